@@ -1,6 +1,6 @@
-"""Sheets of tags to print in true size, and the calibration of a camera from frames of known tags.
+"""Printable sheets of tags in true size, and calibration of a camera from frames of known tags.
 
-This is the only module that knows fpdf2.
+Only this module imports fpdf2.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ _LEAST_TAGS: Final = 4
 _LEAST_VIEWS: Final = 6
 _MOST_VIEWS: Final = 60
 _APART: Final = 0.04
-"""By what share of the image's width the tags of two views differ at least: equal views say nothing."""
+"""Least shift of tags between two views, as a share of the image's width; equal views add nothing."""
 
 _LOOSE: Final = 0.02
-"""A standard deviation of the focal length above this share of it says that views were too much alike."""
+"""Largest relative standard deviation of the focal length; above it, the views were too much alike."""
 
 _WRONG: Final = 8.0
-"""Pixels by which corners are off when the sheet is not the one that was said; a bent one stays far below."""
+"""Error of corners from which the sheet is not the stated one, pixels; a bent sheet stays far below."""
 
 _WIDE: Final = 0.6
-"""The least share of the image's width and height that the tags of all views should reach over."""
+"""Least share of the image's width and height that the tags of all views should cover."""
 
 
 class Calibrated(NamedTuple):
-    """A calibration, and how far to trust it.
+    """A calibration with remarks on its quality.
 
     Attributes:
-        views: how many frames it is from.
-        remarks: what would make it better.
+        views: number of frames that it is from.
+        remarks: advice for a better calibration.
     """
 
     calibration: Calibration
@@ -56,16 +56,16 @@ class Calibrated(NamedTuple):
 def calibrate_camera(
     name: str, frames: Iterable[Frame], family: str, references: Sequence[MountedTag]
 ) -> Calibrated:
-    """Calibrate a camera from frames in which tags are seen from several sides.
+    """Calibrate a camera from frames that show tags from several sides.
 
     Args:
-        name: of where the frames come from, for errors.
-        references: the tags, at their places on one plane.
+        name: name of the source of the frames, for errors.
+        references: tags at their places on one plane.
 
     Raises:
         LogError: there is no frame.
-        UsageError: too few frames show enough of the tags from different sides, or the tags are not where
-            the references have them.
+        UsageError: too few frames show enough tags from different sides, or the tags are not at the places
+            of the references.
     """
     detector = TagDetector(family)
     references_by_id = {tag.id: tag.corners for tag in references}
@@ -111,7 +111,7 @@ def calibrate_camera(
 
 
 def _is_new(found: dict[int, Floats], views: Sequence[dict[int, Floats]], least: float) -> bool:
-    """Return whether no view before has the tags at the same places."""
+    """Return whether no earlier view has the tags at the same places."""
     for view in views:
         shared = [number for number in found if number in view]
         off = [float(np.linalg.norm(found[number] - view[number], axis=1).mean()) for number in shared]
@@ -161,12 +161,12 @@ def camera_text(camera: Camera) -> str:
 PAPERS: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
     {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
 )
-"""Width and height in millimetres."""
+"""Width and height of papers, millimetres."""
 
 MOST_TAGS: Final = 1000
 _MARGIN: Final = 12.0
 _FOOT: Final = 14.0
-"""Millimetres that are left free around a page, and above its lower margin for the ruler."""
+"""Free margin around a page, and free height above its lower margin for the ruler, millimetres."""
 
 _CAPTION: Final = 5.0
 _RULER: Final = 100.0
@@ -174,15 +174,15 @@ _RULER: Final = 100.0
 
 @dataclass(frozen=True, slots=True)
 class TagSheet:
-    """Tags side by side on pages, in rows from the top.
+    """Tags on pages, in rows from the top.
 
     Attributes:
-        ids: in their order.
-        size: edge of the black squares in metres.
+        ids: numbers of the tags, in their order.
+        size: edge of the black squares, metres.
         paper: one of `PAPERS`.
 
     Raises:
-        UsageError: no tag or too many, a tag twice, a size that does not fit the paper.
+        UsageError: no tag, too many tags, a tag twice, or a size that does not fit the paper.
     """
 
     family: str
@@ -205,7 +205,7 @@ class TagSheet:
 
     @property
     def per_page(self) -> int:
-        """How many tags a page holds."""
+        """Number of tags on a page."""
         return self._columns * self._rows
 
     def references(self) -> tuple[MountedTag, ...]:
@@ -228,6 +228,7 @@ class TagSheet:
         width, height = PAPERS[self.paper]
         pdf = FPDF(unit="mm", format=(width, height))
         pdf.set_auto_page_break(False)
+        # a fixed date, so that equal sheets give equal bytes
         pdf.set_creation_date(datetime(2000, 1, 1, tzinfo=UTC))
         pdf.set_title(f"AprilTags {self.family}, {self._millimetres:g} mm")
         pdf.set_font("helvetica", size=8)
@@ -260,7 +261,7 @@ class TagSheet:
 
     @property
     def _pitch(self) -> tuple[float, float]:
-        """From tag to tag: the black square, its white rim on both sides, and a caption below."""
+        """Distances of tags across and down, millimetres, with white rims and a caption below."""
         side = self._millimetres * 1.4
         return side, side + _CAPTION
 
@@ -273,7 +274,7 @@ class TagSheet:
         return int((PAPERS[self.paper][1] - 2 * _MARGIN - _FOOT) // self._pitch[1])
 
     def _centres(self) -> Sequence[tuple[float, float]]:
-        """Return the centres of the places of a page, in millimetres from its upper left corner."""
+        """Return the centres of all tags of a page, in millimetres from its upper left corner."""
         across, down = self._pitch
         return [
             (_MARGIN + (column + 0.5) * across, _MARGIN + row * down + across / 2)
@@ -283,7 +284,7 @@ class TagSheet:
 
 
 def _runs(values: Sequence[int]) -> list[tuple[int, int]]:
-    """Return from where to where cells in a row are black."""
+    """Return the begin and end of each run of black cells in a row."""
     runs: list[tuple[int, int]] = []
     for place, value in enumerate(values):
         if value:

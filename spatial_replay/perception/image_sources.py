@@ -44,7 +44,7 @@ _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
         "bgra8": (4, (0, 1, 2)),
     }
 )
-"""Encodings of raw images: bytes of a pixel, and which of them are blue, green and red, or grey."""
+"""Encodings of raw images: bytes per pixel, and indices of blue, green and red, or grey, among them."""
 
 _CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
     {
@@ -55,24 +55,24 @@ _CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
         "yuyv": (2, "YUV2BGR_YUYV"),
     }
 )
-"""Encodings that OpenCV converts: bytes of a pixel, and what it calls that."""
+"""Encodings that OpenCV converts: bytes per pixel, and OpenCV's name of the conversion."""
 
 _ENCODINGS: Final = (*_CHANNELS, "mono16", *_CONVERTED)
 
 _DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
     {"apriltag_msgs/AprilTagDetectionArray": "detections", "apriltag_msgs/ApriltagArrayStamped": "apriltags"}
 )
-"""Types of messages with the tags of an image, and the field that lists them."""
+"""Types of messages with detected tags, and their field with the tags."""
 
 
 class ImageTopic:
-    """Frames of one topic of a log with images, or with AprilTag detections; a process for one run.
+    """Frames of one topic of a log, with images or AprilTag detections, to iterate over once.
 
     Attributes:
-        name: of the log.
-        topic: its name.
-        channel: the topic as the log declares it.
-        faults: what was lost so far, each with its place.
+        name: name of the log.
+        topic: name of the topic.
+        channel: channel of the topic in the log.
+        faults: losses so far, each with its place.
     """
 
     copy_fault = remark = None
@@ -81,12 +81,12 @@ class ImageTopic:
         """Open the log, and choose the topic.
 
         Args:
-            topic: its name; None for the only one with images, or else with detections.
+            topic: name of the topic; None for the only topic with images, or else with detections.
 
         Raises:
             MissingFileError: there is no such file.
-            LogError: it is not a log of messages.
-            UsageError: no such topic, one of JSON, or none or several to choose from.
+            LogError: the file is not a log of messages.
+            UsageError: no such topic, a topic of JSON, or not exactly one topic to choose.
         """
         self._reader = open_messages(path)
         self.name = self._reader.name
@@ -119,7 +119,7 @@ class ImageTopic:
         self.faults += self._reader.take_faults()
 
     def _frames(self) -> Iterator[tuple[int, Frame | LogError, bool]]:
-        """Yield when each message was logged, its frame or what is wrong with it, and whether it is true."""
+        """Yield the log time of each message, its frame or fault, and whether the frame is true."""
         decoder = H264Decoder() if self._is_video else None
         detections_field = _DETECTIONS.get(self._type)
         for message in self._reader.iter_messages({self.topic}):
@@ -140,19 +140,19 @@ class ImageTopic:
             yield from map(_frame, decoder.rest())
 
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
-        """Yield what the camera showed at some times, increasing: of each the last frame stamped until then.
+        """Yield the last frame with a stamp up to each of some increasing times.
 
-        Each frame is yielded once, and no more is decoded than these take. Damaged ones are left out.
+        Each frame is yielded once, and only the needed frames are decoded. Damaged frames are left out.
 
         Raises:
-            UsageError: a codec that is not installed.
+            UsageError: PyAV is not installed.
         """
         frames = self._times_of_frames()
         places = np.searchsorted(frames.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
         decoder, read_ns = H264Decoder() if self._is_video else None, 0
         for place in np.unique(places[places >= 0]).tolist():
             stamp_ns, last_ns = int(frames.stamps_ns[place]), int(frames.log_times_ns[place])
-            # from the key frame on, unless the decoder is already past it
+            # a video is read from its key frame on, unless the decoder is past it already
             first_ns = last_ns if decoder is None else max(int(frames.key_times_ns[place]), read_ns)
             read_ns = last_ns + 1
             shows: list[Shown] = []
@@ -165,7 +165,7 @@ class ImageTopic:
                     elif time_ns == stamp_ns:
                         shows.append(Shown(time_ns, _image(value, self._type), True))
             if decoder is not None and not shows:
-                # held back since something is missing: the next one is decoded from its key frame again
+                # held back because data are missing: the next frame is decoded from its key frame again
                 shows += _of_stamp(stamp_ns, decoder.rest())
                 decoder, read_ns = H264Decoder(), 0
             image = next((show.image for show in reversed(shows) if show.is_true), None)
@@ -173,7 +173,7 @@ class ImageTopic:
                 yield Frame(stamp_ns, image)
 
     def _times_of_frames(self) -> _Shown:
-        """Return when there are frames, without decoding them."""
+        """Return the times of all frames, without decoding them."""
         rows: list[tuple[int, int, int]] = []
         key_ns = last_ns = -1
         for message in self._reader.iter_messages({self.topic}):
@@ -191,7 +191,7 @@ class ImageTopic:
 
 
 class _Shown(NamedTuple):
-    """Frames by their increasing stamps: log times, and those of the key frames they are decoded from."""
+    """Frames by their increasing stamps: log times, and log times of the key frames before them."""
 
     stamps_ns: Integers
     log_times_ns: Integers
@@ -223,10 +223,10 @@ def _choose_topic(name: str, topics: tuple[Topic, ...], wanted: str | None) -> T
 
 
 def _h264(value: Any) -> bytes:
-    """Return the content of a message of video.
+    """Return the data of a video message.
 
     Raises:
-        LogError: it is not H.264.
+        LogError: the video is not H.264.
     """
     if str(value.format).lower() not in ("h264", ""):
         raise LogError(f"the video is {value.format!r:.40}; H.264 is read")
@@ -234,13 +234,13 @@ def _h264(value: Any) -> bytes:
 
 
 def _frame(shown: Shown) -> tuple[int, Frame, bool]:
-    """Return when a message of video was logged, its frame, and whether that is true."""
+    """Return the log time of a video message, its frame, and whether the frame is true."""
     log_ns, time_ns, payload = shown.of
     return log_ns, Frame(time_ns, shown.image, payload), shown.is_true
 
 
 def _of_stamp(stamp_ns: int, shown: Iterable[Shown]) -> list[Shown]:
-    """Return what is shown with a stamp."""
+    """Return the images with a stamp."""
     return [show for show in shown if show.of == stamp_ns]
 
 
@@ -248,7 +248,7 @@ def _image(value: Any, type_name: str) -> Image:
     """Return the image in a message.
 
     Raises:
-        LogError: it is damaged, or in an encoding that is not known.
+        LogError: the image is damaged, or its encoding is unknown.
     """
     data = bytes(value.data)
     if "Compressed" in type_name:
@@ -266,17 +266,17 @@ def _image(value: Any, type_name: str) -> Image:
         return convert(pixels, _CONVERTED[encoding][1])
     if encoding == "mono16":
         wide = pixels.view(">u2" if getattr(value, "is_bigendian", False) else "<u2")[..., 0]
-        # cameras of 10 or 12 bits leave the upper ones empty
+        # cameras of 10 or 12 bits leave the upper bits empty, so the greatest value decides the shift
         return np.asarray(wide >> max(0, int(wide.max()).bit_length() - 8), np.uint8)
     order = _CHANNELS[encoding][1]
     return np.ascontiguousarray(pixels[..., 0] if size == 1 else pixels[..., order])
 
 
 def _detections(listed: Any) -> tuple[Detection, ...]:
-    """Return the tags that a message lists.
+    """Return the tags in a message.
 
     Raises:
-        LogError: one has not four corners.
+        LogError: a tag does not have four finite corners.
     """
     detections = []
     for tag in listed:
@@ -304,13 +304,13 @@ def open_frames(
     """Open a video, or a topic of a log with images or AprilTag detections; the content decides which it is.
 
     Args:
-        topic: of a log; None for the only one with images, or else with detections.
-        rate: frames a second of a video, instead of its own stamps.
+        topic: topic of a log; None for the only topic with images, or else with detections.
+        rate: frames per second of a video, which replace its own stamps.
 
     Raises:
         MissingFileError: there is no such file.
-        LogError: it is neither.
-        UsageError: an option that does not fit what it is, or a topic that is not there.
+        LogError: the file is neither a video nor a log.
+        UsageError: an option that does not apply to the file, or an unknown topic.
     """
     path = log_file(path)
     if is_log(path):
@@ -326,12 +326,12 @@ def open_frames(
 
 
 class CameraFrames:
-    """Frames of a camera until it is unplugged; times count from the first one. A process for one run.
+    """Frames of a camera until it is unplugged, to iterate over once; times count from the first frame.
 
     Attributes:
-        name: such as "camera 0".
-        channel: None, since it is no topic.
-        faults: what was lost so far.
+        name: name, such as "camera 0".
+        channel: None, because a camera has no topic.
+        faults: losses so far.
     """
 
     channel = remark = None
@@ -343,11 +343,11 @@ class CameraFrames:
         """Open the camera.
 
         Args:
-            length_ns: end after so much time.
-            opened: opens it; what it returns has `read` and `release`, as OpenCV's captures.
+            length_ns: time after which the frames end; None for no limit.
+            opened: function that opens the camera; its value has `read` and `release`, as OpenCV's captures.
 
         Raises:
-            UsageError: there is no such camera; OpenCV is not installed.
+            UsageError: there is no such camera, or OpenCV is not installed.
         """
         self.name = f"camera {number}"
         self.faults: list[str] = []

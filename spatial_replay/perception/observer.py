@@ -1,4 +1,4 @@
-"""Cameras to samples: places of objects, their uncertainty, and which objects are hidden."""
+"""Convert frames of cameras to samples: places of objects, their uncertainty, and hidden objects."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ from spatial_replay.text import listing, plural
 from spatial_replay.trace.trace import Sample
 
 _STEP: Final = 1e-3
-"""Pixels by which corners are moved for derivatives."""
+"""Step of corners for derivatives, pixels."""
 
 _SIZE_TOLERANCE: Final = 0.02
-"""By what share a tag may appear larger or smaller beyond its noise: how well its size is measured."""
+"""Relative error of a tag's stated size, which is allowed in addition to noise."""
 
 _LEANING: Final = math.radians(3.0)
-"""Standard deviation of how much an object leans that is carried."""
+"""Standard deviation of the tilt of a carried object, radians."""
 
 _LEFT_OVER: Final = 4
-"""Coordinates of a tag's corners, of eight, that place, yaw and size leave over."""
+"""Degrees of freedom of a fitted tag: eight coordinates, less two of its place, its yaw and its size."""
 
 _SMALL: Final = 1e-6
 _ITERATIONS: Final = 5
 
 
 class ObjectPose(NamedTuple):
-    """Where an object is, by one of its tags.
+    """Pose of an object from one of its tags.
 
     Attributes:
-        place: (3,): x, y and the height of its bottom above where it stands in the tags file.
-        yaw: radians.
-        spread: (4, 4), the covariance of x, y, z, yaw that comes from the corners.
-        shared: (2, 2), the covariance of x, y that comes from the plane; all objects near have the same.
-        parallax: how far the place may be off since the height of its tag cannot be resolved.
-        doubt: why the pose cannot be right; None if nothing speaks against it.
-        misfit: by how many pixels the corners miss the fitted tag, per coordinate left over by the fit.
+        place: (3,), x, y, and height above its resting height in the tags file.
+        yaw: orientation, radians.
+        spread: (4, 4), covariance of x, y, z, yaw from the errors of corners.
+        shared: (2, 2), covariance of x, y from the error of the plane, which nearby objects share.
+        parallax: largest error of the place because the height of its tag is not resolved.
+        doubt: reason why the pose is wrong; None if there is no reason.
+        misfit: distance of the corners from the fitted tag, pixels per degree of freedom.
     """
 
     place: Floats
@@ -70,9 +70,9 @@ def poses_on_plane(
     """Return the poses of objects on the plane.
 
     Args:
-        corners: (N, 4, 2) in pixels, of one tag of each.
+        corners: (N, 4, 2), corners of one tag of each object, pixels.
         tags: the N tags.
-        sigmas: deviations beyond which a tag's size speaks against its place.
+        sigmas: number of standard deviations from which the size of a tag in the image makes a doubt.
     """
     if not tags:
         return []
@@ -80,13 +80,13 @@ def poses_on_plane(
     size = np.array([tag.size for tag in tags])
     offset = np.array([(tag.x, tag.y) for tag in tags])
     turn = np.array([tag.yaw for tag in tags])
-    # each tag as it is, and with each of its eight coordinates moved up and down
+    # each tag unchanged, and with each of its eight coordinates moved by a step up and down
     moves = np.concatenate([np.zeros((1, 8)), _STEP * np.eye(8), -_STEP * np.eye(8)]).reshape(17, 4, 2)
     places = plane.places(corners[:, None] + moves, np.broadcast_to(z[:, None, None], (len(tags), 17, 4)))
     centre = places.mean(axis=2)
     ahead = (places[:, :, 1] - places[:, :, 0]) + (places[:, :, 2] - places[:, :, 3])
     left = (places[:, :, 3] - places[:, :, 0]) + (places[:, :, 2] - places[:, :, 1])
-    # a square: what is ahead of it and what is left of it, turned back, are the same
+    # in a square, the sides to the left, turned by -90 degrees, equal the sides ahead: average both
     along = ahead + np.stack([left[..., 1], -left[..., 0]], axis=-1)
     edge = np.linalg.norm(along, axis=-1) / 4
     yaw = np.arctan2(along[..., 1], along[..., 0]) - turn[:, None]
@@ -135,7 +135,7 @@ def poses_on_plane(
 
 
 def _squares(centres: Floats, edges: Floats) -> Floats:
-    """Return the corners (N, 4, 2) of squares around centres (N, 2), whose lower edges are (N, 2)."""
+    """Return the corners (N, 4, 2) of squares with centres (N, 2) and lower edges (N, 2)."""
     half = edges[:, None] / 2
     across = np.stack([-half[..., 1], half[..., 0]], axis=-1)
     corners: Floats = np.concatenate([-half - across, half - across, half + across, -half + across], axis=1)
@@ -143,20 +143,20 @@ def _squares(centres: Floats, edges: Floats) -> Floats:
 
 
 def _misfits(plane: Plane, corners: Floats, squares: Floats, z: Floats) -> Floats:
-    """Return by how many pixels corners (N, 4, 2) miss squares at heights (N,), per coordinate left over."""
+    """Return the misfits (N,) of corners (N, 4, 2) to squares at heights (N,); see `ObjectPose.misfit`."""
     places = np.concatenate([squares, np.repeat(z, 4).reshape(-1, 4, 1)], axis=2)
     off = corners.reshape(-1, 2) - plane.pixels(places.reshape(-1, 3))
     return np.asarray(np.linalg.norm(off.reshape(-1, 8), axis=1) / math.sqrt(_LEFT_OVER))
 
 
 def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: float) -> ObjectPose | None:
-    """Return the pose of an object that may be above the plane; None if none fits.
+    """Return the pose of an object that may be above the plane; None if no pose fits.
 
-    Objects stand upright within a few degrees, in the robot's hand, too. The tilt of a small tag is hardly
-    visible, and two poses that lean to opposite sides look alike.
+    Objects are taken as upright within a few degrees, also in the robot's hand. The tilt of a small tag is
+    hardly visible, and two poses that lean to opposite sides look alike.
 
     Args:
-        corners: (4, 2) in pixels, of the tag.
+        corners: (4, 2), corners of the tag, pixels.
     """
     half = tag.size / 2
     square = np.array([(-half, -half, 0.0), (half, -half, 0.0), (half, half, 0.0), (-half, half, 0.0)])
@@ -166,7 +166,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
     weight = np.array([1 / plane.corner_error] * 8 + [1 / _LEANING] * 2)
     upright = np.zeros((2, 6))
     upright[[0, 1], [3, 4]] = 1.0
-    # x, y, z of the tag's centre, and the rotation vector by which it leans and has turned since the start
+    # Gauss-Newton on x, y, z of the tag's centre, and on the rotation vector of its tilt and turn
     state = np.concatenate([start[:3], np.zeros(3)])
     moves = np.concatenate([np.zeros((1, 6)), _SMALL * np.eye(6), -_SMALL * np.eye(6)])
     weighted, residual = np.zeros((10, 6)), np.zeros(10)
@@ -185,7 +185,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
     yaw = start[3] + state[5] - tag.yaw
     cosine, sine = math.cos(yaw), math.sin(yaw)
     shift = np.array([cosine * tag.x - sine * tag.y, sine * tag.x + cosine * tag.y, tag.z])
-    # the place of the object's centre by the place of the tag and its yaw
+    # derivative of the object's pose by the tag's pose
     lever = np.eye(4)
     lever[:2, 3] = shift[1], -shift[0]
     axes = [0, 1, 2, 5]
@@ -205,7 +205,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
 
 
 def _level_start(plane: CameraPlane, corners: Floats, tag: MountedTag) -> Floats:
-    """Return x, y, z and yaw of a tag that is upright and appears as large as it is."""
+    """Return x, y, z and yaw of an upright tag at the distance that follows from its size in the image."""
     places = plane.places(corners, np.full(4, tag.z))
     along = (places[1] - places[0]) + (places[2] - places[3])
     left = (places[3] - places[0]) + (places[2] - places[1])
@@ -217,7 +217,7 @@ def _level_start(plane: CameraPlane, corners: Floats, tag: MountedTag) -> Floats
 
 
 def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
-    """Return one pose from those of several tags on one object, each weighted by its covariance."""
+    """Fuse the poses from several tags on an object, each weighted by its covariance."""
     if len(poses) == 1:
         return poses[0]
     first = poses[0].yaw
@@ -227,7 +227,7 @@ def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     weights = [np.linalg.pinv(pose.spread, hermitian=True, rcond=1e-12) for pose in poses]
     spread = np.linalg.pinv(sum(weights, np.zeros((4, 4))), hermitian=True, rcond=1e-12)
     mean = spread @ sum((w @ x for w, x in zip(weights, states, strict=True)), np.zeros(4))
-    # tags that contradict each other beyond their noise: what the file says of them is not exact
+    # tags that contradict each other beyond noise are misplaced in the file: the spread covers that
     off = states - mean
     excess = sum(float(x @ w @ x) for w, x in zip(weights, off, strict=True)) / max(3 * (len(poses) - 1), 1)
     shared = np.max([pose.shared for pose in poses], axis=0)
@@ -236,14 +236,14 @@ def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
 
 
 def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
-    """Return how far any point of an object may be from where its pose puts it.
+    """Return the largest error of any point of an object's outline.
 
-    For the point v of the outline, the error is that of the place and that of the yaw, by which v swings:
-    with A = [I | e_z x R v] its covariance is A C A^T, and its largest standard deviation the root of the
-    largest eigenvalue. The radius is `sigmas` times that of the worst point, and the parallax.
+    The error of a point v combines the errors of place and yaw. With A = [I | e_z x R v], its covariance is
+    A C A^T, and its largest standard deviation is the root of the largest eigenvalue. The radius is `sigmas`
+    times the largest deviation of all points, plus the parallax.
 
     Args:
-        outline: (K, 2), points of the footprint in its own frame.
+        outline: (K, 2), points of the footprint in the object's frame.
     """
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
     swing = np.stack(
@@ -263,19 +263,19 @@ def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
 def simultaneous(
     cameras: Sequence[Iterable[Frame]], offsets_ns: Sequence[int] = ()
 ) -> Iterator[tuple[Frame | None, ...]]:
-    """Yield the frames of each time: of each camera one, or None where it has none then.
+    """Yield the frames of each time, one for each camera; None for a camera without a frame at that time.
 
-    Frames belong together if they are at most half a frame apart, half of the shortest time to the next frame
-    of any camera. No more than two frames of a camera wait. When one camera ends, the others go on.
+    Frames belong together if they are at most half of the shortest frame interval of all cameras apart. At
+    most two frames of a camera are read ahead. When one camera ends, the others continue.
 
     Args:
-        cameras: frames with increasing times.
-        offsets_ns: what is added to the stamps of each camera; nothing unless given.
+        cameras: frames of each camera, with increasing times.
+        offsets_ns: offset that is added to the stamps of each camera; 0 by default.
     """
     offsets = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
     shifted = [_shift(frames, offset) for frames, offset in zip(cameras, offsets, strict=True)]
     if len(cameras) == 1:
-        # nothing to wait for
+        # the frames of a single camera need no read ahead
         yield from ((frame,) for frame in shifted[0])
         return
     coming = [_Coming(frames) for frames in shifted]
@@ -294,7 +294,7 @@ def _shift(frames: Iterable[Frame], offset_ns: int) -> Iterator[Frame]:
 
 
 class _Coming:
-    """The frames of one camera, of which the next two are known."""
+    """The frames of one camera, with the next two frames read ahead."""
 
     def __init__(self, frames: Iterator[Frame]) -> None:
         self._frames = frames
@@ -302,23 +302,23 @@ class _Coming:
 
     @property
     def time_ns(self) -> int:
-        """The time of the frame that comes next."""
+        """Time of the next frame."""
         return 0 if self.now is None else self.now.time_ns
 
     @property
     def gap_ns(self) -> int:
-        """The time from the frame that comes next to the one after it; 0 if there is none."""
+        """Time between the next two frames; 0 if there are not two."""
         return 0 if self._later is None else self._later.time_ns - self.time_ns
 
     def take(self) -> Frame | None:
-        """Return the frame that comes next, and go on."""
+        """Return the next frame, and read another one."""
         frame, self.now = self.now, self._later
         self._later = next(self._frames, None)
         return frame
 
 
 def camera_names(cameras: Sequence[Any]) -> list[str]:
-    """Return the names of cameras: of a topic, or else of a video; "" of frames that have none.
+    """Return the names of cameras: the topic, or else the name of the video; "" for frames without a name.
 
     Raises:
         UsageError: there is no camera.
@@ -331,22 +331,24 @@ def camera_names(cameras: Sequence[Any]) -> list[str]:
 # ------------------------------------------------------------------------------------------------- one camera
 
 _MOST_AVERAGED: Final = 30
-"""Detections of a reference tag that are averaged."""
+"""Most detections of a reference tag that are averaged."""
 
 _MOST_NAMED: Final = 8
 
 _LATE: Final = 8
-"""Frames of a tag whose largest misfit counts: one has four coordinates left over, too few for a scatter."""
+"""Number of latest frames whose largest misfit counts; one frame has only four degrees of freedom."""
 
 _SHARED: Final = 1.2
-"""The error of a pose in misfits: a codec moves blocks of pixels, so that corners share errors. In films with
-crf 23 to 36 a pose was off by up to 1.2 times the misfit per coordinate, root mean square."""
+"""Ratio of a pose's error to its misfit; a codec moves blocks of pixels, so corners share errors.
+
+In videos with crf 23 to 36, the root mean square error of a pose was up to 1.2 times the misfit.
+"""
 
 _BLURRED: Final = 2.0
-"""How many times larger the error of a tag than that of the reference tags is worth a remark."""
+"""Ratio of a tag's error to the error of the reference tags, above which there is a remark."""
 
 _MOVED: Final = 2.0
-"""Pixels beyond which a reference tag is no longer where it was: the camera has moved."""
+"""Median shift of the reference tags above which the camera has moved, pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -354,9 +356,9 @@ class View:
     """Observation of one camera in one frame.
 
     Attributes:
-        frame: it.
-        detections: all tags, those that no one mapped, too.
-        plane: None as long as reference tags are missing.
+        frame: the frame.
+        detections: all tags, also tags that are not in the tags file.
+        plane: the plane; None while reference tags are missing.
     """
 
     frame: Frame
@@ -365,16 +367,16 @@ class View:
 
 
 class CameraView:
-    """One camera, which stands still; a process for one run.
+    """One resting camera in one run.
 
     Attributes:
-        name: of its video or topic; "" of the only one.
-        tags: what the tags file says for it.
-        fit: how the reference tags fit; None without any.
-        seen: in how many frames each tag was.
-        twice: in how many it was more than once.
-        moved: how often the camera has moved.
-        frames: how many there were.
+        name: name of its video or topic; "" for a single camera.
+        tags: tags file of this camera.
+        fit: fit of the reference tags; None without reference tags.
+        seen: number of frames with each tag.
+        twice: number of frames with a tag more than once, by tag.
+        moved: number of moves of the camera.
+        frames: number of frames.
     """
 
     def __init__(self, name: str, tags: TagsFile) -> None:
@@ -397,7 +399,7 @@ class CameraView:
         self._sharpness: Counter[str] = Counter()
 
     def look(self, frame: Frame) -> tuple[View, dict[int, ObjectPose]]:
-        """Return what a frame shows, and the pose that each tag gives its object.
+        """Return the view of a frame, and poses of objects by tag.
 
         Raises:
             UsageError: the camera is calibrated for another size, or the reference tags do not fit.
@@ -420,7 +422,7 @@ class CameraView:
         return View(frame, tuple(detections), self._plane), poses
 
     def _size_without_image(self) -> tuple[int, int]:
-        """Return the size (width, height) of images that are not there; (0, 0) where it does not matter."""
+        """Return the size (width, height) of images that are not stored; (0, 0) if it is not needed."""
         if self.tags.is_image:
             raise UsageError(
                 f"{self.tags.name}: plane: image counts from the lower edge of the image, and detections do"
@@ -429,14 +431,14 @@ class CameraView:
         return (0, 0) if self.tags.camera is None else self.tags.camera.size
 
     def _single(self, detections: Iterable[Detection]) -> dict[int, Floats]:
-        """Return the corners of the tags that are in the image once: of two, no one knows which it is."""
+        """Return the corners of tags that are in the image exactly once; two equal tags are ambiguous."""
         times = Counter(detection.id for detection in detections)
         self.seen.update(times.keys())
         self.twice.update(number for number, count in times.items() if count > 1)
         return {detection.id: detection.corners for detection in detections if times[detection.id] == 1}
 
     def _refer(self, corners: Mapping[int, Floats]) -> None:
-        """Take in the reference tags, and fit the plane again while their averages still change."""
+        """Average the reference tags, and fit the plane again while the averages change."""
         if not self.tags.references or self.tags.pose is not None:
             return
         present = {
@@ -465,13 +467,13 @@ class CameraView:
             self.fit = plane_from_references(self.tags, means, self._size or (0, 0))
             self._plane = self.fit.plane
         except UsageError:
-            # what fitted before does not while the camera or a tag moves
+            # tags that fitted before do not fit while the camera or a tag moves
             if self.fit is None:
                 raise
             self._plane = None
 
     def _poses(self, plane: Plane, corners: Mapping[int, Floats]) -> dict[int, ObjectPose]:
-        """Return the pose of its object by each tag that is in the image."""
+        """Return poses of objects by tag, from each tag in the image."""
         present = sorted(number for number in corners if number in self.tags.by_id)
         flat = [number for number in present if not self.tags.by_id[number][0].is_lifted]
         sigmas = self.tags.sigmas
@@ -491,9 +493,10 @@ class CameraView:
         return poses
 
     def _with_misfits(self, plane: Plane, number: int, pose: ObjectPose) -> ObjectPose:
-        """Return the pose by a tag, whose spread covers how far the tag missed its fit of late.
+        """Return the pose with a spread that covers the latest misfits of its tag.
 
-        Reference tags rest, and a codec sharpens what rests: they say nothing of the error of tags that move.
+        Reference tags rest, and a codec sharpens resting parts of a video. So their misfits do not show the
+        errors of moving tags.
         """
         if self.tags.corner_error is not None or pose.doubt is not None:
             return pose
@@ -517,7 +520,7 @@ class CameraView:
         return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_text(absent)} {were} not"
 
     def remarks(self) -> list[str]:
-        """Return what is worth knowing: that the camera saw nothing, not the plane, or has moved."""
+        """Return remarks on the camera: no tag seen, no plane, uncertain places, or moves."""
         frames, lines = plural(self.frames, "frame"), []
         of_it = f" of {self.name}" if self.name else ""
         if self.frames and not self.seen:
@@ -555,7 +558,7 @@ class CameraView:
 
 
 def tags_text(numbers: list[str]) -> str:
-    """Return tags as a sentence lists them, the first of many."""
+    """Return a list of tags for a sentence; a long list is cut."""
     return f"tag{'s' if len(numbers) > 1 else ''} {listing(numbers, _MOST_NAMED)}"
 
 
@@ -567,8 +570,8 @@ class Observation:
     """Observation of the frames of one time.
 
     Attributes:
-        sample: the objects.
-        views: by camera; None of one that has no frame then.
+        sample: objects of that time.
+        views: view of each camera; None for a camera without a frame at that time.
     """
 
     sample: Sample
@@ -576,31 +579,31 @@ class Observation:
 
     @property
     def first(self) -> View:
-        """The view of the first camera that has one."""
+        """View of the first camera with a frame."""
         return next(view for view in self.views if view is not None)
 
 
 class TagObserver:
-    """Turns the frames of cameras, which stand still, into samples; a process for one run.
+    """Converts the frames of resting cameras to samples, in one run.
 
-    An object is unknown if its tags are hidden from all cameras, or if its tag cannot be where it appears. A
-    held hidden object stays where it was for a while, with an uncertainty that grows with its highest speed.
+    An object is unknown if its tags are hidden from all cameras, or if its pose has a doubt. A hidden object
+    is held at its last place for a while, with an uncertainty that grows at its highest speed.
 
     Attributes:
         tags: the tags file.
-        hold_ns: how long a hidden object is held.
-        frames: how many samples were made.
+        hold_ns: time that a hidden object is held.
+        frames: number of samples.
     """
 
     def __init__(self, tags: TagsFile, *, hold_ns: int | None = None, cameras: Sequence[str] = ("",)) -> None:
         """Prepare the detectors.
 
         Args:
-            hold_ns: how long a hidden object is held; None for what the tags file says.
-            cameras: their names, as those of their videos; without any, there is one.
+            hold_ns: time that a hidden object is held; None for the time in the tags file.
+            cameras: names of the cameras, such as of their videos; by default, one camera.
 
         Raises:
-            UsageError: a time below 0, a camera that the tags file does not have; OpenCV is not installed.
+            UsageError: a negative time, a camera that the tags file lacks, or OpenCV is not installed.
         """
         hold_ns = tags.hold_ns if hold_ns is None else hold_ns
         if hold_ns < 0:
@@ -620,21 +623,21 @@ class TagObserver:
 
     @property
     def fits(self) -> tuple[Fit | None, ...]:
-        """How the reference tags fit in each camera; None without any."""
+        """Fit of the reference tags in each camera; None without reference tags."""
         return tuple(camera.fit for camera in self._cameras)
 
     def observe(self, *frames: Frame | None) -> Observation:
-        """Return what the frames of one time show.
+        """Return the observation of the frames of one time.
 
-        The sample has the stamp of the first of them. Frames of other cameras may be earlier or later: what
-        only they show is as much less certain as it may have moved in between.
+        The sample has the stamp of the first frame. Other frames may be earlier or later. An object that only
+        they show is less certain by its possible motion in between.
 
         Args:
-            frames: one of each camera; None of one that has no frame then, but not of all.
+            frames: a frame of each camera; None for a camera without a frame, but not for all cameras.
 
         Raises:
-            UsageError: a frame that is not after the one before, a camera that is calibrated for another
-                size, reference tags that do not fit.
+            UsageError: a frame that is not later than the previous one, a camera that is calibrated for
+                another size, or reference tags that do not fit.
         """
         if len(frames) != len(self._cameras) or all(frame is None for frame in frames):
             raise UsageError(
@@ -670,10 +673,10 @@ class TagObserver:
     def _locate(
         self, poses: Sequence[tuple[int, Mapping[int, ObjectPose]]]
     ) -> Iterator[tuple[str, TrackedObject]]:
-        """Yield the objects whose tags are in an image, where nothing speaks against their places.
+        """Yield the objects that have a pose without a doubt.
 
         Args:
-            poses: of each camera that has a frame: by how much it is off in time, and the poses by tag.
+            poses: for each camera with a frame, the time offset of its frame, and its poses by tag.
         """
         for tagged in self.tags.objects:
             poses_of_object = [
@@ -687,7 +690,7 @@ class TagObserver:
                     text, count = self._doubts.get(tagged.name, (pose.doubt, 0))
                     self._doubts[tagged.name] = text, count + 1
             sound = [(off, pose) for off, pose in poses_of_object if pose.doubt is None]
-            # frames that are off in time are taken where they make the object more certain
+            # frames with a time offset are used if they make the object more certain
             found_at = [
                 self._track(tagged, fuse([pose for off, pose in sound if off <= latest]), latest)
                 for latest in sorted({off for off, _ in sound})
@@ -697,7 +700,7 @@ class TagObserver:
                 yield tagged.name, min(found_at, key=lambda tracked: tracked.uncertainty)
 
     def _compare(self, tagged: TaggedObject, poses: Sequence[ObjectPose]) -> None:
-        """Take note of tags that place an object further apart than it is large, beyond what is uncertain."""
+        """Note an object if places from its tags are further apart than its size plus their uncertainty."""
         if len(poses) < 2:
             return
         outline = self._outlines[tagged.name]
@@ -724,7 +727,7 @@ class TagObserver:
         )
 
     def _hold(self, time_ns: int, objects: Mapping[str, TrackedObject]) -> dict[str, TrackedObject]:
-        """Return the hidden objects that are held; remember where the others are, and which are unknown."""
+        """Return the held objects; store the places of visible objects and the names of unknown ones."""
         held: dict[str, TrackedObject] = {}
         for tagged in self.tags.objects:
             if tagged.name in objects:
@@ -734,7 +737,7 @@ class TagObserver:
                 since_ns, last = self._last[tagged.name]
                 if time_ns - since_ns <= self.hold_ns:
                     grown = last.uncertainty + tagged.fastest * (time_ns - since_ns) / 1e9
-                    # a yaw has no uncertainty: of what may have turned, it is unknown
+                    # a yaw has no uncertainty, so the yaw of an object that may have turned is unknown
                     yaw = None if tagged.fastest else last.yaw
                     held[tagged.name] = TrackedObject(
                         last.footprint, last.class_name, yaw, last.height, grown
@@ -746,7 +749,7 @@ class TagObserver:
     # ------------------------------------------------------------------------------------- remarks
 
     def remarks(self) -> tuple[str, ...]:
-        """Return what is worth knowing about the run: tags that are not in the file, objects never seen."""
+        """Return remarks on the run, such as tags that are not in the file and objects never seen."""
         of_cameras = [line for camera in self._cameras for line in camera.remarks()]
         seen = sum((camera.seen for camera in self._cameras), Counter[int]())
         if not seen:
@@ -777,17 +780,17 @@ class TagObserver:
 def observe_frames(
     frames: Iterable[Frame], tags: TagsFile, *, hold_ns: int | None = None
 ) -> Iterator[Observation]:
-    """Yield what the frames of a camera show, one by one; see `TagObserver`."""
+    """Yield the observation of each frame of a camera; see `TagObserver`."""
     return observe_cameras([frames], tags, hold_ns=hold_ns)
 
 
 def observe_cameras(
     cameras: Sequence[Iterable[Frame]], tags: TagsFile, *, hold_ns: int | None = None
 ) -> Iterator[Observation]:
-    """Yield what several cameras show, each time as one sample; see `TagObserver` and `simultaneous`.
+    """Yield one observation of several cameras for each time; see `TagObserver` and `simultaneous`.
 
     Raises:
-        UsageError: no camera, or one that the tags file does not have.
+        UsageError: no camera, or a camera that the tags file lacks.
     """
     observer = TagObserver(tags, hold_ns=hold_ns, cameras=camera_names(cameras))
     for frames in simultaneous(cameras):
@@ -795,7 +798,7 @@ def observe_cameras(
 
 
 def _outline(footprint: Footprint) -> Floats:
-    """Return the points of a footprint that move furthest when it turns, (K, 2): rounding turns in itself."""
+    """Return the vertices (K, 2) of a footprint, which move furthest in a turn; rounding does not matter."""
     return np.concatenate([part.vertices for part in footprint.parts])
 
 

@@ -1,8 +1,8 @@
-"""Frames, detection of tags in them, camera poses and geometry: the only module that knows OpenCV.
+"""Frames, detection of tags, camera poses and geometry; only this module imports OpenCV.
 
-Pixels are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down. Detectors of
-the AprilTag family count from that pixel's outer corner, half a pixel further; `corners_from_apriltag`
-converts these.
+Pixel coordinates are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down.
+Other detectors of AprilTags count from the outer corner of that pixel, half a pixel further;
+`corners_from_apriltag` converts their corners.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ Image = NDArray[np.uint8]
 """(height, width) grey or (height, width, 3) blue, green, red."""
 
 LARGEST_PICTURE: Final = 64_000_000
-"""Pixels of one image; no camera has more, and a damaged header may claim it."""
+"""Most pixels of one image; no camera has more, but a damaged header may claim more."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers of the segments of a JPEG that have its size."""
+"""Markers of the segments of a JPEG that hold its size."""
 
 
 NO_IMAGE: Final[Image] = np.zeros((0, 0), np.uint8)
-"""Marks a frame of which only the tags were kept."""
+"""Image of a frame of which only the tags are stored."""
 NO_IMAGE.setflags(write=False)
 
 
@@ -40,10 +40,10 @@ class Detection(NamedTuple):
     """A tag in an image.
 
     Attributes:
-        id: its number in the family.
-        corners: (4, 2) in pixels, of the black square: bottom left, bottom right, top right, top left as
-            seen on an upright tag.
-        family: as a tags file names it; "" if it is that of the file.
+        id: number in its family.
+        corners: (4, 2), corners of the black square, pixels: bottom left, bottom right, top right, top left
+            of an upright tag.
+        family: name of the family in tags files; "" for the family of the file.
     """
 
     id: int
@@ -58,11 +58,11 @@ class Frame:
     Attributes:
         time_ns: its stamp, on the clock of the samples.
         image: (height, width) grey, or (height, width, 3) blue, green, red.
-        data: the frame as H.264 in Annex B form, where it came like that; b"" otherwise.
-        detections: the tags that a robot found in it, which is not there itself; None to find them.
+        data: H.264 in Annex B form from a video, or the message from a topic; b"" if it cannot be copied.
+        detections: tags that a robot detected in an image that is not stored; None to detect the tags.
 
     Raises:
-        UsageError: the image is not of these shapes, empty, or its numbers are not bytes.
+        UsageError: the image has another shape or type, or is empty.
     """
 
     time_ns: int
@@ -81,9 +81,9 @@ class Frame:
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height that a JPEG, PNG or WebP image claims; None for anything else.
+    """Return the width and height in the header of a JPEG, PNG or WebP image; None for other data.
 
-    Nothing is decoded: an image that claims too much can be refused for what it would cost.
+    Nothing is decoded, so a too large image can be refused before it takes memory.
     """
     try:
         if data.startswith(_PNG):
@@ -103,7 +103,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     while data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xFF:
-            # filled up
+            # fill bytes before a marker
             at += 1
             continue
         if marker in _JPEG_FRAMES:
@@ -114,6 +114,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
+    # https://developers.google.com/speed/webp/docs/riff_container
     kind = data[12:16]
     if kind == b"VP8X":
         width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
@@ -131,14 +132,14 @@ def _webp_size(data: bytes) -> tuple[int, int] | None:
 
 
 def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
-    """Return the pose (6,), rotation vector and translation from the plane's frame to that of a camera.
+    """Return the pose (6,), rotation vector and translation from the plane's frame to a camera's.
 
     Args:
-        eye, target: (3,), where the camera is, and a point in the middle of its image.
-        up: (3,), what points up in the image.
+        eye, target: (3,), place of the camera, and a point in the middle of its image.
+        up: (3,), direction that points up in the image.
 
     Raises:
-        UsageError: the camera is at the target, or `up` is where it looks.
+        UsageError: the camera is at the target, or `up` is parallel to its view.
     """
     forward = target - eye
     right = np.cross(forward, up)
@@ -168,28 +169,28 @@ def rotations(vectors: Floats) -> Floats:
 # --------------------------------------------------------------------------- corners to a fraction of a pixel
 
 _ALONG: Final = 24
-"""Places along an edge at which its step is measured."""
+"""Number of places along an edge at which its step of brightness is measured."""
 
 _MARGIN: Final = 0.1
-"""The share of an edge that is left out at each end, where the other edges are."""
+"""Share of an edge that is left out at each end, close to the other edges."""
 
 _APART: Final = 0.25
-"""Pixels between two places across an edge."""
+"""Distance of two places across an edge, pixels."""
 
 _CELLS: Final = 0.6
-"""How far the step is searched across an edge, in cells of the tag: further, there are other edges."""
+"""Search range across an edge, cells of the tag; further away, there are other edges."""
 
 _WIDEST: Final = 3.0
 _SECOND: Final = 0.5
-"""How far at most, in pixels; and which share of it the second time, when the first has been close."""
+"""Largest search range, pixels; share of the range in the second pass, which starts close to the edge."""
 
 
 def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:
-    """Return corners closer to where they are; those of a tag whose edges are not found stay.
+    """Refine corners of tags; the corners of a tag whose edges are not found stay unchanged.
 
     Args:
-        corners: (N, 4, 2) in pixels, in the order of a `Detection`, no more than two pixels off.
-        cells: along the edge of the black square.
+        corners: (N, 4, 2), in pixels, in the order of a `Detection`, at most two pixels off.
+        cells: number of cells along the edge of the black square.
     """
     if not len(corners):
         return corners
@@ -202,7 +203,7 @@ def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
     ahead = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(ahead, axis=2)
     along = ahead / length[..., None]
-    # image coordinates run down: this is out of a tag whose corners are in our order
+    # y points down in images, so this points out of a tag whose corners are in our order
     outward = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     reach = np.minimum(_CELLS * length.min(axis=1) / cells, _WIDEST) * share
     shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
@@ -219,7 +220,7 @@ def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         at = (weight * steps).sum(axis=-1) / total
     total = np.where(np.isfinite(at), total, 0.0)
-    # the line through the steps of each edge: offset = a + b * share, with little weight on faint ones
+    # a line through the steps of each edge, offset = a + b * share, with little weight on faint steps
     weights = np.minimum(total, np.median(total, axis=-1, keepdims=True))
     sums = [(weights * shares**power).sum(axis=-1) for power in range(3)]
     at = np.nan_to_num(at)
@@ -237,7 +238,7 @@ def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
 
 
 def _bilinear(grey: Image, points: Floats) -> Floats:
-    """Return the values of an image between its pixels; beyond its border, those at the border."""
+    """Interpolate an image between its pixels; beyond its border, values are those at the border."""
     height, width = grey.shape
     x = np.clip(points[..., 0], 0, width - 1.001)
     y = np.clip(points[..., 1], 0, height - 1.001)
@@ -251,7 +252,7 @@ def _bilinear(grey: Image, points: Floats) -> Floats:
 
 
 def _meeting(first: Floats, along: Floats, second: Floats, across: Floats) -> Floats:
-    """Return where lines (…, 2) meet, each given by a point and a direction."""
+    """Return the intersections (…, 2) of lines, each given by a point and a direction."""
     cross = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
     between = second - first
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -272,15 +273,15 @@ FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
         "36h11": "DICT_APRILTAG_36h11",
     }
 )
-"""Families of AprilTags, and what OpenCV calls them."""
+"""Families of AprilTags, and OpenCV's names of them."""
 
 FAMILY_SIZES: Final[Mapping[str, int]] = MappingProxyType(
     {"16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
 )
-"""How many tags each has."""
+"""Number of tags in each family."""
 
 _OURS_FROM_OPENCV: Final = [1, 0, 3, 2]
-"""OpenCV's pictures of AprilTags are upside down, and its corners begin at their top left, clockwise."""
+"""Order of corners: OpenCV has AprilTags upside down, with corners clockwise from the top left."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +291,7 @@ class Camera:
     Attributes:
         focal: (fx, fy) in pixels.
         centre: (cx, cy), the principal point in pixels.
-        distortion: k1, k2, p1, p2, k3, …; none for a pinhole.
+        distortion: k1, k2, p1, p2, k3, …; () for a pinhole.
         size: (width, height) of its images in pixels.
     """
 
@@ -306,7 +307,7 @@ class Camera:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def directions(self, pixels: Floats) -> Floats:
-        """Return where pixels (…, 2) are on the plane in front of the camera, at distance 1, undistorted."""
+        """Return the undistorted places of pixels (…, 2) on the plane at distance 1 from the camera."""
         if not self.distortion:
             return np.asarray((pixels - np.array(self.centre)) / np.array(self.focal), np.float64)
         flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
@@ -314,7 +315,7 @@ class Camera:
         return np.asarray(undistorted, np.float64).reshape(pixels.shape)
 
     def pixels(self, points: Floats) -> Floats:
-        """Return where points (N, 3) in the camera's frame are in the image, (N, 2)."""
+        """Return the pixels (N, 2) of points (N, 3) in the camera's frame."""
         zero = np.zeros(3)
         flat = np.ascontiguousarray(points, np.float64)
         projected, _ = _load().projectPoints(flat, zero, zero, self.matrix, np.array(self.distortion))
@@ -332,9 +333,9 @@ class TagDetector:
         """
         cv2 = _load()
         parameters = cv2.aruco.DetectorParameters()
-        # its own refinement looks around corners, and is half a pixel off on small tags; see `corners`
+        # OpenCV's own refinement is half a pixel off on small tags; see `refined_corners`
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        # one bit of a neighbour is the most that is corrected: a wrong tag is worse than a hidden one
+        # at most two bits are corrected (36h11; three by default), as a wrong tag is worse than a hidden one
         parameters.errorCorrectionRate = 0.4
         dictionary = _dictionary(family)
         self._cells = dictionary.markerSize + 2
@@ -357,12 +358,12 @@ class TagDetector:
 
 
 def corners_from_apriltag(corners: Floats) -> Floats:
-    """Return corners (…, 2) of pupil-apriltags, pyapriltags or apriltag_ros in our pixels."""
+    """Convert corners (…, 2) of pupil-apriltags, pyapriltags or apriltag_ros to our pixels."""
     return corners - 0.5
 
 
 def tag_cells(family: str, number: int) -> Image:
-    """Return the cells of an upright tag with its black border, 0 or 255, one pixel each.
+    """Return an image of an upright tag with its black border, 0 or 255, one pixel per cell.
 
     Raises:
         UsageError: there is no such family, or it has no such tag.
@@ -377,15 +378,16 @@ def tag_cells(family: str, number: int) -> Image:
 
 
 def fit_homography(source: Floats, target: Floats) -> Floats | None:
-    """Return the homography (3, 3) that takes points (N, 2) to others with the least squared error; None if
-    there is none."""
+    """Fit the homography (3, 3) between points (N, 2) by least squares; None if there is none."""
     matrix, _ = _load().findHomography(np.asarray(source), np.asarray(target), 0)
     return None if matrix is None or not np.isfinite(matrix).all() else np.asarray(matrix, np.float64)
 
 
 def fit_pose(points: Floats, pixels: Floats, camera: Camera) -> Floats | None:
-    """Return the pose (6,), rotation vector and translation to the camera's frame, with which points (N, 3)
-    appear at pixels (N, 2); None if there is none."""
+    """Fit the pose (6,) of a camera to points (N, 3) at pixels (N, 2); None if there is none.
+
+    A pose is the rotation vector and the translation to the camera's frame.
+    """
     cv2 = _load()
     matrix, distortion = camera.matrix, np.array(camera.distortion)
     is_solved, turn, shift = cv2.solvePnP(
@@ -399,7 +401,7 @@ def fit_pose(points: Floats, pixels: Floats, camera: Camera) -> Floats | None:
 
 
 def projection(points: Floats, pose: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Return where points (N, 3) appear, (N, 2), and its derivative (N, 2, 6) by a pose as of `fit_pose`."""
+    """Return the pixels (N, 2) of points (N, 3), and their derivative (N, 2, 6) by a pose of `fit_pose`."""
     pixels, jacobian = _load().projectPoints(
         np.ascontiguousarray(points), pose[:3], pose[3:], camera.matrix, np.array(camera.distortion)
     )
@@ -411,8 +413,8 @@ class Calibration(NamedTuple):
     """A calibrated camera.
 
     Attributes:
-        rms: of the reprojection, in pixels.
-        deviations: standard deviations of fx, fy, cx, cy in pixels.
+        rms: root mean square error of reprojected points, pixels.
+        deviations: standard deviations of fx, fy, cx, cy, pixels.
     """
 
     camera: Camera
@@ -427,7 +429,7 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
         size: (width, height) of the images.
     """
     cv2 = _load()
-    # k3 is left out: from tags on a sheet it is seldom determined
+    # k3 stays 0, because tags on a sheet seldom determine it
     rms, matrix, distortion, _, _, spread, *_ = cv2.calibrateCameraExtended(
         [np.asarray(view, np.float32) for view in points],
         [np.asarray(view, np.float32).reshape(-1, 1, 2) for view in pixels],
@@ -467,13 +469,13 @@ def decode_image(data: bytes) -> Image:
     """Decode a JPEG, PNG or WebP image to blue, green, red.
 
     Raises:
-        LogError: it is damaged, none of these, or has more pixels than `LARGEST_PICTURE`.
+        LogError: the image is damaged, of another format, or larger than `LARGEST_PICTURE`.
     """
     cv2 = _load()
     size = encoded_size(data)
     if size is None:
         raise LogError("an image is damaged, or neither JPEG nor PNG nor WebP")
-    # before anything is decoded: a few bytes may claim to be gigabytes
+    # checked before decoding, because a few bytes may claim gigabytes
     if size[0] * size[1] > LARGEST_PICTURE:
         raise LogError(f"an image of {size[0]} x {size[1]} is too large")
     try:
@@ -496,8 +498,7 @@ def encode_jpeg(image: Image, width: int, quality: int = 70) -> bytes:
 
 
 def warp(image: Image, matrix: Floats, size: tuple[int, int]) -> Image:
-    """Return an image moved by a homography (3, 3) of pixels into one of another size (width, height);
-    what lies outside of it is 0."""
+    """Warp an image by a homography (3, 3) to a size (width, height); pixels without a source are 0."""
     cv2 = _load()
     return np.asarray(cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_NEAREST), np.uint8)
 
@@ -517,7 +518,7 @@ def enlarge(picture: NDArray[_Number], factor: int) -> NDArray[_Number]:
 
 
 def blur(image: Image, sigma: float) -> Image:
-    """Return an image blurred by a Gaussian of so many pixels."""
+    """Blur an image by a Gaussian with `sigma` in pixels."""
     return np.asarray(_load().GaussianBlur(image, (0, 0), sigma), np.uint8)
 
 
@@ -528,7 +529,7 @@ def open_camera(number: int) -> Any:
         UsageError: there is no such camera.
     """
     cv2 = _load()
-    # the error below says it in one sentence
+    # OpenCV's warnings are muted, because the error below reports the failure
     log = cv2.utils.logging
     level = log.setLogLevel(log.LOG_LEVEL_ERROR)
     try:
@@ -560,6 +561,6 @@ def _load() -> Any:
     """
     with importing("cameras need OpenCV", extra="vision"):
         import cv2
-    # one thread: results that do not depend on the machine, and no fight with the caller's threads
+    # one thread, so that results do not depend on the machine, and the caller's threads keep their cores
     cv2.setNumThreads(1)
     return cv2

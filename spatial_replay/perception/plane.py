@@ -1,8 +1,8 @@
-"""The plane that objects are on: pixels to places in it, and how far a place may be wrong.
+"""The plane of the objects: conversion of pixels to places, and the uncertainty of places.
 
-Three ways lead there: a homography of reference tags; a calibrated camera whose pose is given or follows
-from reference tags; or the image itself. Each keeps the covariance of what it was measured from, so that a
-place far from all reference tags is known to be less certain.
+A plane is a homography from reference tags, the view of a calibrated camera, or the image itself. The pose of
+the camera is given or from reference tags. A plane from reference tags has a covariance, so that a place far
+from all of them is less certain.
 """
 
 from __future__ import annotations
@@ -20,21 +20,19 @@ from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, p
 from spatial_replay.perception.tags_file import MountedTag, TagsFile
 
 LEAST_CORNER_ERROR: Final = 0.1
-"""Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit."""
+"""Least standard deviation of a corner, pixels, however well reference tags fit."""
 
 USUAL_CORNER_ERROR: Final = 0.3
-"""The same where nothing measures it."""
+"""Standard deviation of a corner if reference tags do not measure it, pixels."""
 
 _WORST_RESIDUAL: Final = 3.0
-"""Pixels by which a reference tag may be off; more is no noise but a wrong place."""
+"""Largest error of a reference tag from noise, pixels; a larger error is a wrong place."""
 
 _LEAST_SLANT: Final = math.sin(math.radians(8.0))
-"""A plane that is seen at less than this, the sine of an angle, is seen edge-on; further down, no tags are
-found."""
+"""Sine of the angle to the plane below which it is seen edge-on; at lower angles, no tags are found."""
 
 _WIDEST: Final = 1.0
-"""Half of the image's diagonal, in focal lengths, of a camera that is not calibrated: 90 degrees from corner
-to corner."""
+"""Half of the image's diagonal of an uncalibrated camera, focal lengths: 90 degrees between corners."""
 
 _STEP: Final = 1e-6
 
@@ -50,18 +48,18 @@ class Plane(Protocol):
         """Return the places (…, 2) of pixels (…, 2) at heights (…) above the plane."""
 
     def covariance(self, pixels: Floats, z: Floats) -> Floats:
-        """Return the covariance (N, 2, 2) of the places of pixels (N, 2) that comes from the plane itself."""
+        """Return the covariance (N, 2, 2) of the places of pixels (N, 2), from the error of the plane."""
 
     def pixels(self, places: Floats) -> Floats:
-        """Return where places (N, 3) appear, (N, 2)."""
+        """Return the pixels (N, 2) of places (N, 3)."""
 
 
 class Fit(NamedTuple):
-    """How reference tags fit.
+    """Fit of a plane to reference tags.
 
     Attributes:
-        rms: of the distances of their corners, in pixels.
-        worst: the tag that is off most, and by how many pixels on average.
+        rms: root mean square error of their corners, pixels.
+        worst: tag with the largest error, and mean error of its corners, pixels.
     """
 
     plane: Plane
@@ -71,7 +69,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePlane:
-    """The image itself, y up: the outer corner of its lowest pixel on the left is (0, 0)."""
+    """The image itself, with y up; the outer corner of its lower left pixel is (0, 0)."""
 
     height: int
     corner_error: float = USUAL_CORNER_ERROR
@@ -91,12 +89,12 @@ class ImagePlane:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomographyPlane:
-    """A plane seen without a calibrated camera: heights above it cannot be resolved.
+    """A plane seen by an uncalibrated camera, which does not resolve heights above the plane.
 
     Attributes:
-        pixel_from_plane: (3, 3), its last entry 1.
-        spread: (8, 8), the covariance of its other entries.
-        size: (width, height) of the images in pixels; zeros where it is not known.
+        pixel_from_plane: (3, 3), homography with the last entry 1.
+        spread: (8, 8), covariance of the other entries.
+        size: (width, height) of the images, pixels; (0, 0) if it is not known.
     """
 
     pixel_from_plane: Floats
@@ -129,14 +127,14 @@ class HomographyPlane:
     def parallax(self, pixels: Floats, z: Floats) -> tuple[Floats, Floats]:
         """Bound the error of reading pixels (N, 2) at heights (N,) as places in the plane.
 
-        A ray at the angle t to the plane's normal gains |z| tan t on its way from the height z to the plane.
-        The map from the plane to the image is A B. B, to the sphere around the camera, has the singular
-        values (1, cos t) / d at the distance d. A, from the sphere to the image, has f / cos p and f / cos² p
-        at the angle p to the optical axis. So cos t is at least cos p times the ratio of those of A B, and d
-        at least f divided by the greater one.
+        A ray at the angle t to the plane's normal shifts by |z| tan t between the height z and the plane. The
+        map from the plane to the image is A B. B maps the plane to the sphere around the camera. At the
+        distance d, its singular values are (1, cos t) / d. A maps the sphere to the image. At the angle p to
+        the optical axis, its singular values are f / cos p and f / cos² p. So cos t is at least cos p times
+        the ratio of the singular values of A B, and d is at least f divided by the greater one.
 
         Returns:
-            How far places may be off, and by which share lengths may appear too large, (N,) each.
+            Largest errors of places, and largest relative errors of lengths, (N,) each.
         """
         matrix, places = self.pixel_from_plane, self.places(pixels, z)
         depth = places @ matrix[2, :2] + matrix[2, 2]
@@ -144,7 +142,7 @@ class HomographyPlane:
         greater, lesser = np.linalg.svd(local, compute_uv=False).T
         size = np.array(self.size, np.float64)
         half = float(np.linalg.norm(size)) / 2
-        # detections without images: the image reaches at least as far as they do
+        # without images, the image is assumed to reach as far as the detections
         focal = (half or float(np.linalg.norm(pixels, axis=1).max()) / 2) / _WIDEST
         off_axis = np.linalg.norm(pixels - (size - 1) / 2, axis=1) / focal if half else _WIDEST
         cosine = lesser / greater / np.sqrt(1 + np.square(off_axis))
@@ -160,7 +158,7 @@ class CameraPlane:
 
     Attributes:
         pose: (6,), rotation vector and translation from the plane's frame to the camera's.
-        spread: (6, 6), its covariance.
+        spread: (6, 6), covariance of the pose.
     """
 
     camera: Camera
@@ -170,7 +168,7 @@ class CameraPlane:
 
     @property
     def rotation(self) -> Floats:
-        """(3, 3), from the plane's frame to the camera's."""
+        """(3, 3), rotation from the plane's frame to the camera's."""
         return np.asarray(rotations(self.pose[None, :3])[0], np.float64)
 
     def places(self, pixels: Floats, z: Floats) -> Floats:
@@ -197,11 +195,11 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     """Fit the plane to reference tags.
 
     Args:
-        size: (width, height) of the images in pixels; zeros where it is not known.
-        corners: (4, 2) of each reference tag that was detected, at least `LEAST_REFERENCES`.
+        size: (width, height) of the images, pixels; (0, 0) if it is not known.
+        corners: (4, 2) corners of the detected reference tags, at least `LEAST_REFERENCES` tags.
 
     Raises:
-        UsageError: they do not fit, or the plane is seen edge-on.
+        UsageError: the tags do not fit, or the plane is seen edge-on.
     """
     references = [tag for tag in tags.references if tag.id in corners]
     known_corners = np.concatenate([tag.corners for tag in references])
@@ -219,7 +217,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     _refuse_misfit(tags, references, by_tag, seen, known_corners)
     error = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
     flat_derivative = derivative.reshape(-1, unknowns)
-    # a place that is wrong by some length moves the tag's corners by that many pixels
+    # an error of a tag's place moves its corners by this many pixels per unit
     per_pixel = _pixels_per_unit(seen, known_corners)
     variance = error**2 + (tags.reference_error * per_pixel) ** 2
     spread = np.asarray(variance * np.linalg.pinv(flat_derivative.T @ flat_derivative), np.float64)
@@ -233,7 +231,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
 
 
 def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
-    """Return the plane that a tags file determines alone; None if reference tags have to be seen first.
+    """Return the plane that a tags file determines without images; None if that takes reference tags.
 
     Args:
         size: (width, height) of the images in pixels.
@@ -256,7 +254,7 @@ def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
 
 
 def _through(matrix: Floats, points: Floats) -> Floats:
-    """Return points (…, 2) moved by a homography."""
+    """Map points (…, 2) by a homography."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         moved: Floats = homogeneous[..., :2] / homogeneous[..., 2:]
@@ -264,7 +262,7 @@ def _through(matrix: Floats, points: Floats) -> Floats:
 
 
 def _cast(directions: Floats, rotation: Floats, shift: Floats, z: Floats) -> Floats:
-    """Return where rays (…, 2) from a camera meet the heights (…) above the plane; NaN behind the camera."""
+    """Return the places of camera rays (…, 2) at heights (…) above the plane; NaN behind the camera."""
     eye = -rotation.T @ shift
     rays = np.concatenate([directions, np.ones((*directions.shape[:-1], 1))], axis=-1) @ rotation
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -274,7 +272,7 @@ def _cast(directions: Floats, rotation: Floats, shift: Floats, z: Floats) -> Flo
 
 
 def _homography_jacobian(matrix: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Return where points (N, 2) go, and the derivative (N, 2, 8) by the matrix without its last entry."""
+    """Map points (N, 2); return them and their derivative (N, 2, 8) by the first eight entries."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     u, v, w = homogeneous.T
     x, y = points.T
@@ -285,7 +283,7 @@ def _homography_jacobian(matrix: Floats, points: Floats) -> tuple[Floats, Floats
 
 
 def _pixels_per_unit(seen: Floats, known: Floats) -> float:
-    """Return how many pixels a unit of the plane takes at most, from the edges of tags."""
+    """Return the largest number of pixels per unit of the plane, from the edges of tags."""
     edges = [np.diff(corners.reshape(-1, 4, 2), axis=1).reshape(-1, 2) for corners in (seen, known)]
     lengths = [np.linalg.norm(edge, axis=1) for edge in edges]
     return float((lengths[0] / lengths[1]).max())
@@ -294,13 +292,13 @@ def _pixels_per_unit(seen: Floats, known: Floats) -> float:
 def _refuse_misfit(
     tags: TagsFile, references: Sequence[MountedTag], off: Floats, seen: Floats, known: Floats
 ) -> None:
-    """Check that no tag is off (K,) by more pixels than noise and `error` explain."""
+    """Check that no tag's error in `off` (K,), pixels, exceeds noise and the stated error of places."""
     limit = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen, known)
     if off.max() <= limit:
         return
     first = references[0]
     for turns in (2, 1, 3):
-        # the corners of all tags, each counted from another one
+        # the corners of all tags in a turned order
         turned = np.roll(known.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)
         solved = _solve(turned, seen, tags.camera)
         if solved is not None and _off_by_tag(turned, seen, solved, tags.camera).max() <= limit:
@@ -325,8 +323,11 @@ def _refuse_misfit(
 
 
 def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float, float] | None:
-    """Return the place of the tag without which the others fit best, its offset from where they place it, and
-    their greatest offset, in pixels."""
+    """Find the tag without which the other tags fit best; None if no fit exists.
+
+    Returns:
+        its index, its error in the fit of the others, and the largest error of the others, pixels.
+    """
     candidates: list[tuple[float, int, float]] = []
     for place in range(len(known) // 4):
         others = np.arange(len(known)) // 4 != place
@@ -341,7 +342,7 @@ def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float,
 
 
 def _solve(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
-    """Return the homography (3, 3), or with a camera its pose (6,), with which places appear at pixels."""
+    """Fit the homography (3, 3), or a camera's pose (6,), from places to pixels; None if there is none."""
     if camera is not None:
         return fit_pose(_flat(known), seen, camera)
     homography = fit_homography(known, seen)
@@ -353,12 +354,12 @@ def _solve(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
 
 
 def _appearing(known: Floats, found: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
-    """Return where places appear, and the derivative by what was found."""
+    """Return the pixels of places, and their derivative by the homography or the pose."""
     return _homography_jacobian(found, known) if camera is None else projection(_flat(known), found, camera)
 
 
 def _off_by_tag(known: Floats, seen: Floats, found: Floats, camera: Camera | None) -> Floats:
-    """Return by how many pixels the corners of each tag are off on average, (K,)."""
+    """Return the mean error of each tag's corners, (K,), pixels."""
     off = np.linalg.norm(_appearing(known, found, camera)[0] - seen, axis=1)
     return np.asarray(off.reshape(-1, 4).mean(axis=1))
 
@@ -368,7 +369,7 @@ def _flat(places: Floats) -> Floats:
 
 
 def _refuse_edge_on(tags: TagsFile, seen: Floats, known: Floats) -> None:
-    """Check that the tags are not seen as lines."""
+    """Check that tags are not seen edge-on."""
     areas = [np.abs(_areas(corners.reshape(-1, 4, 2))) for corners in (seen, known)]
     longest = np.linalg.norm(np.diff(seen.reshape(-1, 4, 2), axis=1), axis=2).max(axis=1)
     if float(np.median(areas[0] / longest**2)) < _LEAST_SLANT:

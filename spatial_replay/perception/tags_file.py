@@ -1,4 +1,4 @@
-"""Tags files: which tag is on which object, where the plane is, and what the camera does."""
+"""Tags files: tags on objects, the plane, and the camera."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from spatial_replay.perception.opencv import FAMILY_SIZES, Camera, pose_looking_
 from spatial_replay.trace.trace import duration_ns_from_text
 
 LEAST_REFERENCES: Final = 4
-"""Reference tags that a plane takes without a calibrated camera; with one, a single tag could do, but a wrong
-place of it would not be noticed."""
+"""Least number of reference tags for a plane.
+
+With a calibrated camera, one tag would be enough, but an error of its place would not be noticed.
+"""
 
 _UNITS: Final = {"": 1.0, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _LENGTH: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*(mm|cm|m)")
@@ -31,14 +33,14 @@ _ANGLE: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*deg")
 
 @dataclass(frozen=True, slots=True)
 class MountedTag:
-    """A tag on an object, in the object's own frame, or one whose place in the plane is known.
+    """A tag on an object, in the object's frame, or a reference tag, in the plane.
 
     Attributes:
-        id: its number.
+        id: number of the tag.
         size: edge of its black square, in footprint units.
-        x, y: where its centre is.
-        yaw: radians, counter-clockwise from the frame's x axis to the tag's, which points to its right.
-        z: height of the tag above the reference tags, for objects that stay where they stand.
+        x, y: place of its centre.
+        yaw: angle from the frame's x axis to the tag's right, counter-clockwise, radians.
+        z: height of the tag above the reference tags while its object rests.
     """
 
     id: int
@@ -50,7 +52,7 @@ class MountedTag:
 
     @property
     def corners(self) -> Floats:
-        """(4, 2), in the order of a detection."""
+        """(4, 2), corners in the order of a `Detection`."""
         half = self.size / 2
         turn = np.array([[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]])
         square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
@@ -63,10 +65,10 @@ class TaggedObject:
     """An object with tags.
 
     Attributes:
-        footprint: in its own frame.
+        footprint: footprint in the object's frame.
         height: (bottom, top) above the plane, or None.
-        is_lifted: whether it may leave the plane: the pose of a tag is then found in space.
-        fastest: units a second, by which a held object's uncertainty grows.
+        is_lifted: whether it may leave the plane; then the poses of its tags are fitted in space.
+        fastest: highest speed, at which the uncertainty of a held object grows, units per second.
     """
 
     name: str
@@ -83,20 +85,20 @@ class TagsFile:
     """A valid tags file.
 
     Attributes:
-        name: of the file.
-        family: of all its tags.
+        name: name of the file.
+        family: family of all its tags.
         is_image: whether the plane is the image itself, in pixels.
-        references: tags whose places are known.
-        camera: None if it is not calibrated.
-        pose: (6,), rotation vector and translation from the plane's frame to the camera's; None where the
-            reference tags give it.
-        cameras: of several, by the name or number of each; instead of `camera` and `pose`.
-        corner_error: standard deviation of a corner in pixels; None to measure it.
-        reference_error: how far a reference tag may be from its place, in footprint units.
-        sigmas: standard deviations that the stated uncertainty covers.
-        hold_ns: how long a hidden object stays where it was, ever less certain.
-        by_id: the object that a tag is on, and how.
-        text: its text.
+        references: tags with known places.
+        camera: calibrated camera; None if it is not calibrated.
+        pose: (6,), rotation vector and translation from the plane's frame to the camera's; None if it comes
+            from reference tags.
+        cameras: camera and pose of each of several cameras, by name or number; replaces `camera` and `pose`.
+        corner_error: standard deviation of a corner, pixels; None to measure it.
+        reference_error: error of a reference tag's place, in footprint units.
+        sigmas: number of standard deviations that the stated uncertainty covers.
+        hold_ns: time that a hidden object is held at its last place, with growing uncertainty.
+        by_id: object and mounting of each tag by number.
+        text: text of the file.
     """
 
     name: str
@@ -121,19 +123,19 @@ class TagsFile:
 
     @property
     def ids(self) -> frozenset[int]:
-        """All tags that it names."""
+        """Numbers of all tags in the file."""
         return frozenset([*self.by_id, *(reference.id for reference in self.references)])
 
     def of_camera(self, name: str, number: int = 1, *, count: int = 1) -> TagsFile:
-        """Return what the file says for one of several cameras.
+        """Return the tags file for one of several cameras.
 
         Args:
-            name: of its video or topic.
-            number: from 1, in the order in which they are given.
-            count: how many cameras there are.
+            name: name of its video or topic.
+            number: number of the camera, from 1.
+            count: number of cameras.
 
         Raises:
-            UsageError: the file does not say what this one does, or says that all have one pose or one image.
+            UsageError: the file lacks this camera, or gives one pose or one image for several cameras.
         """
         if self.cameras:
             camera = self.cameras.get(name, self.cameras.get(str(number)))
@@ -170,7 +172,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
     """Parse the text of a tags file.
 
     Args:
-        name: of the file, for errors.
+        name: name of the file, for errors.
 
     Raises:
         UsageError: the text is not valid; all errors are listed.
@@ -217,7 +219,7 @@ def _object(
     """Return an object; `level` is the height of the reference tags."""
     height = entry.get("height")
     interval = None if height is None else (_length(height[0]), _length(height[1]))
-    # in an image there are no heights; a tag without one is as high as the reference tags
+    # an image has no heights; a tag on an object without a height is as high as the reference tags
     top = level if interval is None or _is_image(defaults) else interval[1]
     mounted = entry["tags"] if "tags" in entry else [entry["tag"]]
     tags = []
@@ -268,7 +270,7 @@ def _camera(value: Mapping[str, Any]) -> Camera:
 
 
 def _pose(camera: Mapping[str, Any]) -> Floats | None:
-    """Return the pose (6,) of a camera that is at a place and looks at a point; None if that is not given."""
+    """Return the pose (6,) from a camera's position and the point that it looks at; None without them."""
     value = camera.get("pose")
     if value is None:
         return None
@@ -301,7 +303,7 @@ def _is_image(value: Mapping[str, Any]) -> bool:
 
 
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
-    """Find what a schema cannot express: tags that are used twice, planes without enough to find them."""
+    """Find faults that a schema cannot express, such as a tag that is used twice or an undetermined plane."""
     value: Any = document.value
     if not isinstance(value, dict) or not isinstance(value.get("objects"), dict):
         return []
@@ -387,8 +389,10 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
 
 
 def _reach(known: Any) -> float:
-    """Return the diagonal of the box around reference tags, or a camera and the point that it looks at, in
-    metres; inf where it is not known."""
+    """Return the diagonal of the box around points, in metres; inf if it is not known.
+
+    The points are the reference tags, or a camera and the point that it looks at.
+    """
     try:
         entries = [entry for key, entry in known.items() if key != "up"]
         places = [[*map(_length, entry["at"] if isinstance(entry, dict) else entry)] for entry in entries]
@@ -398,7 +402,7 @@ def _reach(known: Any) -> float:
 
 
 def _beyond(value: Any, reach: float) -> str:
-    """Return that a length without a unit is larger than the plane; "" where it is not."""
+    """Return the fault of a length without a unit that exceeds `reach`; "" for a smaller length."""
     number = max(_plain_numbers(value), default=0.0)
     if number <= reach:
         return ""
@@ -409,7 +413,7 @@ def _beyond(value: Any, reach: float) -> str:
 
 
 def _plain_numbers(value: Any) -> Iterator[float]:
-    """Yield the sizes of the numbers without a unit in a list, at any depth."""
+    """Yield the absolute values of numbers without a unit in nested lists."""
     if isinstance(value, list):
         for number in value:
             yield from _plain_numbers(number)
@@ -418,11 +422,11 @@ def _plain_numbers(value: Any) -> Iterator[float]:
 
 
 def _outline_fault(corners: Any) -> str | None:
-    """Return why the corners of a polygon enclose no footprint; None if they do, or are no corners."""
+    """Return the reason why a polygon is no footprint; None for a footprint, and for malformed corners."""
     try:
         Footprint.polygon([[_length(coordinate) for coordinate in corner] for corner in corners])
     except GeometryError as error:
-        # what functions take, a tags file does not have
+        # a tags file has no `concave`
         return str(error).removesuffix(", or take its hull (concave='hull')")
     except (UsageError, TypeError, ValueError):
         pass

@@ -1,10 +1,10 @@
 """Video files and H.264 frames: decoding, encoding and writing; the only module that imports PyAV.
 
-A predicted frame is drawn onto the frames before it. If one of those is missing or damaged, a decoder makes
-up the difference: its pictures are old, or in parts, until the next key frame.
+A predicted frame depends on earlier frames. If one of them is missing or damaged, a decoder invents the
+missing parts: its images are outdated or incomplete until the next key frame. Such a frame is not true.
 
-A log stores video as H.264 in Annex B form, one frame a message, with parameter sets before each key frame
-and without B frames, as `foxglove.CompressedVideo` demands.
+A log stores video as H.264 in Annex B form. `foxglove.CompressedVideo` demands one frame per message,
+parameter sets before each key frame, and no B frames.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from spatial_replay.text import plural
 
 _OPTIONS: Final = MappingProxyType({"max_pixels": str(LARGEST_PICTURE)})
 _IDR, _SEQUENCE_PARAMETERS = 5, 7
-"""Kinds of units in H.264."""
+"""Types of NAL units in H.264."""
 
 _MISSING: Final = "Frame num gap"
-"""How the decoder of H.264 begins to say that frames are missing, at the level of its debugging."""
+"""Prefix of the debug messages of FFmpeg's H.264 decoder about missing frames."""
 _HARMLESS: Final = "SEI"
 """Prefix of FFmpeg's messages about malformed SEI units, which are harmless."""
 
 _MOST_WAITING: Final = 32
-"""Packets; codecs show a frame at most 16 later."""
+"""Most packets that wait for their frames; codecs delay a frame by at most 16 packets."""
 
 _TURN = threading.Lock()
-"""Held while one thread decodes: how much FFmpeg says is set for all of them."""
+"""Lock for decoding, because FFmpeg has one log level for all threads."""
 
 
 class Decoded(NamedTuple):
-    """A frame as it comes out of the decoder.
+    """A decoded frame.
 
     Attributes:
-        of: what was given with its packet.
-        frame: of PyAV.
-        is_true: whether nothing it was drawn onto is missing or damaged.
+        of: object that was passed with its packet.
+        frame: frame of PyAV.
+        is_true: whether no frame that it depends on is missing or damaged.
     """
 
     of: Any
@@ -60,12 +60,12 @@ class Decoded(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """An image as it comes out of the decoder.
+    """A decoded image.
 
     Attributes:
-        of: what was given with its message.
-        image: black if it is not true.
-        is_true: whether nothing it was drawn onto is missing or damaged.
+        of: object that was passed with its message.
+        image: image of the frame; black if the frame is not true.
+        is_true: whether no frame that it depends on is missing or damaged.
     """
 
     of: Any
@@ -75,7 +75,12 @@ class Shown(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class _Sent:
-    """A packet under way: what was given with it, and the losses noticed before it and with it."""
+    """A pending packet.
+
+    Attributes:
+        of: object that was passed with it.
+        before, after: numbers of losses before and after it was decoded.
+    """
 
     of: Any
     before: int
@@ -85,30 +90,30 @@ class _Sent:
 
 
 class Decoder:
-    """Packets to frames, in their order of showing; a process for one stream."""
+    """Decodes the packets of one stream to frames in display order."""
 
     def __init__(self, context: Any) -> None:
-        """Prepare a codec context that is not open yet: one thread, one frame out for one in."""
+        """Prepare a codec context that is not open yet; one thread, because several threads delay frames."""
         av = load_av()
         context.thread_type, context.thread_count = "NONE", 1
         context.options = dict(_OPTIONS)
         context.flags |= av.codec.context.Flags.copy_opaque
         self._context = context
         self._losses = 0
-        # the losses that no longer count, since a key frame was shown after them
+        # number of losses before the last key frame, which no longer count
         self._mended = 0
-        # sent after a loss, and not shown yet
+        # packets after a loss whose frames are pending
         self._waiting: list[_Sent] = []
 
     def decode(self, packet: Any, of: Any = None) -> list[Decoded]:
-        """Return the frames that come out with a packet, which may be those of earlier ones.
+        """Decode a packet; return the finished frames, which may be frames of earlier packets.
 
         Args:
-            packet: None for what is held back; the decoder is then at its end.
-            of: what to give back with its frame.
+            packet: packet; None for the frames that are held back, at the end of the stream.
+            of: object that is returned with its frame.
 
         Raises:
-            av.FFmpegError: it cannot be decoded; what follows is not true until the next key frame.
+            av.FFmpegError: it cannot be decoded; later frames are not true until the next key frame.
         """
         av = load_av()
         sent = _Sent(of, self._losses, self._losses, None, None)
@@ -149,7 +154,7 @@ class Decoder:
             self._waiting.append(sent)
 
     def _skipped_frames(self, pts: int | None) -> Iterator[Decoded]:
-        """Yield empty frames for those due before a stamp: some decoders skip what they cannot draw."""
+        """Yield empty frames for pending frames before a stamp; some decoders skip frames after a loss."""
         late = [waiting for waiting in self._waiting if pts is None or cast("int", waiting.pts) < pts]
         self._waiting = [waiting for waiting in self._waiting if waiting not in late]
         width, height = self._context.width, self._context.height
@@ -162,14 +167,14 @@ class Decoder:
     def _judge(self, frame: Any, sent: _Sent) -> Decoded:
         if frame.is_corrupt:
             self._mended = -1
-        # a picture that is renewed strip by strip is called a key frame where that begins, but is predicted
+        # with intra refresh (strip by strip), FFmpeg marks the first frame as key, but it is predicted
         elif frame.key_frame and frame.pict_type not in _predicted_kinds() and sent.before == sent.after:
             self._mended = max(self._mended, sent.after)
         return Decoded(sent.of, frame, sent.after <= self._mended)
 
 
 class H264Decoder:
-    """H.264 messages to images, in their order; a process for one topic."""
+    """Decodes the H.264 messages of one topic to images, in order."""
 
     def __init__(self) -> None:
         """Open the decoder; frames before the first key frame are not decoded."""
@@ -178,15 +183,17 @@ class H264Decoder:
         self._count = 0
 
     def decode(self, data: bytes, of: Any = None) -> Iterator[Shown]:
-        """Yield what comes out with a message: nothing before the first key frame, perhaps earlier messages.
+        """Decode a message; yield the finished images, which may be of earlier messages.
+
+        Messages before the first key frame are skipped.
 
         Raises:
-            LogError: it is damaged.
+            LogError: the message is damaged.
         """
         self._is_ready |= has_key(data)
         if self._is_ready:
             av = load_av()
-            # in their order, so that those which are skipped are known
+            # stamps count the messages, so that skipped frames are noticed
             packet = av.Packet(data)
             packet.pts, packet.time_base = self._count, Fraction(1)
             self._count += 1
@@ -198,7 +205,7 @@ class H264Decoder:
                 yield Shown(frame.of, picture(frame), frame.is_true)
 
     def rest(self) -> Iterator[Shown]:
-        """Yield what is held back; the decoder is then at its end."""
+        """Yield the images that are held back, at the end of the stream."""
         if self._is_ready:
             with suppress(load_av().FFmpegError):
                 for frame in self._decoder.decode(None):
@@ -206,20 +213,19 @@ class H264Decoder:
 
 
 class Untrue:
-    """Counts frames that are not true; a process for one run.
+    """Counts frames that are not true in one run.
 
     Attributes:
-        frames: how many.
-        last: how many of them at the end.
+        frames: number of these frames.
+        last: number of these frames after the last true frame.
     """
 
     def __init__(self) -> None:
-        """Begin with none."""
         self.frames = self.last = self._places = 0
         self._first_ns = 0
 
     def add(self, time_ns: int, is_true: bool) -> None:
-        """Take note of a frame, shown so long after the first."""
+        """Count a frame; `time_ns` is its time after the first frame."""
         if is_true:
             self.last = 0
             return
@@ -230,7 +236,7 @@ class Untrue:
         self.last += 1
 
     def faults(self, name: str) -> list[str]:
-        """Return what to say of them, if there are any."""
+        """Return the fault of these frames, if there are any."""
         if not self.frames:
             return []
         where = f"after {self._first_ns / 1e9:.3f} s"
@@ -243,7 +249,7 @@ class Untrue:
 
 
 def has_key(data: bytes) -> bool:
-    """Return whether H.264 in Annex B form can be decoded from here on."""
+    """Return whether a decoder can start at a message of H.264 in Annex B form."""
     at = data.find(b"\x00\x00\x01")
     while 0 <= at < len(data) - 3:
         if data[at + 3] & 31 in (_IDR, _SEQUENCE_PARAMETERS):
@@ -253,10 +259,10 @@ def has_key(data: bytes) -> bool:
 
 
 def picture(decoded: Decoded) -> Image:
-    """Return the image of a frame; black where it is not true, since tags may seem to be where they are not.
+    """Return the image of a frame; black if it is not true, because it may show tags at wrong places.
 
     Raises:
-        LogError: it is too large.
+        LogError: the frame is too large.
     """
     width, height = decoded.frame.width, decoded.frame.height
     if width * height > LARGEST_PICTURE:
@@ -267,7 +273,7 @@ def picture(decoded: Decoded) -> Image:
 
 
 def reason(error: BaseException) -> str:
-    """Return what FFmpeg says, short."""
+    """Return FFmpeg's text of an error, shortened."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return f"{text!s:.200}".lower()
 
@@ -288,7 +294,7 @@ def load_av() -> Any:
     with importing("videos need PyAV", extra="vision"):
         import av
         import av.bitstream
-    # its messages would go to the terminal; errors are raised, and those of decoders are listened to
+    # FFmpeg would print its messages; errors are raised, and `Decoder` reads the messages of decoders
     with suppress(AttributeError):
         av.logging.set_level(None)
         av.logging.set_skip_repeated(False)
@@ -298,21 +304,21 @@ def load_av() -> Any:
 # ----------------------------------------------------------------------------------------- files and encoding
 
 _KEY_FRAMES: Final = 30
-"""Frames from one key frame to the next in what we encode: a viewer seeks to the one before the cursor."""
+"""Interval of key frames in our videos, frames; a viewer seeks to the key frame before its cursor."""
 
 _NS: Final = Fraction(1, 10**9)
 _TICK: Final = Fraction(1, 90_000)
 _MOST_BOXES: Final = 1000
-"""Boxes of an .mp4 that are looked at for its index."""
+"""Most boxes of an .mp4 that are searched for its index."""
 
 
 class VideoFile:
-    """Frames of a video file, with their own stamps from the first frame on; a process for one run.
+    """Frames of a video file, to iterate over once; stamps count from the first frame.
 
     Attributes:
-        name: of the file.
-        channel: None, since it is no topic.
-        faults: what was lost so far, each with its place.
+        name: name of the file.
+        channel: None, because a file has no topic.
+        faults: losses so far, each with its place.
     """
 
     channel = None
@@ -321,11 +327,11 @@ class VideoFile:
         """Open the file.
 
         Args:
-            rate: frames a second, instead of the file's own stamps.
+            rate: frames per second, which replace the file's own stamps.
 
         Raises:
             MissingFileError: there is no such file.
-            LogError: it is no video, or its codec is not there.
+            LogError: the file is no video, or its codec is missing.
             UsageError: PyAV is not installed, or the rate is not above 0.
         """
         if rate is not None and not (math.isfinite(rate) and rate > 0):
@@ -373,7 +379,7 @@ class VideoFile:
 
     @property
     def copy_fault(self) -> str | None:
-        """Why its frames cannot be copied into a log as they are; None if they can."""
+        """Reason why its frames cannot be copied into a log unchanged; None if they can."""
         context = self._stream.codec_context
         if context.name != "h264":
             return f"{self.name} holds {context.name}, not H.264"
@@ -383,9 +389,9 @@ class VideoFile:
 
     @property
     def remark(self) -> str | None:
-        """That its own stamps are ignored; None without a rate, or if it has no stamps or they go back.
+        """Remark that its own stamps are ignored; None without a rate, without stamps, or if they go back.
 
-        It is complete once all frames are read.
+        It is final after all frames are read.
         """
         if self._rate is None or not self._has_stamps or self._goes_back:
             return None
@@ -400,7 +406,7 @@ class VideoFile:
         last_ns = before_ns = -1
         first, count, widest_ns = None, 0, 0
         untrue = Untrue()
-        # a frame that is not true, until there is another one
+        # a frame that is not true waits for the next one, because the last frame of a cut file is dropped
         waiting: Frame | None = None
         try:
             length_ns = self._length_ns()
@@ -427,7 +433,7 @@ class VideoFile:
                     yield frame
                 else:
                     waiting = frame
-            # a file that ends within a frame has damaged that one
+            # only the last frame is not true, so the file ends within it
             if untrue.last == untrue.frames == 1:
                 at = (
                     "in its first frame"
@@ -439,7 +445,7 @@ class VideoFile:
             if waiting is not None:
                 yield waiting
             self.faults += untrue.faults(self.name)
-            # the last frame is shown as long as any other, however uneven they are
+            # a last frame of more than 1.5 times the longest interval means that frames are missing
             if widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
                 ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
                 self.faults.append(f"{self.name} breaks off after {ends}")
@@ -457,9 +463,9 @@ class VideoFile:
         )
 
     def _decode(self) -> Iterator[Decoded]:
-        """Yield frames in the order of showing, each with its bytes if it can be copied."""
+        """Yield frames in display order, each with its bytes if it can be copied."""
         av = load_av()
-        # an .avi has no times of showing: the frames shown take the times of decoding, in their order
+        # an .avi has no display times, so frames in display order get the decoding times in order (`slots`)
         is_avi = self._container.format.name == "avi"
         is_reordered = is_avi and self._stream.codec_context.has_b_frames
         slots: deque[int] = deque()
@@ -481,14 +487,14 @@ class VideoFile:
                 frames = self._decoder.decode(packet, (copies, slot))
             except av.InvalidDataError as error:
                 self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
-            # the filter takes the packet's content
+            # after decoding, because the filter consumes the packet's content
             if convert is not None and packet.size:
-                # one that is damaged has been reported above
+                # a damaged packet was reported above
                 with suppress(av.InvalidDataError):
                     copies += [bytes(converted) for converted in convert.filter(packet)]
             for decoded in frames:
                 copies, slot = decoded.of
-                # a key frame is not shown before it is decoded: frames lost ahead of it leave their slots
+                # a key frame is not displayed before it is decoded: earlier slots belong to lost frames
                 while decoded.frame.key_frame and slot is not None and slots and slots[0] < slot:
                     slots.popleft()
                 if slots:
@@ -496,13 +502,13 @@ class VideoFile:
                 yield decoded._replace(of=b"".join(copies))
 
     def _length_ns(self) -> int:
-        """Return how long the file says that the video is; 0 if it does not."""
+        """Return the length of the video in the file's header; 0 if it has none."""
         if self._rate is not None:
             return 0
         stream, container = self._stream, self._container
         if stream.duration is not None:
             return int(stream.duration * stream.time_base / _NS)
-        # of several streams another one may be longer
+        # the length of the container may be that of another, longer stream
         return 1000 * (container.duration or 0) if len(container.streams) == 1 else 0
 
     def _stamp_ns(self, frame: Any, count: int) -> int:
@@ -524,10 +530,10 @@ class VideoFile:
 
 
 class H264Encoder:
-    """Frames to H.264, one message each; a process for one video."""
+    """Encodes the frames of one video to H.264, one message per frame."""
 
     def __init__(self, width: int, height: int, rate: int = 30) -> None:
-        """Open the encoder; a picture with an odd edge loses a row or column of pixels.
+        """Open the encoder; an odd height or width loses a row or column of pixels.
 
         Raises:
             UsageError: PyAV is not installed.
@@ -551,7 +557,7 @@ class H264Encoder:
         self._context = context
 
     def encode(self, frame: Frame) -> bytes:
-        """Return the next frame, times increasing."""
+        """Encode the next frame; times must increase."""
         picture = _to_encode(frame, self._size)
         picture.pts = frame.time_ns // 1000
         picture.time_base = Fraction(1, 1_000_000)
@@ -559,14 +565,14 @@ class H264Encoder:
 
 
 class VideoWriter:
-    """Writes frames as a video (H.264, no B frames), as a context manager; a process for one file."""
+    """Writes frames to a video file (H.264, no B frames), as a context manager."""
 
     def __init__(self, path: Path, rate: int = 30) -> None:
         """Open the file.
 
         Raises:
             OutputError: the file cannot be written.
-            UsageError: PyAV is not installed, or the name's ending is not that of a video.
+            UsageError: PyAV is not installed, or the name does not end like a video.
         """
         av = load_av()
         self._rate = rate
@@ -587,7 +593,7 @@ class VideoWriter:
         self._container.close()
 
     def write(self, frame: Frame) -> None:
-        """Add a frame; an odd edge of the picture loses a row or column of pixels."""
+        """Add a frame; an odd height or width loses a row or column of pixels."""
         height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
         if self._stream is None:
             self._stream = self._open(width, height)
@@ -607,14 +613,14 @@ class VideoWriter:
 
 
 def _to_encode(frame: Frame, size: tuple[int, int]) -> Any:
-    """Return the image of a frame as PyAV encodes it, cut to a size (width, height)."""
+    """Return the image of a frame for the encoders of PyAV, cut to a size (width, height)."""
     width, height = size
     image = np.ascontiguousarray(frame.image[:height, :width])
     return load_av().VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "bgr24")
 
 
 def _lacks_index(path: Path) -> bool:
-    """Return whether a file is an .mp4 or .mov without the box that says where its frames are."""
+    """Return whether a file is an .mp4 or .mov without `moov`, the index of its frames."""
     with path.open("rb") as file:
         kinds: list[bytes] = []
         size, at = path.stat().st_size, 0
@@ -622,7 +628,7 @@ def _lacks_index(path: Path) -> bool:
             file.seek(at)
             head = file.read(16)
             length, kind = int.from_bytes(head[:4]), head[4:8]
-            # 1: the length follows, as eight bytes; 0: up to the end
+            # length 1: eight bytes of length follow; length 0: the box ends with the file (ISO/IEC 14496-12)
             length = {0: size - at, 1: int.from_bytes(head[8:])}.get(length, length)
             kinds.append(kind)
             at += max(length, 8)
