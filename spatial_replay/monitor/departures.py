@@ -56,8 +56,8 @@ class Departure:
     Attributes:
         name: name of the object.
         start_ns, end_ns: times of the first sample without it, and of the sample of its return.
-        distance: distance to the reference of its atom, in the last sample before the absence. If the
-            member was not near then, the distance at `end_ns`.
+        distance: distance to the object that its atom compares it with. It is measured just before the
+            absence or, if it was not near then, at `end_ns`.
         message: a sentence.
     """
 
@@ -173,7 +173,7 @@ class Departures:
                 )
 
     def _distances(self, visitors: _Visitors, columns: Integers, samples: Integers, trace: Trace) -> Floats:
-        """Return the distances (N, watches, 3) of N members, each in three samples (N, 3) of its own."""
+        """Return the distances (N, watches, 3) of N members in three samples (N, 3) per member."""
         rows = trace.rows[samples.ravel()]
         cells = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
         # a stand-in replaces each member in its samples, so that one call measures all members
@@ -199,6 +199,7 @@ class Departures:
         self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats, size: float
     ) -> None:
         """Add the departure of a member that has returned, if it was near a threshold."""
+        # a member of a single sample has no approach; 1 avoids a division by zero
         span_ns = max(absence.last_ns - absence.early_ns, 1)
         # an empty group is infinitely far away: inf - inf is NaN, which counts as no approach
         with np.errstate(invalid="ignore"):
@@ -226,7 +227,7 @@ class _Absence(NamedTuple):
 
     Attributes:
         reason: beginning of the sentence about it.
-        early_ns: time of the first sample with the member within the second before `last_ns`.
+        early_ns: time of the first sample with the member in the last second up to `last_ns`.
         last_ns: time of the last sample with the member.
         start_ns: time of the first sample without it.
         early, last: (watches,), distances at `early_ns` and `last_ns`.
@@ -243,13 +244,13 @@ class _Absence(NamedTuple):
 
 
 def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
-    """Return the first sample with a member within the second up to `sample` - 1."""
+    """Return the first sample with a member in the last second up to `sample` - 1."""
     begin = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
     return begin + int(members[begin:sample, column].argmax())
 
 
 def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
-    """Return the sizes (N, K) of N objects, each in K samples of its own; 0 if unknown."""
+    """Return the sizes (N, K) of N objects in K samples per object; 0 if unknown."""
     rows = trace.rows[samples, columns[:, None]]
     sizes = np.zeros(rows.shape)
     sizes[rows >= 0] = trace.footprints.select(rows[rows >= 0]).sizes
@@ -312,7 +313,7 @@ def _without_enlargement(term: Term) -> Term:
 
 
 def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
-    """Return a term with a changed base; the base of a `Centre` is inside it."""
+    """Apply `change` to a term, or to the term inside a `Centre`."""
     if isinstance(term, Centre):
         inner: Any = _with_base(term.term, change)
         return replace(term, term=inner)
@@ -320,7 +321,7 @@ def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
 
 
 def _with_group(term: Term, groups: Mapping[str, Group | Earlier]) -> Term:
-    """Return a term with its variable replaced by the whole group; only named objects stay excluded."""
+    """Replace the variable of a term by its whole group, which excludes named objects only."""
 
     def change(base: Term) -> Term:
         group = groups.get(base.name, base) if isinstance(base, Variable) else base

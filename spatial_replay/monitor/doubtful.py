@@ -35,8 +35,9 @@ class ClassMembers:
         codes = [code for code, name in class_by_code.items() if name in self._names]
         if not codes:
             return
+        # an object with unknown position has row -2 - observation, and its class is known
         rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
-        # row -1 of an absent object reads the appended last entry, a code that no class has
+        # an absent object has row -1, which reads the appended last code: -1, which is no class
         code_of_row = np.append(trace.class_code, -1)[rows]
         for code in codes:
             columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()

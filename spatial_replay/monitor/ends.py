@@ -1,4 +1,4 @@
-"""Begin and end of the evaluation of a log, from needs of specifications and spans of topics.
+"""Find the samples of a log that are evaluated: from its begin to its end for all needed topics.
 
 Recorded logs, traces and running robots follow one rule. Evaluation begins at the first sample where each
 needed topic has sent a message that transforms can place. It ends at the last such sample.
@@ -65,7 +65,7 @@ class Needs:
     def choose_first(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
         """Return the spans that are needed regardless of the objects that appear later.
 
-        A live run cannot know later objects, but has to begin at the same sample as its recording.
+        A live run cannot know later objects, but it has to begin where a replay of its log begins.
         """
         patterns = {span.pattern for span in spans}
         fixed = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
@@ -92,7 +92,7 @@ class RunEnds:
 
     Args:
         start, end: whether samples may be left out at the start, and at the end.
-        is_rest: whether the trace continues earlier samples; then all its samples may be left out.
+        is_rest: whether earlier samples were evaluated; then all samples may be left out.
         within_ns: limit at the start, instead of the topics' own limits.
 
     Attributes:
@@ -132,7 +132,7 @@ class RunEnds:
     def add(self, trace: Trace) -> list[Trace]:
         """Add the next samples and return the samples that are ready for evaluation.
 
-        Each added trace is returned once, trimmed, in order of addition.
+        One trace is returned for each added trace, perhaps later, without the samples left out.
         """
         if self.begin_ns is not None and not self._end and not self.late:
             return [trace]

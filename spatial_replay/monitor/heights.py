@@ -1,4 +1,4 @@
-"""Distance comparisons that heights decide, because one object is above the other."""
+"""Find comparisons of distances that heights decide, because one object is above the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.text import Instant, Sentence, plural
 from spatial_replay.trace.trace import Trace
 
 _MOST_SAMPLES: Final = 64
-"""Limit on compared samples of a block, spread evenly."""
+"""Limit on compared samples per block."""
 
 
 @dataclass(slots=True)
@@ -42,7 +42,7 @@ class _Comparison:
 
 
 class HeightComparisons:
-    """Counts comparisons whose truth changes without heights, block by block."""
+    """Counts the samples in which comparisons change their truth without heights, block by block."""
 
     def __init__(self, specifications: Sequence[Specification]) -> None:
         """Start before the first sample."""
@@ -73,6 +73,7 @@ class HeightComparisons:
             )
             for comparison in comparisons:
                 formula = over_bindings("forall", comparison.bound, comparison.atom)
+                # channel 0 is the low end, so a comparison with unknown values counts as false
                 in_space, from_above = (leaf_values(scene, [formula], {})[0, 0] >= 0 for scene in scenes)
                 differing = np.flatnonzero(in_space != from_above)
                 comparison.compared += len(in_space)

@@ -81,7 +81,7 @@ class ViolatedInvariant:
 
 
 class _Runs(NamedTuple):
-    """Runs of consecutive samples: first sample (K,) of each run, and last sample plus one."""
+    """K runs of consecutive samples: first samples (K,), and last samples plus one (K,)."""
 
     starts: Integers
     ends: Integers
@@ -107,7 +107,7 @@ def find_violated_invariants(
         leaves: (C, A, T), the instance's leaves.
         times_ns: (T,), T at least 1.
         goes_on: whether samples may follow; then only permanent violations count.
-        most: limit on intervals of each invariant that get a deciding atom; later ones get none.
+        most: limit on intervals of each invariant that get a deciding atom, by time.
     """
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:
@@ -221,7 +221,7 @@ def _place_of(deciding: DecidingAtom | None) -> Point | None:
 def invariant_sentences(
     invariant: ViolatedInvariant, first_ns: int, units: Mapping[str, str]
 ) -> Iterator[Sentence]:
-    """Yield sentences on the number of violated intervals, and on the first few of several intervals.
+    """Yield a sentence on the number of violated intervals, and one on each of the first `LISTED`.
 
     Args:
         first_ns: reference time of the sentences.

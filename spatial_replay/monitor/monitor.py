@@ -79,7 +79,7 @@ class NodeUpdate(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Satisfied or violated if no continuation can change that, pending otherwise."""
+        """Satisfied or violated if no continuation can change it; else pending."""
         return online_verdict(self.lower, self.upper)
 
 
@@ -235,7 +235,7 @@ class Ending(NamedTuple):
         lower, upper: ends of the value's interval over the finished log.
         unit: declared unit of these numbers, or "".
         reason: explanation of an unknown verdict; "" for other verdicts, and without `note_unknown`.
-        doubts: assumptions under the verdict that the run contradicts.
+        doubts: assumptions that the verdict depends on, and that the run contradicts.
     """
 
     spec: NamedSpec
@@ -415,10 +415,10 @@ class Monitor:
 
 
 class _Start:
-    """Decides at which sample evaluation begins.
+    """Decides when evaluation begins.
 
     Attributes:
-        begin_ns: time of that sample; None before that sample.
+        begin_ns: time of the first evaluated sample; None before that sample.
         missing: the names that have not come yet.
     """
 
@@ -435,7 +435,7 @@ class _Start:
         self._first_ns: int | None = None
 
     def has_begun(self, sample: Sample) -> bool:
-        """Return whether evaluation has begun at a sample; called for each sample until then."""
+        """Return whether evaluation has begun, given the next sample."""
         if self.begin_ns is not None:
             return True
         self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
@@ -466,7 +466,7 @@ class _AwaitedNames:
         """Whether any name is still missing."""
 
     def extend(self, sample: Sample) -> tuple[Diagnostic, ...]:
-        """Return a warning for each missing name once the limit has passed; before it, none."""
+        """Return a warning for each name that is missing after the time limit; none before it."""
         self._samples += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
@@ -518,7 +518,7 @@ class _AwaitedNames:
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
-    """Map each name to the index of its spec and its node id; of equal names, the first counts."""
+    """Map each name to the index of its spec and its node id; a repeated name keeps the first."""
     places: dict[str, tuple[int, int]] = {}
     for index, of_spec in enumerate(names):
         for identifier, name in enumerate(of_spec):
@@ -528,7 +528,7 @@ def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, 
 
 
 def _ending(spec: NamedSpec, final: Floats | None, last: Floats | None, unit: str) -> Ending:
-    """Return a result from the intervals (N, 2) of its nodes at the end and their last numbers (N, 4)."""
+    """Return the result of a spec, given its final intervals (N, 2) and its last numbers (N, 4)."""
     if final is None:
         return Ending(spec, Verdict.UNKNOWN, _robustness(last), float("-inf"), float("inf"), unit)
     lower, upper = final[0].tolist()
@@ -542,7 +542,7 @@ def _robustness(numbers: Floats | None) -> float:
 REMEMBERED = 1024
 """Number of newest samples that a monitor stores to find the deciding atom of a violation."""
 _AT_ONCE = 64
-"""Limit on samples that are searched as a whole; longer runs are searched from the newest sample back."""
+"""Limit on samples that are searched at once; longer runs are searched from the newest sample back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -554,7 +554,7 @@ class Violation:
         node: its id in the tree of the result.
         text: its canonical text.
         time_ns: time of the sample that made it certain.
-        robustness: upper bound of the robustness that the part can still reach; below 0.
+        robustness: upper bound of the part's robustness over all continuations; below 0.
         witness: the atom that settled it, and the change that would flip it. None if the atom is older than
             the samples that the monitor stores.
         first_ns: reference time of the sentences, the time of the monitor's first sample.
@@ -610,7 +610,7 @@ class Violation:
 
 
 def _has_factor(atom: Atom) -> bool:
-    """Return whether an atom multiplies its signal: its robustness is then no amount of the signal."""
+    """Return whether an atom multiplies its signal, so that its robustness has another scale."""
     expression = atom.expression.operand if isinstance(atom.expression, Scaled) else atom.expression
     return any(isinstance(part, Product | Scaled) for part in iter_expressions(expression))
 
@@ -696,7 +696,7 @@ class Settled:
 
     @cached_property
     def witness(self) -> Witness | None:
-        """The witness on the newest samples, as few as give the part the same number; None if none do."""
+        """The witness on the newest samples. It uses few samples if these give the part the same number."""
         for begin in self._begins():
             witness = self._witness_from(begin)
             number = witness.upper if self.verdict is Verdict.VIOLATED else witness.lower
@@ -721,6 +721,7 @@ class Settled:
         samples, duration_ns, to_reports = look_back([self.spec.formula])
         start_ns = self.samples[begin].time_ns
         first = max(begin - max(samples, to_reports), 0)
+        # samples repeat reports, so the previous report may be any number of samples back
         if to_reports and any(sample.reported_ns for sample in self.samples):
             first = 0
         while duration_ns and first > 0 and self.samples[first].time_ns > start_ns - duration_ns:

@@ -1,4 +1,4 @@
-"""Offline robustness: rho(t, node) of every node at each sample t, given all samples.
+"""Offline robustness: rho(t, node) of every node at each sample t, from t to the last sample.
 
 A monitor, in contrast, computes robustness only at the first and the newest sample. A sliding window is
 evaluated as a separate log at each position.
@@ -66,7 +66,7 @@ def _at(steps: Steps, step: int) -> int:
 
 @inlined
 def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
-    """Return the distance from one step to a later one, in samples or in ns."""
+    """Return the distance between two steps, in samples or ns."""
     if unit == codes.SAMPLES:
         return later - earlier
     return int(abs(steps.stamps[_at(steps, later)] - steps.stamps[_at(steps, earlier)]))
@@ -86,7 +86,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
 ) -> None:
-    """Copy to each step the value of the latest step at least `distance` back, or `missing`."""
+    """Write to each step the value of the latest step at least `distance` back; `missing` without one."""
     back = -1
     for i in range(steps.length):
         while back < i and _distance(steps, unit, back + 1, i) >= distance:
@@ -130,6 +130,7 @@ def _run_boolean(
     code, a, b = row[0], row[1], row[2]
     first, second = columns[channel, a], columns[channel, b]
     if code == codes.CONSTANT:
+        # rows hold integers, so an infinity is stored as its sign
         target[begin:end] = row[4] * np.inf
     elif code == codes.NOT:
         for k in range(begin, end):
@@ -146,7 +147,7 @@ def _run_boolean(
 def run_offline(
     rows: Integers, leaves: Floats, stamps: Integers, begin: int, end: int, columns: Floats, extrema: Floats
 ) -> None:
-    """Compute all rows on the samples from `begin` to before `end` alone.
+    """Compute all rows on the samples from `begin` to before `end`, without any others.
 
     Args:
         rows: (R, OFFLINE_WIDTH), operands first.
@@ -188,7 +189,7 @@ def run_windows(
     rows: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats, extrema: Floats,
     result: Floats,
 ) -> None:  # fmt: skip
-    """Compute the nodes at the start of the window that ends at each sample, on the window's samples alone.
+    """Evaluate all nodes on a sliding window: at the start of the window that ends at each sample.
 
     Args:
         starts: (T,), first sample of each window.
@@ -202,7 +203,7 @@ def run_windows(
 
 
 _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
-"""The past operator that equals each future operator in reversed time."""
+"""Future operators, with the past operators that equal them in reversed time."""
 
 
 class OfflineTable(SignalTable):
@@ -249,8 +250,8 @@ class OfflineNodes:
     Attributes:
         times_ns: (T,).
         columns: (C, N, T), ends of each node's interval, in channels (see `online.codes`).
-        conditions: (C, T), whether the operand's rates have values, by operand id. It has only operands that
-            their operators leave out at samples without a rate (see `_judged_operands`).
+        conditions: (C, T) by operand id, conditions that all rates of an operand have values. Only operands
+            with rates below a temporal operator have one (see `_judged_operands`).
         goes_on: whether samples may follow.
     """
 
@@ -342,7 +343,7 @@ class OfflineFormula:
 
 
 def computed_formulas(formula: Formula) -> list[Formula]:
-    """Return the nodes of a formula, by id, then the conditions of operands that are left out at samples."""
+    """Return the nodes of a formula, by id, then the rate conditions of `_judged_operands`."""
     tree = nodes_with_operands(formula)
     return [
         *(node for node, _ in tree),
@@ -351,7 +352,11 @@ def computed_formulas(formula: Formula) -> list[Formula]:
 
 
 def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boolean]:
-    """Return the `given` or `with` form of each operand, by id, that its operator leaves out at samples."""
+    """Return the operands with rates below temporal operators, by id.
+
+    Such an operator leaves out samples without a rate, so its operand is read as `given` or `with`: first the
+    condition that all rates have values, then the operand itself.
+    """
     return {
         identifier: operand
         for node, operands in tree
@@ -377,7 +382,7 @@ def evaluate_offline(
 def evaluate_prefix(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
-    """Evaluate every node over samples that may continue; arguments as for `evaluate_offline`.
+    """Evaluate every node over samples that others may follow; arguments are as for `evaluate_offline`.
 
     Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample equal a
     monitor's. Their deciding path ends at the atom that settled a verdict before the log ended.
@@ -388,9 +393,9 @@ def evaluate_prefix(
 def evaluate_with_whole_windows(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
-    """Evaluate every node over a finished log, with unknown values in windows that it cuts (see `is_cut`).
+    """Evaluate every node over a finished log, as if cut windows continued with unknown values.
 
-    Arguments as for `evaluate_offline`.
+    Arguments are as for `evaluate_offline`; for cut windows see `is_cut`.
     """
     return _evaluate_beyond(formula, order, leaves, times_ns, is_cut)
 
@@ -444,6 +449,7 @@ class _OpenFormulas:
         is_open = self._beyond(node, self._times_ns)
         if not is_open.any():
             return node
+        # no specification can write this name, so the leaf equals no other leaf
         leaf = Atom("", "signal", Signal(f"\0{len(self.leaves)}"))
         self.leaves.append(leaf)
         self.columns.append(is_open)
@@ -462,8 +468,8 @@ class _OpenFormulas:
 def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
     """Return (T,), whether the end of a log cuts the window of an operator short at each sample.
 
-    The log never cuts an operator without an upper bound, which ends with it, and WX, which is defined at the
-    last sample. The exception is a log of one sample: it shows no duration, so it cuts every G.
+    An operator without an upper bound ends with the log and is not cut. WX is not cut, because it is defined
+    at the last sample. One exception: a log of one sample cuts every G, because it shows no duration.
     """
     bound = formula.bound
     is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
@@ -505,7 +511,7 @@ def windows_of(
         positions = indices if samples is None else samples
         edge = np.full(len(positions), count if is_ahead else 0, np.int64)
         return (positions, edge) if is_ahead else (edge, positions + 1)
-    # distances from the first sample, bounds capped at the last one: their sums fit 64 bits
+    # distances from the first sample, with bounds capped at the last sample: sums fit 64 bits
     places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1
     near = min(bound.lower, furthest)
@@ -522,6 +528,7 @@ def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """Return each node's robustness (N, T) from each sample to the end of the log; NaN if undetermined."""
+    # nominal ends only: uncertainty does not count for a curve of robustness
     return _determined_numbers(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 

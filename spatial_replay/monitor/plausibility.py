@@ -42,9 +42,9 @@ from spatial_replay.trace.trace import Pauses, Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
 _FAR = 10.0
-"""Ratio of a length to the log's extent above which the length is probably in another unit."""
+"""A length above this many times the log's extent is probably in another unit."""
 _APART = 5.0
-"""Ratio of a threshold and the nearest measured number above which the threshold is out of reach."""
+"""A threshold this many times above or below all measured numbers is out of reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class ThresholdRange:
 
     Attributes:
         atom: an atom with one distance or signal.
-        bound: quantifiers that bind its variables, outermost first, with one over the objects of a template.
+        bound: quantifiers that bind its variables, outermost first. A template's parameter has one, too.
         least, greatest: range of the quantity over all objects that the variables stand for. For a text, and
             for a quantity that is never known, least > greatest.
         known: number of samples in which the quantity is known.
@@ -97,7 +97,7 @@ class ThresholdRange:
 
     @property
     def _words_of_empty(self) -> str:
-        """The words on samples without an object, with the atom's value there."""
+        """Words for samples in which the groups are empty, with the atom's value."""
         quantifiers = {quantified.quantifier for quantified in self.bound}
         if len(quantifiers) > 1:
             return "has no object"
@@ -130,7 +130,7 @@ class LogNumbers:
         samples: number of samples.
         times_ns: times of the first and the last sample.
         classes: classes of the objects; "" for objects without a class.
-        missing: number of samples that lack an object or signal of the specification, and time of the first.
+        missing: number of samples without an object or signal of the specification, and time of the first.
     """
 
     def __init__(self, specification: Specification) -> None:
@@ -198,6 +198,7 @@ class LogNumbers:
             is_text = isinstance(threshold_range.atom.parameters[-1], str)
             is_sure = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
+                # a single channel means equal ends
                 is_sure &= ends[0] == ends[min(1, len(ends) - 1)]
             # over no object, `forall` is +inf and `exists` is -inf
             is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
@@ -243,7 +244,7 @@ class LogNumbers:
 
 
 def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
-    """Return a line for each window given in samples, with its seconds at the log's rate."""
+    """Return a line for each window in samples, with its length in seconds at the log's rate."""
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
@@ -444,7 +445,7 @@ def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:
 def over_bindings(
     quantifier: Literal["forall", "exists"], bound: tuple[Quantified, ...], atom: Atom
 ) -> Atom | Quantified:
-    """Return an atom under quantifiers of one kind that bind its variables."""
+    """Return an atom with all its quantifiers replaced by `forall`, or all by `exists`."""
     formula: Atom | Quantified = atom
     for binding in reversed(bound):
         formula = Quantified(quantifier, binding.variables, binding.group, formula)
@@ -461,7 +462,7 @@ def bound_nodes(specification: Specification) -> Iterator[tuple[Formula, tuple[Q
 def _binding(
     atom: Atom, quantifiers: tuple[Quantified, ...], parameter: str | None
 ) -> tuple[Quantified, ...]:
-    """Return the quantifiers around an atom that bind its variables, or variables of their groups.
+    """Return the quantifiers that bind variables of an atom, or variables of these quantifiers' groups.
 
     A template parameter ranges over all objects that the atom does not name, because an object is not to be
     compared with itself.

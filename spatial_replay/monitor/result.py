@@ -135,9 +135,9 @@ class SpecResult(Displayed):
         settled_ns: (N, 2), see `InstanceStream`.
         times_ns: (T,) int64, times of the evaluated samples; empty if no numbers of samples were stored.
         series: (N, 4, T), value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
-        leaves: (C, A, T), leaves of the instance, from which the methods compute; None if not stored.
+        leaves: (C, A, T), leaves of the instance, which witnesses and signals need; None if not stored.
         evidence: access to the samples, to read them again.
-        doubts: assumptions under the verdict that the log contradicts.
+        doubts: assumptions that the verdict depends on, and that the log contradicts.
     """
 
     name: str
@@ -347,7 +347,7 @@ class SpecResult(Displayed):
         return data_frame(self)
 
     def gaps(self) -> tuple[Gap, ...]:
-        """Return the gaps of objects and signals in the formula, one for each that is ever missing."""
+        """Return the gaps of all objects and signals in the formula that are ever missing."""
         return self.evidence.gaps(self.formula)
 
     @property
@@ -357,7 +357,7 @@ class SpecResult(Displayed):
 
     @property
     def least_at_ns(self) -> int | None:
-        """Time at which the first cause reached its least robustness; None if it settled with it."""
+        """Time at which the first cause reached its least robustness; None if that settled it."""
         return self._least_at_ns(self.causes)
 
     @cached_property
@@ -389,9 +389,9 @@ class SpecResult(Displayed):
     def tested(self) -> Tested:
         """By how much of the log the verdict was tested: "full", "cut" or "nothing".
 
-        "nothing": the verdict is the same for all values of the atoms, while antecedents of a satisfied
-        formula keep theirs. "cut": the verdict could change if windows beyond the end of the log were
-        complete. "full": all other verdicts, and unknown ones.
+        "nothing": the verdict is the same for all values of the atoms. (In a satisfied formula, antecedents
+        keep their values.) "cut": the verdict may change if the log continues to the ends of its windows.
+        "full": all other verdicts, unknown ones included.
         """
         if self._is_untested:
             return "nothing"
@@ -486,9 +486,9 @@ class SpecResult(Displayed):
         return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
-        """Return sentences on the atom behind the robustness, and on an earlier beginning of a violation.
+        """Return sentences on the robustness, and on the beginning of a violation if it was earlier.
 
-        They are "" without a witness (see `worst`).
+        The text is "" without a witness (see `worst`).
         """
         if self.causes:
             return cause_reason(self.causes[0], first_ns)
@@ -595,7 +595,7 @@ class SpecResult(Displayed):
         return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole_log)
 
     def _witnesses(self, node: int, settled_ns: int | None) -> tuple[Witness | None, Witness | None]:
-        """Return the settling witness of a node's verdict, and the witness of a violation that grew later."""
+        """Return the settling witness of a node and, if its violation grew later, the final witness."""
         settling = self._settled_witness(node, settled_ns)
         if (
             self.leaves is None
@@ -687,7 +687,7 @@ class Evaluation(Displayed):
     def vacuous(self) -> tuple[UntestedPart, ...]:
         """The templates without instances: no object fits them, so they decided nothing.
 
-        Parts of a result that decided nothing are in its own `vacuous`.
+        `SpecResult.vacuous` has the parts of a result that decided nothing.
         """
         evaluated = (result.formula for result in self.results)
         return idle_templates(self.specification.results, evaluated, self.each, self.classes)
@@ -900,6 +900,7 @@ def evaluate_many(
     for trace in traces:
         _require_trace(trace)
         if is_apart or not len(trace) or len(trace) >= _MOST_TOGETHER:
+            # evaluations come in the order of the traces, so the group is first
             yield from _evaluate_group(specification, group, semantics)
             group = []
             yield evaluate(specification, trace, semantics=semantics)

@@ -37,7 +37,9 @@ from spatial_replay.spec.walks import is_spatial, leaf_key, nodes_with_operands
 
 
 class PaperMemory(NamedTuple):
-    """State between samples; each array of numbers has a parallel array of flags for undetermined numbers.
+    """State between samples.
+
+    NaN marks a number that is left out. An undetermined number is marked in the parallel array `lost_…`.
 
     Attributes:
         stamps: (room,), times of the samples in ns; only the first time if there are no columns.
@@ -73,6 +75,7 @@ class PaperMemory(NamedTuple):
 def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: Flags) -> None:
     """Compute a node on the newest sample alone, from its operands there."""
     code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    # such a window needs later samples: on the newest sample alone, the node is left out
     if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
         numbers[n], lost[n] = np.nan, 0
         return
@@ -181,7 +184,7 @@ def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory
 
 @piece
 def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
-    """Update a temporal node that is needed at every sample, at the samples whose windows are still open."""
+    """Update a temporal node that is needed at every sample; only samples with open windows change."""
     code = rows[n, CODE]
     row, inner = rows[n, COLUMN], rows[n, INNER]
     target, target_lost = memory.columns[row], memory.lost_columns[row]
@@ -216,7 +219,7 @@ def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: 
 def _scan_node(
     rows: Integers, operands: Integers, n: int, start: int, last: int, memory: PaperMemory
 ) -> None:
-    """Run the unbounded operator from each sample, from `start` on, to the last one."""
+    """Compute the unbounded operator from each sample to the last one, for the samples from `start` on."""
     code, inner = rows[n, CODE], rows[n, INNER]
     target, target_lost = memory.columns[inner], memory.lost_columns[inner]
     right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]
@@ -285,7 +288,7 @@ def step_paper(
             else:
                 node_operands = operands[rows[n, FIRST] : rows[n, END]]
                 _fold(code, node_operands, memory.value, memory.lost_value, n)
-            # adding zero turns -0.0 into 0.0, so that equal numbers are equal bits
+            # adding zero turns -0.0 into 0.0, so that equal numbers have equal bits
             series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
             series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
             series[n, 2, k] = series[n, 3, k] = series[n, 0, k]
@@ -462,8 +465,8 @@ def scan_until(
 ) -> None:  # fmt: skip
     """Compute until from each sample to `last`, for a left operand that depends on no later sample.
 
-    The scan goes backwards; the left operand at each sample caps the best value over later ends. An end
-    whose numbers were all left out so far takes the left operand's value, which no capped end exceeds.
+    The scan goes backwards, and the left operand at each sample caps the best value over later ends. If all
+    numbers of an end were left out so far, its value is the left operand, which no other end can exceed.
     """
     best, is_lost, is_any_left_out = np.nan, 0, False
     for t in range(last, first - 1, -1):
@@ -511,7 +514,9 @@ def scan_until_by_pairs(
 
 
 _TILE = 256
+"""Number of samples per call of the kernel."""
 _FIRST_ROOM = 1024
+"""Initial capacity of the columns, samples."""
 MAX_PAIRS = 1 << 26
 """Limit on pairs of samples for which untils store a number: about 11,600 samples, 0.6 GB."""
 
@@ -561,11 +566,11 @@ class PaperRun:
         Raises:
             UsageError: the pairs of samples exceed the limit.
         """
-        # Def. 16 knows no uncertainty: nominal ends only, and a number is lost where they differ
+        # Def. 16 has no uncertainty: only nominal ends count, and a number is lost where they differ
         low, high = low_and_high(len(leaves), wide=False)
         numbers = np.ascontiguousarray(leaves[low])
         lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
-        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
+        times_ns = np.array(times_ns, np.int64)  # writable, because kernels are compiled for writable arrays
         series = empty((len(self._table.rows), 4, len(times_ns)))
         samples, rows = self._position + len(times_ns), self._table.rows
         # unbounded windows only: pairs of bounded ones are counted when their samples come
@@ -622,7 +627,7 @@ def left_out(
     times_ns: Integers,
     first_ns: int,
 ) -> Floats:
-    """Return leaves with NaN where a leaf, or the body of a quantifier, looks back (`a[-3]`) beyond the log.
+    """Return leaves with NaN where they are left out: they look back (`a[-3]`) beyond the log.
 
     A leaf with a rate is also NaN where the rate has no value, if an operator leaves such samples out.
 

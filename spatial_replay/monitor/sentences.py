@@ -192,6 +192,7 @@ def _verdict(final: Floats, node: int) -> Verdict:
 
 def _number(node: int, values: Floats, final: Floats) -> float:
     value = float(values[node])
+    # an undetermined number is compared by its upper end
     return float(final[node, 1]) if math.isnan(value) else value
 
 
@@ -391,12 +392,13 @@ def how_text(
 
 
 def uncertain_text(least: str) -> str:
-    """Return the clause with the least amount, for an atom whose number is uncertain."""
+    """Return the clause with the least possible amount of an uncertain number."""
     return f", at least {least} with what is uncertain"
 
 
 def without_residue(number: float, atom: Formula) -> float:
     """Return a number of an atom, or 0 if it is within rounding error."""
+    # rounding errors grow with the numbers of the atom
     limits = [abs(part.value) for part in iter_parts(atom) if isinstance(part, Number)]
     limits = [limit for limit in limits if math.isfinite(limit)]
     scale = max(limits, default=0.0) or 1.0
@@ -415,13 +417,13 @@ def _permanence_sentence(title: str, verdict: Verdict, since: Instant) -> Senten
 
 
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
-    """Return the reason of a verdict: its deciding atom or, if the verdict is unknown, the unknown values."""
+    """Return the reason of a verdict: the deciding atom or, for an unknown verdict, the unknown values."""
     deciding = witness.deciding
     missed = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
         return _join(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
     if witness.missed is not None and witness.missed.is_condition:
-        # the condition held: by how much does not explain the violation
+        # the margin of a condition that held does not explain the violation
         return _join(*missed)
     outcome = _how_it_decides(witness, deciding, first_ns)
     if witness.missed is not None and witness.missed.response == deciding.text:
@@ -434,7 +436,7 @@ def _join(first: Sentence, *others: Sentence) -> Sentence:
 
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
-    """Return sentences on the robustness of a cause, and on its earlier beginning; "" without a witness."""
+    """Return sentences on a cause's robustness, and on its beginning if earlier; "" without a witness."""
     if cause.robustness_witness is None:
         return Sentence("")
     reason = reason_sentence(cause.robustness_witness, first_ns=first_ns)
@@ -551,7 +553,7 @@ def _step_title(witness: Witness, place: int) -> str:
 
 
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
-    """Name the operator within which an atom is greatest or least; else as `_in_time`."""
+    """Name the operator within which an atom is greatest or least; without one, as `_in_time`."""
     passed: set[str] = set()
     # one sample may settle a failing G or a holding F, and later ones may be more extreme
     unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
@@ -586,6 +588,7 @@ def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
                 return f"{names[0]} sticks out of {names[1]} by {size}"
             return f"{names[0]} lies {size} inside {names[1]}"
         case "misalignment":
+            # misalignment is 1 minus the cosine of the angle
             degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
             return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
         case "present":

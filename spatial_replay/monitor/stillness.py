@@ -14,13 +14,16 @@ from spatial_replay.text import plural, printable
 from spatial_replay.trace.trace import Trace
 
 _LEAST_REPORTS: Final = 20
-"""Minimum number of reports to judge an object."""
+"""Minimum number of reports of an object without changes."""
 _MOSTLY: Final = 0.95
-"""Minimum fraction of reports in which each other object changes."""
+"""Minimum fraction of reports in which each other object changes.
+
+With 20 reports and 95 %, 151 recorded logs have no remark.
+"""
 _LEAST_OTHERS: Final = {True: 1, False: 3}
 """Minimum number of other objects, by whether they have a class.
 
-Objects without a class need more, because one of two objects is often a fixed goal.
+Objects without a class need more: a goal or tray rests beside two moving objects, a hand and a cube.
 """
 
 
@@ -66,7 +69,9 @@ class Stillness:
                 continue
             reports = self._reports[name]
             report_numbers = np.concatenate([reports.last[None], numbers[rows]])
+            # the first report of an object has no previous report to differ from
             is_first = bool(np.isnan(report_numbers[0]).all())
+            # NaN differs from itself, but a missing yaw is no change
             is_changed = (
                 (report_numbers[1:] != report_numbers[:-1])
                 & ~(np.isnan(report_numbers[1:]) & np.isnan(report_numbers[:-1]))

@@ -136,7 +136,7 @@ def find_instances(
 
 
 def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
-    """Check that every template parameter has a choice of objects, and every choice a parameter."""
+    """Check that every template parameter has a choice of objects, and that no other name has one."""
     for spec in templates:
         if spec.parameter not in each:
             raise UsageError(
@@ -179,7 +179,7 @@ def _appearances(
 
 
 NEVER = -1
-"""Settling time of a verdict that no sample settled."""
+"""Entry of `settled_ns` for a verdict that no sample settled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ class InstanceStream:
         self._begin()
 
     def restart(self) -> None:
-        """Restart before the first sample, without `final` of the samples so far."""
+        """Restart before the first sample; `final` of the previous run is lost."""
         if isinstance(self._run, OnlineRun):
             self._run.restart()
         else:
@@ -279,7 +279,7 @@ class InstanceStream:
             no_series = np.empty((len(program.reports), 4, 0))
             return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
-        # the scene starts with the log, or as far back as terms look: its positions can replace the log's
+        # no term looks back beyond the scene, or it starts with the log: positions in the scene suffice
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
@@ -376,7 +376,7 @@ def one_after_another(traces: Sequence[Trace]) -> Trace:
 def run_together(
     instances: Sequence[Instance], scene: TraceScene, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[tuple[list[InstanceStream], list[SeriesBlock]]]:
-    """Evaluate instances over each of many traces, with all leaves measured together.
+    """Evaluate instances over many traces; the leaves of all traces are measured together.
 
     Args:
         instances: instances without bindings, whose terms do not look back.
@@ -395,6 +395,7 @@ def run_together(
         for stream in streams if begin else ():
             stream.restart()
         blocks = [
+            # measured together, leaves may have more channels than this trace needs
             stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
             for stream, leaves in zip(streams, leaves_by_instance, strict=True)
         ]
@@ -419,7 +420,7 @@ class LiveStream:
         self._leaf_ranges = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
         first_leaves = [leaf_range.start for leaf_range in self._leaf_ranges]
-        # paired here, since `extend` reads them at every sample
+        # paired here, because `extend` reads them at every sample; unused under the paper's semantics
         self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None
@@ -470,6 +471,7 @@ class LiveStream:
         if sample.time_ns < self._start_ns:
             self._leaves.look_at(sample)
             return [np.full((len(evaluator.program.reports), 4), np.nan) for evaluator in self._evaluators]
+        # `PaperRun` needs positions in the log, since it leaves out leaves that look beyond its start
         values = self._leaves.fill_room(sample).measure()
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
         results: list[Floats | None] = []

@@ -82,7 +82,7 @@ _NEXT = {"X": "next sample", "WX": "next sample", "Y": "sample before"}
 
 @dataclass(frozen=True, slots=True)
 class UntestedPart:
-    """A part of a formula that was not tested, or not wholly.
+    """A part of a formula that was not tested, or only in part.
 
     Attributes:
         node: its id; None for a template without instances.
@@ -190,7 +190,7 @@ def _may_decide_nothing(instance: Instance) -> bool:
 
 
 def _may_be_empty(node: Temporal) -> bool:
-    """Return whether an operator's window may be empty: it does not include the operator's own sample."""
+    """Return whether an operator's window may be empty, because it excludes the operator's own sample."""
     return node.operator in _NEXT or (node.bound is not None and node.bound.lower > 0)
 
 
@@ -237,8 +237,8 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
 
     Args:
         node: id of the original formula.
-        sign: 1 if the formula has to hold, -1 if it must not hold, 0 for neither, as in a goal. A formula
-            with sign 0 is not an implication.
+        sign: 1 if the formula has to hold, -1 if it must not hold, 0 for neither, as in a goal. With sign 0,
+            no disjunction or conjunction is read as an implication.
     """
     operands = list(_operands_with_ids(formula, node))
     operator = operator_of(formula)
@@ -295,7 +295,7 @@ def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
 
 
 _GOALS = frozenset({("F", 0), ("O", 0), ("U", 1), ("S", 1), ("W", 1), ("R", 0)})
-"""Operators, and places of their operands that need to hold at only one sample."""
+"""Operators and places of operands that have to hold at one sample only."""
 _EVERYWHERE = frozenset({"F", "G", "U", "R", "W", "O", "H", "S"})
 """Operators whose windows have several samples."""
 
@@ -309,7 +309,7 @@ def _sign_below(operator: str, place: int, sign: int) -> int:
         return -sign
     if operator in ("xor", "<->") or (operator, place) == ("->", 0):
         return 0
-    # a goal that must not hold in any sample has to fail in all of them, as in `not F`
+    # a negated goal has to fail at all samples, as in `not F`
     is_goal = (operator, place) in _GOALS
     return 0 if operator in _EVERYWHERE and is_goal is (sign > 0) else sign
 
@@ -388,7 +388,7 @@ def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) ->
     counting = np.flatnonzero(scope & (begin < end))
     begin, end = begin[counting], end[counting]
     if place < len(formula.operands) - 1:
-        # the left operand holds from each sample to the one before the right one's
+        # the left operand counts from the operator's sample to before the right operand's sample
         if formula.operator == "S":
             begin, end = begin + 1, counting + 1
         else:
@@ -479,9 +479,10 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
-    """Yield each implication in a quantifier's body, with the formula that its antecedent holds for a member.
+    """Yield each implication in a quantifier's body.
 
-    For an implication in another one's consequent, both antecedents have to hold; the flag is then True.
+    The second value is the formula that its antecedent holds for some member. An implication in another one's
+    consequent also needs that antecedent; the third value is then True.
     """
     stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
     while stack:
@@ -529,7 +530,7 @@ def _empty_groups(
 
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
-    """Yield the open groups of a leaf; groups do not exclude variables, so that they fit any binding."""
+    """Yield the open groups of a leaf, without excluded variables, because these differ by binding."""
     for term in map(standing, iter_terms([formula])):
         group = term.term if isinstance(term, Earlier) else term
         if isinstance(group, Group) and group.members is None:
@@ -609,9 +610,11 @@ _UNKNOWN: Final = Atom("", "signal", Signal("\0"))
 def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict) -> bool:
     """Return whether a verdict is the same for all values of the leaves.
 
-    For a satisfied verdict, leaves in antecedents keep their numbers: if no antecedent held, nothing was
-    tested. Leaves over an open group keep their numbers where the group is empty. Conditions that a rate has
-    a value keep theirs, because samples that are left out test nothing.
+    Some leaves keep their numbers:
+
+    - leaves in antecedents of a satisfied formula, because nothing is tested if no antecedent holds;
+    - leaves over an open group at samples where it is empty;
+    - conditions that a rate has a value, because samples that are left out test nothing.
 
     Args:
         leaves: (C, A, T), the leaves of the instance's formula.
@@ -668,6 +671,7 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
             unknown_leaves[:, place] = leaves[[low, high], place]
         elif isinstance(bound, Quantified):
             column = evidence.columns([_without_tests(bound)])
+            # the ends with uncertainty
             unknown_leaves[:, place] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
@@ -718,7 +722,7 @@ def find_cut_window(
     ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
-    # rank 1 or -1: decided by the cut window, but not by the whole one
+    # rank 1 or -1: decided by a cut window, but not by a whole one
     decided = [step for step in cut if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}]
     step = decided[-1] if decided else path.steps[0]
     return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
@@ -757,7 +761,7 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
 
 
 def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
-    """Return nodes with ranks as numbers: decided by whole windows, only by cut windows, or undecided.
+    """Return nodes with ranks as numbers: decided with whole windows, only with cut ones, or undecided.
 
     Minima, maxima and negations preserve the order of ranks, so their deciding path ends at a cut window.
     """

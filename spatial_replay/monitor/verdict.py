@@ -48,7 +48,7 @@ class Verdict(StrEnum):
     UNKNOWN = "unknown"
 
     def __bool__(self) -> bool:
-        """Refuse a truth value: as a non-empty text, even "violated" would be true.
+        """Refuse a truth value, because the text "violated" would be true.
 
         Raises:
             UsageError: always.
@@ -87,12 +87,12 @@ _BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdi
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
-    """Return the worst verdict in the order violated, unknown, pending, satisfied; satisfied for none."""
+    """Return the worst verdict: violated, unknown, pending, satisfied. Without any, it is satisfied."""
     return max(verdicts, key=_BEST_FIRST.index, default=Verdict.SATISFIED)
 
 
 def require_ltlf(semantics: Semantics, what: str) -> None:
-    """Check that the semantics is "ltlf": the paper's defines no signals, windows and witnesses.
+    """Check that the semantics is "ltlf"; the paper's defines no signals, windows and witnesses.
 
     Args:
         what: subject of the error message.

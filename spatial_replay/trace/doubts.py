@@ -14,7 +14,7 @@ MANY_TURNS: Final = 8 * pi
 """Limit on angles in radians, four turns; larger angles are probably degrees."""
 
 SHORTEST_PERIOD_NS: Final = 200_000
-"""Shortest plausible period of a recording, ns; a shorter one means times in another unit."""
+"""Shortest plausible period of a recording, ns; shorter periods are times in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Doubt:
     Attributes:
         assumption: name of the assumption, as in `accept` of a mapping.
         topic: topic whose messages contradict it; "" for a log without topics.
-        text: the measurement, and the key that settles it. It begins with the topic.
+        text: sentence with the topic, the measurement, and the key that settles the doubt.
         objects, signals: names whose values depend on the assumption.
         is_accepted: whether the mapping accepts the doubt, so that verdicts are not doubtful.
     """
@@ -37,7 +37,7 @@ class Doubt:
     is_accepted: bool = False
 
     def remark(self, log: str) -> Sentence:
-        """Return the remark about this doubt, with the name of the log."""
+        """Return the remark on a log with this doubt."""
         if self.is_accepted:
             return Sentence(f"{log}: accepted: ", self.text)
         remedy = f"`accept: [{self.assumption}]` in the mapping" if self.topic else "`--allow doubtful`"
@@ -55,7 +55,6 @@ def metadata_from_doubts(doubts: Iterable[Doubt]) -> dict[str, str]:
 
 
 def json_doubt(doubt: Doubt) -> dict[str, Any]:
-    """Return a doubt as JSON."""
     return {
         "assumption": doubt.assumption,
         "topic": doubt.topic,

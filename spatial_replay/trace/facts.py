@@ -31,7 +31,7 @@ class TopicFacts:
         name: entry of the mapping that makes names; "" for the default of the type.
         names: names of the objects.
         classes: classes of the objects; None for objects without a class.
-        class_changes: number of reports with another class than the object's previous report.
+        class_changes: number of changes of an object's class between reports.
         signals: names of the signals.
         size, shorter_side: longer and shorter sides of outlines, in footprint units.
         low, high: least and greatest coordinates, as in messages.

@@ -73,6 +73,7 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     observed = _sort_observations(observed)
     faults = _duplicates(observed)
     readable, shapes, wrong = check_observations(observed, concave=concave)
+    # of several faults of a sample, the duplicate is reported
     faults = wrong | faults
     rows = np.full((len(observed.times_ns), len(observed.names)), ABSENT, np.int64)
     number = np.arange(len(observed.name), dtype=np.int64)
@@ -125,6 +126,7 @@ def _sort_observations(observed: Observations) -> Observations:
     rank[order] = np.arange(len(order))
     name = rank[observed.name]
     key = observed.sample * max(1, len(names)) + name
+    # readers mostly yield sorted rows, which need no copies
     if (key[1:] >= key[:-1]).all():
         return replace(observed, names=names, name=name)
     by_key = np.argsort(key, kind="stable")
@@ -152,12 +154,12 @@ def _duplicates(observed: Observations) -> dict[int, str]:
 
 
 def _finite(observed: Observations) -> Booleans:
-    """Return whether all numbers of each observation are finite, (R,); a missing yaw or height is."""
+    """Return whether all numbers of each observation are finite, (R,). A missing yaw or height is allowed."""
     shapes = observed.shapes
     is_bad = ~np.isfinite(shapes.radius)
     finite = np.isfinite(shapes.vertices)
     if not finite.all():
-        # per vertex only if needed: the reduction over pairs takes ten times as long as `all`
+        # per vertex only if needed: `all(axis=1)` over pairs takes ten times as long as `all()`
         is_bad |= count_in_rows(np.asarray(~finite.all(axis=1)), shapes.vertex_start) > 0
     bad_parts = count_in_rows(is_bad, shapes.part_start)
     no_height = np.isnan(shapes.bottom) & np.isnan(shapes.top)
@@ -171,6 +173,7 @@ def _finite(observed: Observations) -> Booleans:
 
 def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]:
     shapes = observed.shapes
+    # NaN in a comparison is no fault: such rows are unreadable
     with np.errstate(invalid="ignore"):
         empty_parts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
         negative_parts = count_in_rows(shapes.radius < 0, shapes.part_start)

@@ -20,7 +20,7 @@ class TopicSpan:
         classes: classes of its possible objects, in lower case; None for any class.
         limit_ns: longest part of the log that may be left out at an end because of this topic, ns.
         begun_ns, heard_ns: times of its first and last message; None without messages.
-        first_ns, last_ns: times of the first and the last such sample; None without such samples.
+        first_ns, last_ns: times of the first and the last of these samples; None without any.
     """
 
     topic: str

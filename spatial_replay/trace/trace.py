@@ -83,6 +83,7 @@ def _signal_value(name: str, value: Any) -> float:
         if isinstance(value, str):
             return text_number(value)
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number or a text") from error
+    # a number as text, and a truth value, convert to floats but are probably mistakes
     if isinstance(value, (str, bytes, bool, np.bool_)):
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true")
     return number
@@ -168,7 +169,7 @@ class Sample:
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
-        # reports at the sample's own time are dropped, so that samples with and without them are equal
+        # a report time equal to the sample's is the default: without it, equal samples compare equal
         others = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
@@ -216,6 +217,7 @@ class MeasurementCache:
         """Return the array stored under a key, or None."""
         with self._lock:
             array = self._arrays.pop(key, None)
+            # added again as the last one, because the order of the dict is the order of use
             if array is not None:
                 self._arrays[key] = array
             return array
@@ -226,6 +228,7 @@ class MeasurementCache:
             replaced = self._arrays.pop(key, None)
             self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
             self._arrays[key] = array
+            # the newest array stays, even if it alone exceeds the limit
             while len(self._arrays) > 1 and self._bytes > _BYTES:
                 self._bytes -= self._arrays.pop(next(iter(self._arrays))).nbytes
 
@@ -437,7 +440,7 @@ class Trace(Displayed):
     def filling(self) -> NDArray[np.bool_]:
         """(T,), whether a sample fills a pause.
 
-        Such samples are unknown, in runs that begin 1 ns after a sample or end 1 ns before one.
+        Runs of unknown samples fill a pause if they begin 1 ns after a sample or end 1 ns before one.
         """
         unknown = self.is_unknown
         turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
@@ -478,7 +481,7 @@ class Trace(Displayed):
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(sequence), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
-        # objects with unknown position have rows, too, after all others: these hold their classes
+        # rows of objects with unknown position come last; they store only the class
         blank: list[tuple[int, str, str | None]] = []
         for index, sample in enumerate(sequence):
             for name in sorted(sample.objects):
@@ -577,7 +580,7 @@ class Trace(Displayed):
         )
 
     def compact(self) -> Trace:
-        """Return the same samples in the normal form, which is the same for equal traces.
+        """Return the normal form of the trace, which is identical for equal traces.
 
         Observations are numbered by sample, then name; names, classes and signals that no sample uses
         are dropped; classes are sorted, None first.
@@ -596,7 +599,7 @@ class Trace(Displayed):
         return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
 
     def _report_times(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the columns of report times in the normal form; unknown values have the sample's time."""
+        """Return the report times of the normal form, where unknown values have the time of the sample."""
         own_ns = self.times_ns[:, None]
         reported_ns = None
         if self.reported_ns is not None:
@@ -824,7 +827,7 @@ _RARE: Final = 20
 """Minimum number of intervals per pause; with more pauses, the times are irregular."""
 _MOST_LISTED: Final = 3
 _MOST_HELD: Final = 65_536
-"""Number of intervals from which on only the long ones are stored."""
+"""Number of intervals after which only long ones are stored."""
 
 
 class Pauses:
@@ -840,7 +843,7 @@ class Pauses:
         """Add times that follow the previous ones.
 
         Args:
-            is_lost: (T,), whether everything is unknown from a time on; the interval after it is no pause.
+            is_lost: (T,), whether everything is unknown after a time. The interval after it is no pause.
         """
         times = np.concatenate([self._last, times_ns])
         lost = np.concatenate(
@@ -852,6 +855,7 @@ class Pauses:
         if self._first_usual_ns is None and self._count >= _MOST_HELD:
             held = self._held
             self._first_usual_ns = int(np.median(held[1, :_MOST_HELD]))
+            # the stored intervals are filtered again, now that the usual one is known
             self._pieces = []
             self._hold(held)
 

@@ -12,7 +12,7 @@ from spatial_replay.trace.doubts import MANY_TURNS, SHORTEST_PERIOD_NS, Doubt
 from spatial_replay.trace.trace import Trace
 
 _FEW_SAMPLES = 10
-"""Minimum number of samples to doubt their times; shorter files may be written by hand."""
+"""Minimum number of samples for a doubt of times; shorter files may be written by hand."""
 
 
 class TrackEvidence:
@@ -42,6 +42,7 @@ class TrackEvidence:
         if (turns > 2 * pi).any():
             self._add_steps(trace)
         if (turns > MANY_TURNS).any():
+            # `fmax` ignores NaN, the yaw of objects without orientation
             self._widest_turn = max(self._widest_turn, float(np.fmax.reduce(turns)))
             self._turned.update(trace.names)
 

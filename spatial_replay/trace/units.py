@@ -95,6 +95,7 @@ class Axes:
 
     def convert_yaw(self, yaw: Floats) -> Floats:
         """Return angles (R,) of the source as angles of samples."""
+        # as for vertices, zero stays zero
         return 0.0 - yaw if self.y == "down" else yaw
 
     def convert_trace(self, trace: Trace) -> Trace:
@@ -121,7 +122,7 @@ _MOST_SIZES: Final = 256
 
 
 def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B")) -> None:
-    """Refuse two runs if every common object is many times larger in the same one of them.
+    """Refuse two runs if all common objects are many times larger in one run than in the other.
 
     Args:
         called: names of the runs in the message.
@@ -144,7 +145,7 @@ def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B"))
 
 
 def _size(trace: Trace, name: str) -> float:
-    """Return the median extent of an object, with radii; 0 for a point, and without any position."""
+    """Return the median extent of an object, radii included; 0 for a point or an unknown position."""
     rows = trace.rows[:, trace.names.index(name)]
     rows = rows[rows >= 0]
     if not len(rows):

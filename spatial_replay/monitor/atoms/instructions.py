@@ -110,7 +110,7 @@ def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | N
 def _leaves(expression: Expression, sign: int) -> Iterator[tuple[int, Expression]]:
     """Iterate over the leaves of an expression, with the sign of their effect.
 
-    A minimum or a maximum counts as a leaf, because it is not monotone: one unknown operand makes it unknown.
+    A minimum or maximum counts as a leaf. It is not monotone, because one unknown operand makes it unknown.
     """
     match expression:
         case Sum(first, second):
@@ -143,12 +143,12 @@ def _variable_and_radius(term: Term) -> tuple[str | None, float]:
     return None, 0.0
 
 
-# instructions: operation, a, b, c; a "number" is NaN where it is undefined
-CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
-ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # numbers; NaN where an operand is NaN
+# operations of instructions (operation, a, b, c); a number is NaN where it is undefined
+CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # constant, measurement or signal a
+ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # of numbers; NaN where an operand is NaN
 HOLDS = 7  # a number as an interval: [-inf, inf] where it is NaN
-AND, OR = 8, 9  # intervals
-AND_MEMBER, OR_MEMBER = 10, 11  # a, joined with b where members c is 1, with [-inf, inf] where it is -1
+AND, OR = 8, 9  # of intervals
+AND_MEMBER, OR_MEMBER = 10, 11  # a, joined with b where membership c is 1, with [-inf, inf] where -1
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
 EQUAL = 14  # signal a and constant b: +inf or -inf; NaN where only one of them is a text, or a is missing
@@ -194,7 +194,7 @@ def run_instructions(
     Args:
         code: four numbers for each instruction.
         values, spreads, signals, closest, members: rows of T numbers each; four rows per closest pair.
-        outputs: instruction whose column is leaf j, for each j.
+        outputs: number of the instruction that computes leaf j, for each j.
         leaves: (C, A, T), output.
     """
     channels, total, instructions = leaves.shape[0], leaves.shape[2], len(code) // 4
@@ -277,7 +277,7 @@ def run_instructions(
                 else:
                     for k in range(count):
                         value = columns[second, k]
-                        # unknown membership: the body may or may not count, so its interval is all reals
+                        # with unknown membership the body may count or not, so its interval is [-inf, inf]
                         if members[member + k] < 0:
                             value = np.inf if channel % 2 else -np.inf
                         if members[member + k] == 0:
@@ -311,8 +311,8 @@ class Membership(NamedTuple):
     """A binding of an open quantifier: 1 in samples where all of `candidates` are members, 0 elsewhere.
 
     Attributes:
-        candidates: their indices among the candidates of the group. If empty, it stands for the group itself:
-            -1 in samples with unknown members, 0 elsewhere.
+        candidates: indices of objects among the candidates of the group. Without any, the number is -1 in
+            samples with unknown members, 0 elsewhere.
     """
 
     group: Group | Earlier
@@ -409,7 +409,7 @@ class LeafCode:
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
     def _current(self, rate: Rate, bindings: Bindings) -> int:
-        """Return a row that is a number in samples with all objects of a rate, or its signal."""
+        """Return a row that is NaN in samples without an object of a rate, or without its signal."""
         if rate.signal is not None:
             return self._expression(rate.signal, bindings)
         row, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]
@@ -420,7 +420,7 @@ class LeafCode:
     def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
         """Return the row of an expansion, given the rows of the original operands, by `id`.
 
-        An expansion repeats an operand, and compiling each repetition would take 2**depth steps.
+        An expansion repeats operands; to compile each repetition would take 2**depth steps.
         """
         if id(formula) in rows:
             return rows[id(formula)]

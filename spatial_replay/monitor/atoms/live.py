@@ -1,8 +1,8 @@
 """The leaves of single samples, for monitors: plans are compiled once and reused.
 
-Most samples differ in their numbers, not in their names. A plan stores all that depends on names as index
-arrays, so a sample only has to copy its numbers. A plan serves every sample whose members of open groups fit
-into it; an object missing from a sample is only a flag.
+Most samples differ in their numbers, not in their names. A plan stores everything that depends on names as
+index arrays, so a sample only has to copy its numbers. A plan serves every sample whose members of open
+groups fit into it; an object missing from a sample is only a flag.
 
 Without open groups, one plan serves all samples. Otherwise a plan depends on the number of members. It has
 placeholders for objects that the specification does not name, because these differ only in their classes.
@@ -99,8 +99,8 @@ class PlanArrays(NamedTuple):
         region_radius: radius of each part.
         region_vertices: x and y of all vertices.
         region_heights: (bottom, top) of each region.
-        listed_start: offsets of the lists in `listed_rows`. There is one list per operand, per closest pair,
-            per binding, and per measurement, in this order.
+        listed_start: offsets of the lists in `listed_rows`: one list for each operand, then for each closest
+            pair, each binding, and each measurement.
         listed_rows: rows of an operand or a pair's group, rows needed for a binding, and rows without which a
             measurement is unknown.
         listed_classes: the class that each listed row must have, or `ANY`.
@@ -109,7 +109,7 @@ class PlanArrays(NamedTuple):
             `first` and `second` (-1: none).
         yaws: (Y, 3), number of each measurement between orientations, and its two rows.
         closest_enlargement: total enlargement of each closest pair.
-        is_group: 1 if a binding stands for a group itself, which is unknown without its row; else 0.
+        is_group: 1 if a binding stands for the group itself, whose members are unknown without its row.
         code, constants, outputs: arguments of `run_instructions`.
     """
 
@@ -150,7 +150,7 @@ class PackedPlan(NamedTuple):
     Attributes:
         whole: the fields of `PlanPlaces`, then the integer arrays.
         real: the float arrays.
-        room: work space of `measure_sample`, numbers; each number of the objects needs three more.
+        room: size of the work space of `measure_sample`, without three entries per number of the objects.
     """
 
     whole: Integers
@@ -190,10 +190,10 @@ class PackedPlan(NamedTuple):
 
 
 class PlanPlaces(NamedTuple):
-    """Places of the plan's arrays in `PackedPlan.whole` and `PackedPlan.real`, and their counts.
+    """Begins and ends of a plan's arrays in `PackedPlan.whole` and `PackedPlan.real`, and counts.
 
-    A field named after an array of `PlanArrays` is its begin; a field that ends in `_end` is its end. They
-    are numbers, because kernels count references to arrays, even in tuples.
+    The begin of an array has the array's name, and its end has the suffix `_end`. Kernels get these numbers
+    instead of a tuple of arrays, because they count references to each array.
 
     Attributes:
         samples, regions, places, signals, coded: the plan's extent.
@@ -311,7 +311,7 @@ def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
 def _fill_rows(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers
 ) -> None:
-    """Copy regions and the objects of a sample into rows; `sample` is that of `measure_sample`."""
+    """Copy the regions of a plan and the objects of a sample into rows."""
     samples, object_begin = plan.samples, plan.samples + plan.regions
     lists[rows.part_start] = lists[rows.vertex_start] = 0
     for k in range(object_begin):
@@ -369,7 +369,7 @@ def _measure(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     values: int, begin: int,
 ) -> None:  # fmt: skip
-    """Write K values, then K spreads, at `values`; they equal those of `measurements.measurement_values`.
+    """Write K values, then K spreads, at `values`, as `measurements.measurement_values` computes them.
 
     Args:
         begin: begin of the work space for operands.
@@ -440,7 +440,7 @@ def _closest(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     closest: int,
 ) -> None:  # fmt: skip
-    """Write the ends (K, 4) of the closest pairs at `closest`; they equal those of `leaf_values`."""
+    """Write the ends (K, 4) of the closest pairs at `closest`, as `leaf_values` computes them."""
     nearest = np.empty((1, 3))
     for k in range(plan.pairs):
         start = plan.listed_start + plan.operands + k
@@ -519,7 +519,7 @@ def _channels_of(
 
 @kernel
 def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leaves: Floats) -> int:
-    """Compute the leaves of one sample, (C, A, 1), with the same results as `leaf_values`.
+    """Compute the leaves of one sample, (C, A, 1), equal to those of `leaf_values`.
 
     Args:
         whole, real: arrays of a `PackedPlan`.
@@ -563,7 +563,7 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
 
 
 class SampleRoom:
-    """Memory for the newest sample of a stream in the layout of kernels; the next sample replaces it.
+    """Memory for the newest sample of a stream, in the layout of kernels.
 
     Attributes:
         arguments: arguments of `measure_sample`.
@@ -622,7 +622,7 @@ class PlanContext:
 
     Attributes:
         leaves: leaves of each formula.
-        delays: delays of the samples that the terms read, 0 first.
+        delays: delays of the samples that terms read; delay 0 is first.
         classes: code of each class of an open group, by its name in lower case. Other classes have code 0.
         regions: regions in formulas, and centres of regions in formulas.
     """
@@ -719,12 +719,12 @@ class PlanRows:
 
 
 class LeafPlan:
-    """Index arrays for the leaves of a sample, with the earlier samples that it looks back at."""
+    """Index arrays that compute the leaves of a sample, also from earlier samples."""
 
     def __init__(
         self, frame: PlanContext, members: frozenset[Member], placeholders: Mapping[_Classes, Sequence[str]]
     ) -> None:
-        """Create a plan for samples whose open groups have no other members than `members`.
+        """Create a plan for samples whose open groups only have members in `members`.
 
         Args:
             placeholders: names of members that stand for unnamed objects, by the classes of the object.
@@ -912,7 +912,7 @@ MOST_PLANS = 64
 _MOST_BYTES = 1 << 22
 """Limits on stored plans, by number and bytes; the least recently used plans are evicted first."""
 _MOST_CLASSES = 1024
-"""Limit on cached spellings of class names, which objects write in any case."""
+"""Limit on cached class names; objects may write them in any case."""
 
 _NO_OBJECT = ""
 """A name that no object has."""
@@ -973,14 +973,14 @@ class SampleLeaves:
         self.room = SampleRoom(len(formulas))
 
     def look_at(self, sample: Sample) -> Sequence[Sample | None]:
-        """Add the next sample; return it with the samples at the terms' delays."""
+        """Add the next sample; return it with the earlier samples at the delays of terms."""
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)
         return self._recent.add(sample)
 
     def fill_room(self, sample: Sample) -> SampleRoom:
-        """Add the next sample and write it, with the samples it looks back at, into memory for kernels.
+        """Add the next sample and copy it, with earlier samples that terms read, into memory for kernels.
 
         Raises:
             UsageError: the bindings exceed `MAX_BINDINGS`.

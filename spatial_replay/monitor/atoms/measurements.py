@@ -101,6 +101,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     """Return the cache key of a measurement, with the shapes of regions instead of their names."""
     shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
+    # `skip` is part of the key, because arrays begin with the sample `skip`
     if not shapes:
         return scene.skip, measurement
     return scene.skip, measurement.with_terms(*map(_without_region_name, measurement.terms)), shapes

@@ -29,7 +29,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 
 def before_last_reports(trace: Trace) -> Integers:
-    """Return the last sample before the first that shows the newest report, for each object and signal."""
+    """Return the sample before the newest report begins, for each object and signal with report times."""
     columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
     for name, reported_ns in trace.signals_reported_ns.items():
         columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
@@ -47,7 +47,7 @@ def is_signal_known(values: Floats) -> Booleans:
 
 
 def _begins(is_known: Booleans, reported_ns: Integers) -> Booleans:
-    """Return whether a sample is the first that shows its report; both columns are (T, ...)."""
+    """Return whether a report begins with each sample; both arguments are (T, ...)."""
     begins = is_known.copy()
     begins[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
     return begins
@@ -57,8 +57,8 @@ class Reports(NamedTuple):
     """The previous report of an object or a signal, in each sample.
 
     Attributes:
-        before: (T,), last sample that shows the previous report. -1 for the first report, also for the first
-            after a sample without one.
+        before: (T,), last sample with the previous report; -1 if there is none. There is none after a sample
+            without a report.
         seconds: (T,), time between both reports; NaN if there is no previous one, or if not positive.
     """
 
@@ -94,7 +94,7 @@ class LatestReport:
     centre: tuple[bytes, bytes] | None = None
 
     def follow(self, value: Any, reported_ns: int) -> LatestReport:
-        """Return the report of the next sample: this one again if the time is the same, else a new one."""
+        """Return the report of the next sample, which is the same report if its time is the same."""
         if reported_ns == self.reported_ns:
             return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns

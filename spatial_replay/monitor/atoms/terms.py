@@ -1,4 +1,4 @@
-"""Terms in a trace: their footprints, uncertainty, unknown samples, and reach into the past (`a[-3]`).
+"""Terms in a trace: their footprints, uncertainty, unknown samples, and delays (`a[-3]`).
 
 A rate looks back at reports (see `reports`).
 """
@@ -57,7 +57,7 @@ from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 
 class Delay(NamedTuple):
-    """The delay of a term: a number of samples, at least some ns, or a report (both None)."""
+    """The delay of a term: in samples, in ns, or to the previous report (both None)."""
 
     samples: int | None
     duration_ns: int | None
@@ -103,7 +103,7 @@ def tail(trace: Trace, reach: Reach) -> Trace:
     """Return the samples of a trace that the next sample may look back at (see `look_back`)."""
     begin = len(trace) - max(reach.samples, reach.to_reports)
     if reach.duration_ns:
-        # the next sample is later than the newest, so its delay cannot reach further back
+        # the next sample is later than the newest one, so it cannot look back further
         latest_ns = trace.times_ns[-1] - reach.duration_ns
         begin = min(begin, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
     recent = np.arange(max(begin, 0), len(trace))
@@ -120,7 +120,7 @@ class RecentSamples:
         self._is_newest_only = [delay for delay, _ in self._queues] == [NO_DELAY]
 
     def add(self, sample: Sample) -> list[Sample | None]:
-        """Add the next sample; return the sample at each delay before it, None before the first sample."""
+        """Add the next sample; return the sample at each delay, or None before the first sample."""
         if self._is_newest_only:
             return [sample]
         return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
@@ -153,7 +153,7 @@ class ResolvedTerm:
 
     Attributes:
         operand: its footprints.
-        unknown: (T,), whether the whole term is unknown.
+        unknown: (T,), whether the term is unknown.
         spread: (T,), its uncertainty; for a group, the largest of its members.
         yaw: (T,), its orientation; NaN if it has none.
     """
@@ -353,7 +353,7 @@ class TraceScene:
         return self._resolve_rows(rows, unknown | (source < 0))
 
     def _moved_back(self, term: Earlier) -> ResolvedTerm:
-        """Resolve the earlier position of a rate's term."""
+        """Resolve a term at the time of the earlier report that a rate compares."""
         shortest, columns, spreads = self._step(term.rate), [], []
         for name, current in zip(*self._members_of(term.term), strict=True):
             rows, spread = self._moved_rows(name, current, shortest)
@@ -370,7 +370,7 @@ class TraceScene:
         return ResolvedTerm(Operand(rows), unknown, spread, np.full(len(rows), np.nan))
 
     def _moved_rows(self, name: str, current: Integers, shortest: Floats) -> tuple[Integers, Floats]:
-        """Return the rows of an object moved back by its velocity, and the uncertainty of these positions.
+        """Return the rows of an object moved back by its velocity, and their uncertainty.
 
         Args:
             current: (T,), row of the object in each sample of the whole trace.
@@ -396,7 +396,7 @@ class TraceScene:
         return rows, spread
 
     def _add_moved_rows(self, newer: Integers, older: Integers, share: Floats) -> Integers:
-        """Move rows by a share of the way back to older rows; return their new row numbers."""
+        """Add copies of newer rows, moved by a share of the way to older rows; return their row numbers."""
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
         moved_batch = shift_rows(

@@ -25,12 +25,12 @@ OFFLINE_TARGET = 6  # in offline rows instead of SIGNAL_WINDOW: the column that 
 OFFLINE_WIDTH = 7
 # codes of signals
 LEAF = 0  # leaf a
-CONSTANT = 1  # low times infinity
+CONSTANT = 1  # infinity with the sign low
 NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
-WINDOW_MAX, WINDOW_MIN = 10, 11  # extremum of a over [low, high] back
-DELAY = 12  # a at low back; high times infinity before the first sample
-# high times infinity from distance low after the first sample on; before, the opposite infinity
+WINDOW_MAX, WINDOW_MIN = 10, 11  # extremum of a over positions low to high back
+DELAY = 12  # a at distance low back; before the first sample, infinity with the sign high
+# infinity whose sign is high from a distance low after the first sample on, and the opposite before
 ELAPSED = 31
 RINGS = (WINDOW_MAX, WINDOW_MIN)  # store positions in a ring
 AHEAD = 16  # added to a code from ONCE on: the operator in reversed time (see `offline`)
@@ -46,7 +46,7 @@ LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3
 # max(b, min(a, next)); min(b, max(a, next))
 UNTIL, RELEASE = 4, 5
-PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # extremum of a over [low, high] ahead
+PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # extremum of a over positions low to high ahead
 SHIFT = 8  # a at low ahead; positions of a up to high ahead are needed
 AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)
 PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
@@ -59,8 +59,8 @@ BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 # columns of parts: rows of the nodes, the kind, numbers of variables and tables, the corner that ends a run,
 # and the begin of the table in each channel (for parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# one bit each for `OPEN_LOW` and `OPEN_HIGH`: whether the bound follows from the table alone, because later
-# samples may exceed every pending position
+# a bit for `OPEN_LOW` and one for `OPEN_HIGH`: whether this bound follows from the table alone, because
+# later samples may exceed every pending position
 PART_KNOWN = 7
 PART_HAS_NOW = 8  # whether it also reports its value at the newest sample
 PART_IS_MONOTONE = 9  # whether the operand of a root by the minimum never falls (maximum: never rises)
@@ -70,8 +70,8 @@ TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 # columns of reports: index of the signal or part; rule for the number `now`
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
 REPORT_WIDTH = 5
-# codes of reports. A row is a node as written, so only these have codes for `xor`, `->` and `<->`; rows for
-# their expansions would cost eight numbers per sample each
+# codes of reports. Reports are nodes as written, so `xor`, `->` and `<->` have codes, too: rows for their
+# expansions would cost eight numbers per sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
@@ -98,7 +98,7 @@ CHANNELS = 4
 """Number of channels: nominal low and high, wide low and high."""
 
 _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
-"""Stored channel that holds each of the four channels, by the number of stored channels."""
+"""For each number of stored channels, the stored channel that each of the four channels equals."""
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:

@@ -46,7 +46,7 @@ Row = tuple[int, ...]
 """A row of a table, with the columns that `codes` lists."""
 
 NOTHING = -1
-"""Entry of a row without an operand, upper end, variable, table or window."""
+"""Entry of a row for a missing operand, upper end, variable, table or window."""
 
 
 def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
@@ -57,7 +57,7 @@ def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
 
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
-    """Return rows as an array (R, width), even for R = 0; shorter rows are padded with zeros."""
+    """Return rows as an array (R, width); shorter rows are padded with zeros."""
     padded = [(*row, *(0,) * (width - len(row))) for row in rows]
     return np.array(padded, np.int64).reshape(len(rows), width)
 
@@ -190,7 +190,7 @@ class SignalTable:
         return row
 
     def infinity_after(self, unit: int, distance: int, sign: int) -> int:
-        """Add an infinity that has this sign from a distance after the first sample on, else the other."""
+        """Add an infinity with this sign from a distance after the first sample on; before, the opposite."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
 
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
@@ -227,7 +227,7 @@ class PartRows:
     """The rows of a node that looks ahead, in negation normal form: operands first, equal rows once.
 
     Attributes:
-        variables: number of operators that need their value at the next sample.
+        variables: number of operators whose value depends on the next sample.
         tables: number of tables: one of the part, and one for each past operator with its own table.
     """
 
@@ -246,7 +246,7 @@ class PartRows:
             self._add(root, True)
 
     def rows(self) -> tuple[Row, ...]:
-        """Return the rows with the numbers of their variable and table, and whether they depend on any."""
+        """Return the rows, each with its variable and table, and whether it depends on any of them."""
         variable = 0
         table = 1  # 0 is the part's own table
         numbered_rows: list[Row] = []
@@ -301,7 +301,7 @@ class PartRows:
     def _add(self, formula: Formula, positive: bool) -> int:
         """Return the row of a formula, or of its negation, in negation normal form.
 
-        Each polarity is built once: the expansion of `xor` has its operands in both.
+        Each of the two is built once, because the expansion of `xor` has its operands in both.
         """
         formula = expand(formula)
         while isinstance(formula, Boolean) and formula.operator == "not":
@@ -408,7 +408,7 @@ def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[
 
 
 def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
-    """Return the extrema that an until or since takes of its right and of its left operand."""
+    """Return the extremum for the right operand of an until or since, and the one for its left operand."""
     return (greatest, least) if is_strong else (least, greatest)
 
 
@@ -422,14 +422,12 @@ def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
 
 
 class _Direction(NamedTuple):
-    """Codes of nodes below a root that joins by the minimum; for the maximum they are mirrored.
+    """Codes of nodes below a root that joins by the minimum. For the maximum, each has its dual.
 
     Attributes:
-        either: nodes that are great if one operand is great.
-        both: nodes that are great if all operands are great.
-        until: nodes that are great once their operand is great.
-        release: nodes that are great while their operand is great.
-        worst, best: bounds over the smallest and the greatest continuation.
+        either, both: codes of "or" and "and".
+        until, release: codes of until and release.
+        worst, best: bounds for the lowest and the highest later values.
     """
 
     either: int
@@ -452,7 +450,7 @@ _DIRECTIONS: Mapping[int, _Direction] = MappingProxyType(
 
 
 def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
-    """Return the direction of a part's root if it is a variable, an operator without an end; else None."""
+    """Return the direction of a part's root; None if the root is not a variable."""
     if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
         return None
     return _DIRECTIONS.get(rows[-1][codes.NODE_CODE])
@@ -461,14 +459,14 @@ def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
 def known_bounds(rows: tuple[Row, ...]) -> int:
     """Return the bounds that follow from a part's table regardless of open positions, one bit each.
 
-    Later samples may always violate `G x`, so its lower bound is -inf. Its upper bound follows from the table
-    if later samples can satisfy x at every open position, as for `F y` and `F y or z`. The table then bounds
-    the closed positions, if the same holds for all its variables.
+    Later samples may always violate `G x`, so its lower bound is -inf. Its upper bound depends on closed
+    positions alone if later samples can satisfy x at every open position, as for `F y` and `F y or z`. The
+    table then has this bound, if the same holds for all its variables.
     """
     direction = _direction_of(rows)
     if direction is None:
         return 0
-    # whether a node is infinitely great in the best continuation
+    # whether a node is infinite under the best continuation
     outdone: list[bool] = []
     for code, a, b, *_ in rows:
         if code == direction.either:
@@ -487,7 +485,7 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
 
 
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
-    """Return for each node whether its numbers never fall, and whether they never rise, as samples come.
+    """Return for each node whether its numbers never fall with new samples, and whether they never rise.
 
     The numbers are those of a run that ends with the newest sample.
     """
@@ -504,7 +502,7 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
 
 
 def is_monotone(rows: tuple[Row, ...]) -> bool:
-    """Return whether the operand of a root by the minimum never falls (maximum: never rises)."""
+    """Return whether the operand never falls, for a root that joins by the minimum (maximum: never rises)."""
     direction = _direction_of(rows)
     if (
         direction is None
@@ -646,7 +644,7 @@ class _Parts:
 
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
-    """Yield the rows; windows in seconds are numbered."""
+    """Yield the rows, with numbers for windows in seconds."""
     timed = 0
     for row in nodes:
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
@@ -656,7 +654,7 @@ def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
 
 
 def _with_signal_row(row: Row, signals: SignalTable) -> Row:
-    """Return a row; a negated literal becomes a literal of the negated signal."""
+    """Return a row; a negated literal is replaced by a literal of the negated signal."""
     code, signal, is_negated, *fields = row
     if code != codes.LITERAL or not is_negated:
         return row

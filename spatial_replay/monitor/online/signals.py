@@ -21,8 +21,8 @@ from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
-# columns of a sliding window's ring: number of positions that ever left it and that ever entered it, the next
-# position to enter, then the positions that can still attain the extremum
+# columns of a sliding window's ring: numbers of positions that have left and entered it, the next position to
+# enter, then the positions that can still attain the extremum
 HEAD, TAIL, ENTERING, RING = range(4)
 
 
@@ -46,7 +46,7 @@ def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
 
 @inlined
 def past_value(code: int, first: float, second: float, before: float) -> float:
-    """Return an unbounded once, historically or since at a sample, from its value at the previous sample."""
+    """Return once, historically or since at a sample, from its value at the previous sample."""
     if code == codes.ONCE:
         return max(first, before)
     if code == codes.HISTORICALLY:

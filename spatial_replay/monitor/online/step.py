@@ -7,7 +7,7 @@ same bits, because the only arithmetic is minima, maxima and negation.
 In one channel, a node has four numbers for each sample: value, now, lower and upper. In more channels (see
 `codes`) it has eight numbers, the low and high ends of four values. These are the value, `now`, the value
 over every continuation, and the value if the run ends there. A number depends on its operands' numbers in the
-same row, and in the mirror row, from which negation reads.
+same row; under a negation, on those in the mirror row.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from spatial_replay.monitor.online.signals import (
 from spatial_replay.monitor.online.windows import run_windows
 
 NUMBERS = 8
-"""Number of rows of a node, and of a part."""
+"""Number of rows for the numbers of a node or part."""
 SERIES = 4
 """Number of result rows of a node: value, now, lower and upper."""
 
@@ -126,7 +126,7 @@ def report(
             if is_now and code == codes.REPORT_SIGNAL:
                 for k in range(count):
                     work[target, k] = history[channel, index, begin + k]
-            elif code == codes.REPORT_SIGNAL:  # a signal is final at the first sample
+            elif code == codes.REPORT_SIGNAL:  # the value of a signal at the first sample is final
                 _fill(work, target, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
             elif code == codes.REPORT_PART:
                 if not is_now or rule == codes.NOW_OF_PART:
@@ -186,7 +186,7 @@ ROOM = 256
 BEGIN, FINISH = 1, 2
 """Phases of `run_samples`: signals with parts without windows, and the numbers of all nodes."""
 _UNKNOWN = -2
-"""Newest sample of a set of columns before its first sample."""
+"""Entry of `KNOWN` for a set of columns without any sample."""
 
 
 @kernel
@@ -240,7 +240,7 @@ def run_sample(
         whole, real, sample, end, leaves: arguments of `measure_sample`.
         numbers: (N, 4), output: value, now, lower and upper of each node.
         channels: number of channels of the leaves; 0 if they are not measured yet.
-        run_channels: number of channels of the state. If it is less than that of the leaves, nothing runs.
+        run_channels: number of channels of the state. With fewer channels than the leaves, nothing runs.
 
     Returns:
         the number of channels of the leaves.
@@ -282,7 +282,7 @@ class _OpenPart:
         self.state[windows.STATE, :nodes] = -1
 
     def copy(self, room: int) -> _OpenPart:
-        """Return a copy of the state; its columns have to be computed again."""
+        """Return a copy of the state without the columns, which are computed again."""
         part = _OpenPart(self.rows, room)
         part.tables[:] = self.tables
         part.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
@@ -292,7 +292,7 @@ class _OpenPart:
         return part
 
     def forget(self, drop_count: int) -> None:
-        """Drop the oldest samples: positions count from a later sample."""
+        """Shift all positions after the oldest samples were dropped."""
         head = self.state[windows.HEAD]
         head[windows.OFFSET] += drop_count
         head[windows.BASE] -= drop_count
@@ -409,7 +409,7 @@ class OnlineRun:
         return series
 
     def widen(self, channels: int) -> None:
-        """Extend the state to `channels`; each new channel starts as a copy of its equal."""
+        """Extend the state to `channels`; a new channel starts as a copy of the channel that it equalled."""
         if channels <= self._channels:
             return
         old_channels, self._channels = self._channels, channels

@@ -27,15 +27,15 @@ CLOSING = 16
 BLOCK = 64
 """Number of positions in a block of the root's operand; a block is joined again only after a change."""
 STRIDE = 16
-"""Number of positions that are filled with one number at a time."""
+"""Number of positions that `_run_open` fills at once."""
 _NEVER = 1 << 62
 
 SETS = 3
 """Sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""
 SEEN = SETS + 1
-"""Sets of columns before the copies of operands' columns for windows."""
+"""Index of the first set with copies of operands' columns; windows compare them with the new columns."""
 EXTRA = SEEN + SETS
-"""Sets of columns before the extra rows."""
+"""Number of sets of columns, before the extra rows."""
 # rows after the columns of the nodes: joined blocks, work space of `_slide`, and the results of a part
 JOINED, BEFORE, RESULTS = 0, SETS, SETS + 1
 RESULT_NOW = 1
@@ -43,7 +43,7 @@ RESULT_NOW = 1
 EXTRA_ROWS = SETS + 5
 
 # rows of the state: HEAD has single numbers, the others one number for each node. The newest sample changed
-# its own position, and positions from CHANGED to before CHANGED_END (newest sample and 0: no others)
+# its own position, and the positions from CHANGED to before CHANGED_END; without any, CHANGED_END is 0
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
 STARTS = 9  # then two rows per window in seconds: its first position, and its last position plus one
 # columns of HEAD: number of dropped samples, the base, whether any position is absorbed, and the number of
@@ -101,7 +101,7 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
 
 @inlined
 def window_of(rows: Integers, d: int) -> tuple[bool, int, int, int, int]:
-    """Return whether a node looks ahead, the unit and ends of its window, and the row of its times."""
+    """Return whether a node looks ahead, its window's unit and ends, and the row of its window's times."""
     is_ahead = codes.PART_WINDOW_MAX <= rows[d, codes.NODE_CODE] <= codes.SHIFT
     times = STARTS + 2 * rows[d, codes.NODE_TIMED]
     return is_ahead, rows[d, codes.NODE_UNIT], rows[d, codes.NODE_LOW], rows[d, codes.NODE_HIGH], times
@@ -171,7 +171,7 @@ def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int,
 
 @inlined
 def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
-    """Record the windows in seconds that begin with the newest samples, or have ended before them."""
+    """Record which windows in seconds begin or have ended with the newest samples."""
     for d in range(len(rows) - 1):
         if rows[d, codes.NODE_TIMED] < 0:
             continue
@@ -248,9 +248,9 @@ def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, column: int, begin: int, changed: int, last: int, is_fresh: bool,
 ) -> int:  # fmt: skip
-    """Update the windows that reach to the last sample, backwards until one does not change.
+    """Update the windows that reach to the last sample, from the last window backwards.
 
-    Later windows are parts of earlier ones, so no earlier window changes either.
+    Earlier windows contain later ones, so the update stops at the first window that does not change.
 
     Returns:
         the first position whose number changes.
@@ -264,7 +264,7 @@ def _run_open(
         stop = max(position - STRIDE, begin)
         first = _start(state, window, stop, last)
         if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
-            # no number of these windows exceeds the extremum, so it is theirs, too
+            # no number in these windows exceeds the extremum, so all of them have this extremum
             start = _start(state, window, position - 1, last)
             is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
             for k in range(position if is_same else stop, position):
@@ -287,7 +287,7 @@ def _changing_windows(
     is_greatest: bool, columns: Floats, child: int, column: int, seen: int, changed: int, changed_end: int,
     begin: int, end: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Skip windows with a better number than all changed numbers, old and new.
+    """Skip windows whose number beats all changed numbers, old and new.
 
     Returns:
         the bounds of the windows among begin … end - 1 that may change: first, last plus one.
@@ -337,7 +337,7 @@ def _run_window(
     if not is_fresh:
         begin = min(max(min(_first_holding(state, window, changed, last), last), lowest), tail)
     if is_ahead and not is_fresh:
-        closing = tail  # windows from here on close with the newest sample or later
+        closing = tail  # windows from this position on close with the newest sample or later
         if is_decided and last > 0:
             closing = min(max(_first_holding(state, window, last - 1, last), lowest), tail)
         end = min(_first_starting(state, window, changed_end, last), closing)
@@ -368,7 +368,7 @@ def _run_since(
     strong: bool, has_left: bool, columns: Floats, left: int, right: int, column: int, value: float,
     begin: int, last: int,
 ) -> int:  # fmt: skip
-    """Run a since or trigger forwards from the value before `begin`; return the first changed position."""
+    """Run a since or trigger forwards from `begin`, given the value before; return the first change."""
     changes, is_same = begin, True
     for k in range(begin, last + 1):
         if has_left:
@@ -382,7 +382,7 @@ def _run_since(
 
 @inlined
 def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> float:
-    """Return the start value of a since or trigger: its value at its state, from its table."""
+    """Return the start value of a since or trigger, which its table gives for the position of its state."""
     value, part = beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK]), len(rows) - 1
     if state[STATE, d] >= 0:
         variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
@@ -394,7 +394,7 @@ def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> f
 def _set_point(
     rows: Integers, d: int, state: Integers, columns: Floats, row: int, mode: int, last: int, tables: Floats
 ) -> None:
-    """Set the point's coordinate of a node's variable to its value at the boundary."""
+    """Set the coordinate of a node's variable in the point to the node's value at the boundary."""
     boundary = state[BOUNDARY, d]
     value = columns[row, boundary] if boundary <= last else beyond(mode, rows[d, codes.NODE_WEAK])
     tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[d, codes.NODE_VARIABLE]] = value
@@ -402,7 +402,7 @@ def _set_point(
 
 @inlined
 def has_column(rows: Integers) -> bool:
-    """Return whether the root has a column; a root that joins all positions from the base on needs none."""
+    """Return whether the root has a column. A root that joins all positions needs none."""
     root = len(rows) - 2
     return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
 
@@ -509,7 +509,7 @@ def _bring_up(
 def _join_blocks(
     is_until: bool, columns: Floats, body: int, joined: int, value: float, begin: int, end: int
 ) -> float:
-    """Join a number with the numbers at begin … end - 1, by whole blocks where possible."""
+    """Join a number with the numbers at begin … end - 1, using joined blocks."""
     first_block, block_end = begin // BLOCK + 1, end // BLOCK
     blocks_begin = min(first_block * BLOCK, end)
     value = extremum(is_until, columns, body, begin, blocks_begin, value)
@@ -612,11 +612,10 @@ def _reach(
 ) -> bool:
     """Find the positions of each node that the root needs at root_low … root_high.
 
-    `LOW` and `HIGH` receive them. `PLAIN` receives the lower ends before they are widened to the ends of the
-    tables.
+    They are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before it is widened to boundaries and states.
 
     Returns:
-        whether all windows on the way have closed.
+        whether all windows between these positions and the root have closed.
     """
     nodes, is_closed = len(rows) - 1, True
     for d in range(nodes):
@@ -744,8 +743,8 @@ def _renew_tables(
 def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last: int) -> None:
     """Move the base over positions with open windows that cannot change the root any more.
 
-    The table bounds `G x` from above. A position does not matter once x is at least this bound, because x
-    never falls there.
+    The table bounds `G x` from above. A position has no effect once x is at least this bound, because x
+    never falls.
     """
     root, base = len(rows) - 2, state[HEAD, BASE]
     is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, rows[root, codes.NODE_B]

@@ -1,4 +1,4 @@
-"""Evidence for witnesses: the samples of one instance, read again on each request, and their gaps."""
+"""The samples of one instance, read again on each request, and their gaps."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Gap:
         name: title of the object or signal (see `NamedPart`); None for pauses.
         missing: number of samples that lack it, or that fill pauses.
         samples: number of all samples.
-        first_ns, last_ns: times of the first and the last missing sample.
+        first_ns, last_ns: times of the first and the last of the missing samples.
         window: start and end (not included) of the samples that have it, if it is missing only at the ends
-            of the log; else None. None also for an object with a class that comes later, or leaves.
+            of the log; else None. None also for an object with a class that is sometimes absent.
         longest_ns: times of the first sample of its longest gap, and of the first sample after it.
         is_filled: whether that gap is filled to its end, as by `max_gap`; a lost connection adds only
             a sample at its beginning.
@@ -57,11 +57,10 @@ class Evidence:
         units: Mapping[str, str] = MappingProxyType({}),
         zero_ns: int | None = None,
     ) -> None:
-        """Store access to the samples.
+        """Store how to read the samples.
 
         Args:
-            traces: iterates over the samples in blocks of any length, with earlier samples for terms that
-                look back.
+            traces: iterates over the samples in blocks of any length, with earlier samples that terms read.
             units: declared units of the log, of signals by name, of lengths under "".
             zero_ns: reference time of sentences; None for the time of the first sample.
         """
@@ -73,7 +72,7 @@ class Evidence:
         self._reach = instance.reach
 
     def bound(self, formula: Formula) -> Formula:
-        """Bind a formula of the instance to the object of the instance."""
+        """Replace variables of a formula by the object of the instance."""
         return substitute(formula, self.instance.bindings)
 
     def scene(self, time_ns: int) -> TraceScene:
@@ -118,7 +117,7 @@ class Evidence:
         return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:
-        """Return `zero_ns`; by default the time of the first sample, even one before the instance."""
+        """Return `zero_ns`; without it, the time of the first sample of all traces."""
         if self._zero_ns is not None:
             return self._zero_ns
         return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
@@ -129,7 +128,7 @@ class Evidence:
         return np.concatenate([scene.trace.times_ns[scene.skip :][self._inside(scene)] for scene in scenes])
 
     def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
-        """Return the gaps of objects and signals in a formula, one for each that is ever missing.
+        """Return the gaps of all objects and signals in a formula that are ever missing.
 
         Args:
             time_ns: a pause that contains this time counts as the longest.
@@ -216,7 +215,7 @@ def _object_names(base: Term) -> tuple[str, ...]:
 
 
 def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), whether an object has no known position, or a signal no finite value, in each sample."""
+    """Return (T,), whether the position of an object or the value of a signal is missing in each sample."""
     name = part.name
     if part.is_signal:
         values = trace.signals.get(name)
@@ -227,7 +226,7 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 
 
 def _is_absent(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), whether an object is absent, not only unknown, in each sample."""
+    """Return (T,), whether an object is absent in each sample; an object with unknown position is not."""
     if part.is_signal or part.name not in trace.names:
         return np.full(len(trace), not part.is_signal)
     return np.asarray(trace.rows[:, trace.names.index(part.name)] == ABSENT)

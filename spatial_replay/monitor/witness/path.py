@@ -79,8 +79,8 @@ class End(Enum):
     """The deciding end of an interval.
 
     The low end decides a satisfied formula, because it is at least 0. The high end decides a violated one.
-    Other formulas are `OPEN`: their path follows the low ends of minima and the high ends of maxima, and ends
-    at an operand that is itself open.
+    Other formulas are `OPEN`. Their path follows the low ends of minima and the high ends of maxima, so it
+    ends at an open operand.
     """
 
     LOW = "low"
@@ -193,8 +193,8 @@ class DecidingPath(NamedTuple):
 def deciding_path(nodes: OfflineNodes, node: int, end: End, *, sample: int = 0) -> DecidingPath:
     """Return the deciding path of a node at a sample.
 
-    Of equal operands, the one whose path ends at the earliest sample decides, then the first operand. Of
-    equal samples in a window, the earliest decides.
+    Ties between operands go to the path that ends at the earliest sample, then to the first operand. Ties in
+    a window go to the earliest sample.
     """
     return _Walk(nodes).follow(node, sample, end)
 
@@ -283,9 +283,9 @@ class _Walk:
         return self._until(SignedOperand(left), SignedOperand(right), sample, window, end, is_ahead=is_ahead)
 
     def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
-        """Return the sample of the least left operand so far, if it decides an until with an open window.
+        """Return the least left operand so far of an until with an open window, if it decides the until.
 
-        None if other samples decide the until, and for other operators.
+        The low end of an until never depends on later samples, so it is None for this end.
         """
         formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
@@ -319,7 +319,7 @@ class _Walk:
         *,
         is_ahead: bool = True,
     ) -> PathNode:
-        """Return the operand and sample that decide an until or, with `is_ahead` false, a since."""
+        """Return the operand and sample that decide an until, or a since if `is_ahead` is false."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
         lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
         left_so_far = [_least_between(numbers, is_ahead=is_ahead) for numbers in lefts]
@@ -355,7 +355,7 @@ class _Walk:
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
-    """Return the running minimum of a column from its near end to before each place; +inf at the near end."""
+    """Return the minimum of a column between its near end and each place, without the place itself."""
     ordered = column if is_ahead else column[::-1]
     least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
     return least if is_ahead else least[::-1]
@@ -407,7 +407,7 @@ def missed_response(
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
-    """Return why an atom is unknown in the one sample of a scene, each reason once, in order."""
+    """Return the reasons why an atom is unknown in the one sample of a scene, each reason once."""
     parts = list(iter_expressions(atom.expression))
     exact = [part.signal for part in parts if isinstance(part, Equality)]
     reasons = (reason for part in parts if part not in exact for reason in _reasons(scene, part))
@@ -445,7 +445,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
 
 
 def _position(term: Term) -> Projection:
-    """Return an expression that is unknown if the position of a term is unknown."""
+    """Return a coordinate of a term, which is unknown if the term's position is unknown."""
     return Projection(term, "x", "min")
 
 
@@ -610,7 +610,7 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
 
 
 def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
-    """Return the bodies for all bindings that the quantifier does not leave out."""
+    """Return the bodies of the bindings that a quantifier does not leave out."""
     bodies = list(_bodies(scene, formula))
     if not rate_conditions(formula.body):
         return bodies
@@ -619,7 +619,7 @@ def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
 
 
 def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
-    """Iterate over the body for each binding of the variables to members of the group."""
+    """Iterate over a quantifier's body for all bindings that may decide it."""
     names, members, _ = scene.members(formula.group)
     present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
     for bound in _may_decide(scene, formula, present):
@@ -627,7 +627,7 @@ def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
 
 
 def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Return bindings that include a deciding one: near pairs, if a distance decides the quantifier."""
+    """Return the bindings that may decide a quantifier: near pairs if a distance decides, else all."""
     pair = closest_pair_of(formula)
     everyone = permutations(present, len(formula.variables))
     if pair is None or len(present) < 3:
@@ -678,7 +678,7 @@ def _as_atom(expression: Expression) -> Atom:
 
 
 def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
-    """Return the numbers of a signal or measurement; groups are replaced by the members that attain it."""
+    """Return the number of a signal or measurement, with the deciding members instead of groups."""
     match part:
         case Rate():
             low, high = _intervals(scene, [_as_atom(part)])[0]
@@ -700,7 +700,7 @@ def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
 
 
 def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
-    """Return a measurement between the members of groups that attain it."""
+    """Return a measurement with the deciding members instead of groups."""
     singles = [_singles(scene, term) for term in part.terms]
     candidates = [part.with_terms(*terms) for terms in product(*singles)]
     values, places = measurement_values(scene, candidates)[0][:, 0], np.arange(len(candidates))

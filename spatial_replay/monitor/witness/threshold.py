@@ -85,7 +85,7 @@ class Dial:
         return cls("margin", 0.0, is_exact)
 
     def with_constant(self, formula: Formula) -> Dial | None:
-        """Return the dial of the number's constant; None without one, and if computed numbers use it."""
+        """Return the dial of the number's constant; None without one, or if it is also used in arithmetic."""
         if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
             return None
         (constant,) = self.value.constants
@@ -196,7 +196,7 @@ RESIDUE: Final = 1e-12
 _PRECISION: Final = 60
 _FAR = 1e300
 _STEPS = 8.0
-"""Floating-point steps by which a number moves beyond the flip, so that rounding cannot undo it."""
+"""Floating-point steps that a number moves too far, so that rounding cannot undo the flip."""
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
 """Rounds of a search, and parts of the interval in each.
@@ -205,7 +205,7 @@ The search is for dials that do not shift all samples equally. Each round reads 
 interval between a number that flips the verdict and one that does not.
 """
 _AT_FIRST = 64
-"""Numbers in the first pass of a search in which larger changes need not flip the verdict."""
+"""Number of first trials in both directions, where a larger change need not flip the verdict."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,8 +252,8 @@ def threshold_of(
 ) -> Threshold | Obstacle | None:
     """Find the nearest number of the deciding atom that flips a verdict, or the reason why no number does.
 
-    A constant is varied in all atoms. A number without a name is varied in all atoms from the same place in
-    the text; a quantifier over a named group, or a macro, creates several.
+    A constant is varied in all its atoms. A number without a name is varied in all atoms that come from the
+    same place in the text, such as those of a macro or a quantifier over a named group.
 
     Args:
         leaves: (C, A, T), leaves of the instance in each sample.
@@ -301,7 +301,7 @@ class _Search:
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
         slopes = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
-        # slopes are found from the formula, because equal leaves of different places share one index
+        # slopes come from the formula, because equal leaves share an index wherever they are written
         self._moving: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
@@ -370,7 +370,7 @@ class _Search:
         return ""
 
     def obstacle(self) -> Obstacle:
-        """Return why no number flips the verdict, from the verdict with the atom shifted by `_FAR`."""
+        """Return why no number flips the verdict; the atom is shifted by `_FAR` to find out."""
         far = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
@@ -384,14 +384,14 @@ class _Search:
         return "others" if verdict is self._verdict else "unknown"
 
     def _is_flipped(self, verdict: Verdict) -> bool:
-        """Return whether a verdict is the opposite one; for a log that continues, any other verdict."""
+        """Return whether a verdict is the opposite one or, if samples may follow, any other."""
         return verdict is not self._verdict and (self._goes_on or verdict is not Verdict.UNKNOWN)
 
     def _is_possible(self, number: float) -> bool:
         return math.isfinite(number) and (self._dial.kind != "radius" or number >= 0.0)
 
     def _nearest(self, direction: float) -> float | None:
-        """Return the nearest number in one direction that flips the verdict, up to a small excess."""
+        """Return a number just beyond the nearest one in a direction that flips the verdict."""
         find = self._size_by_samples if self._is_uniform else self._size_by_rounds
         size = find(direction)
         return None if size is None else self._number_beyond(size, direction)
@@ -474,7 +474,7 @@ class _Search:
         ]
 
     def _is_meant(self, atom: Atom) -> bool:
-        """Return whether an atom has the constant or, without one, is from the deciding atom's place."""
+        """Return whether an atom is varied: it has the constant, or the deciding atom's place in the text."""
         if self._dial.constant:
             return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
         meant = self._deciding.atom
@@ -492,7 +492,7 @@ class _Search:
         return replace(atom, expression=self._dial.turn(atom.expression, number))
 
     def _shift_columns(self, added: Sequence[Formula], number: float) -> Floats:
-        """Return the columns of atoms at a number, as shifts of the original atoms' columns."""
+        """Return the columns of atoms with the dial at a number, by shifts of the original columns."""
         indices = {
             leaf_key(rewritten(leaf, lambda atom: self._atom_at(atom, number))): index
             for index, leaf in self._moving.items()
@@ -512,7 +512,7 @@ class _Search:
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:
-    """Return the only atom of a leaf below quantifiers and negations, with its sign; None for others."""
+    """Return the atom of a leaf that has only quantifiers and negations above it, and its sign."""
     sign = 1
     while not isinstance(formula, Atom):
         if isinstance(formula, Boolean) and formula.operator == "not":
@@ -529,7 +529,7 @@ def _radii_in(expression: Expression) -> list[float]:
 
 
 def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
-    """Yield changes of an atom without a number after which it has to hold by a margin."""
+    """Yield changes that make an atom without a number hold by a margin."""
     match atom.relation, atom.expression:
         case "ovlp", _:
             yield partial(_as_distance, margin=margin)
@@ -581,10 +581,10 @@ def _enlarge_term(atom: Atom, place: int, radius: float) -> Atom:
 
 
 def _short_numbers(number: float, value: float) -> Iterator[float]:
-    """Iterate over short numbers near a number, and beyond it from `value`; the number itself is last."""
+    """Iterate over short numbers near `number`, or beyond it as seen from `value`, then `number` itself."""
     exact, change = Decimal(number), Decimal(number) - Decimal(value)
     rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    # a number near 0 that is only rounding error has no digits of its own: the change has them
+    # a number near 0 may be rounding error: then the digits of the change count
     leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
     last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for place in (last_digit, last_digit - DIGITS):

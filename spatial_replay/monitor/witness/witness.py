@@ -68,7 +68,7 @@ class WitnessStep:
         name: name of the spec whose root it is, or None.
         text: its canonical text.
         time_ns: time of the sample.
-        leaves_out: whether its operator leaves out samples or members whose rate has no value.
+        leaves_out: whether its operator leaves out samples, or members, because a rate has no value.
     """
 
     node: int
@@ -81,7 +81,7 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class WhilePresent:
-    """The verdict of an unknown formula after a restriction to samples with its objects.
+    """The verdict of an unknown formula that is restricted to samples with its objects.
 
     Attributes:
         names: names of these objects.
@@ -173,7 +173,7 @@ def find_witness(
 ) -> Witness:
     """Return the witness of a node.
 
-    Of equal atoms, the atom at the earliest sample decides, then the first operand.
+    Ties go to the earliest sample, then to the first operand.
 
     Args:
         evidence: evidence of the instance.
@@ -181,8 +181,7 @@ def find_witness(
         times_ns: (T,), T at least 1.
         node: id of the node.
         goes_on: whether samples may follow; the verdict then holds over every continuation.
-        whole: leaves and times of the whole log, on which the flipped verdict is computed; None for these
-            samples.
+        whole: leaves and times of the whole log, over which the verdict is to flip; None for these samples.
         flips: whether to search for the number that flips the verdict.
     """
     instance = evidence.instance
@@ -239,7 +238,7 @@ def find_witness(
 def _open_end(
     evidence: Evidence, nodes: OfflineNodes, node: int, end: End
 ) -> tuple[DecidingAtom, int] | None:
-    """Return the atom that leaves an end of a node open, and the time of its sample, if there is one."""
+    """Return the atom that leaves an end of a node's interval open, and its time; None if none does."""
     path = deciding_path(nodes, node, end)
     deciding = atom_of_path(evidence, nodes, path, evidence.scene)
     if deciding is None or deciding.lower == deciding.upper:
@@ -312,7 +311,7 @@ def _steps(evidence: Evidence, nodes: OfflineNodes, path: DecidingPath) -> tuple
 def _while_present(
     evidence: Evidence, leaves: Floats, times_ns: Integers, node: int, path: DecidingPath
 ) -> WhilePresent | None:
-    """Return the verdict of a node if the innermost operator of its path asks for present objects.
+    """Return the verdict of a node if its path's innermost operator only counts samples with the objects.
 
     None if this verdict is unknown, if the leaf's objects are in all samples, or if one of them is in none.
     """
