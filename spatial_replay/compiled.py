@@ -228,7 +228,7 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
 
 
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel whose calls may take milliseconds, and let other threads run meanwhile.
+    """Return a kernel whose calls may take milliseconds, and let other threads run.
 
     Short calls must not use it: a busy thread would get the interpreter, and keep it for milliseconds.
     """
@@ -397,7 +397,7 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
         "SPATIAL_REPLAY_KERNELS": "compiled",
         "SPATIAL_REPLAY_CACHE": str(folder.parent),
     }
-    # a process forked meanwhile would keep open the pipe by which Popen notices the start of the child
+    # a process forked during the start would keep open the pipe by which Popen notices the start
     with _process.fork_lock:
         child = subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD, task, *sys.path],

@@ -155,7 +155,7 @@ class Bounds:
                 target = os.path.realpath(path)
                 mode = os.stat(target).st_mode  # noqa: PTH116
         except OSError:
-            # the file was removed meanwhile, or the link has no target
+            # the file has just been removed, or the link has no target
             mode = stat.S_IFREG
         if target is not None and not any(map(Path(target).is_relative_to, self.folders)):
             raise UsageError(

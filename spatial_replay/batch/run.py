@@ -524,7 +524,7 @@ def run_batch(
             for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
                 now = states_of([task.log for task in group])
                 for task, rows_of_log in zip(group, rows_of_group, strict=True):
-                    # rows of a log that changed meanwhile are not stored; remote readers check versions
+                    # rows of a log that has changed are not stored; remote readers check versions
                     is_same = now[task.log] == states[task.log]
                     for key, rows in zip(tasks[task], rows_of_log, strict=True):
                         # an error may be temporary, so its rows are not stored

@@ -500,8 +500,8 @@ class Difference:
     """One result that differs from the baseline.
 
     Attributes:
-        change: "worse" or "more" if the robustness changes by more than the tolerance; "verdict" or "better"
-            if the verdict gets worse or better; "gone" or "new" if only one table has the result.
+        change: "worse" or "more" for robustness that changes by more than the tolerance. "verdict" or
+            "better" for a worse or better verdict. "gone" or "new" for a result of only one table.
         case, log, file, spec, object: key of the result.
         before, now: verdicts; None for an error or a missing result.
         before_robustness, robustness: None where not determined.

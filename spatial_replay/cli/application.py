@@ -1,7 +1,7 @@
-"""The program `spatial-replay`: its commands, its exit codes, and how errors are reported.
+"""The program `spatial-replay`: its commands, its exit codes, and its reports of errors.
 
-Commands are imported when they are used: importing one may load the compiler and the log readers, and
-`--help` has to list them without.
+A command is imported when it is used, because the import may load numba and the log readers. So `--help`
+lists the commands without importing them.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ COMMANDS: dict[str, str] = {
     "completion": "Print a shell completion script.",
     "warmup": "Compile everything once, for images.",
 }
-"""Name and summary, also of commands that the help leaves out; `cli/NAME.py` defines the command NAME."""
+"""Summaries by name, also of hidden commands; `cli/NAME.py` defines the command NAME."""
 
 FAMILIES = {
     "results": "batch",
@@ -91,7 +91,7 @@ FAMILIES = {
     "verify": "clip",
     "serve": "replay",
 }
-"""Commands that share the module of another one."""
+"""Commands that are defined in the module of another command."""
 
 FORMER_OPTIONS = {
     "--max-gap": "write --read max_gap=T",
@@ -100,7 +100,7 @@ FORMER_OPTIONS = {
     "--profile": "write `use spatial_spec` in the first line of the specification",
     "--result": "explain takes it: spatial-replay explain LOG --spec SPEC --result NAME",
 }
-"""Options of earlier versions, or of other commands, with the form that works."""
+"""Remedies for options of earlier versions and of other commands."""
 
 
 class LazyCommands(click.Group):
@@ -158,13 +158,13 @@ def application() -> None:
 
 def main() -> NoReturn:
     """Run the program and exit."""
-    # a request to terminate cleans up as Ctrl-C does; a shell's background jobs ignore the latter
+    # SIGTERM cleans up as Ctrl-C does; background jobs of a shell ignore Ctrl-C
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
     signal.signal(signal.SIGALRM, _interrupt)
     sys.unraisablehook = _interrupt_again
-    # little of a short run is garbage, and looking for it a hundred times takes a twentieth of the run
+    # a short run has little garbage, and a hundred collections take 5 % of its time
     gc.set_threshold(50_000, 20, 20)
     code = run()
     if code == ExitCode.INTERRUPTED:
@@ -173,14 +173,14 @@ def main() -> NoReturn:
 
 
 _PATIENCE_S = 0.5
-"""How long an interrupted program waits for its threads."""
+"""Time that an interrupted program waits for its threads, seconds."""
 
 
 def _end_waiting_threads(code: int) -> None:
-    """End the process if a thread waits for something that may never come, such as the data of a pipe."""
+    """End the process if a thread still waits, for example for data of a pipe."""
     until_s = time.monotonic() + _PATIENCE_S
     main_thread = threading.main_thread()
-    # an interruption may come between the making of a thread and its start; such a one cannot be joined
+    # an interruption may come before a new thread starts, and such a thread cannot be joined
     threads = [
         thread
         for thread in threading.enumerate()
@@ -189,21 +189,21 @@ def _end_waiting_threads(code: int) -> None:
     for thread in threads:
         thread.join(max(until_s - time.monotonic(), 0.0))
     if any(thread.is_alive() for thread in threads):
-        # exiting would wait for it
+        # `sys.exit` would wait for the thread
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
 
 
 _AGAIN_S = 0.05
-"""How long after an interruption that was ignored the next one comes."""
+"""Delay of the next interruption after an ignored one, seconds."""
 
 
 class _Interruption(KeyboardInterrupt):
-    """An interruption that stays caught.
+    """An interruption that can be caught everywhere.
 
-    Once a plain KeyboardInterrupt has passed through an `exec`, as of a dataclass that is being made, the
-    interpreter ends the process by SIGINT, even if it is caught.
+    If a plain KeyboardInterrupt passes through an `exec`, as in the definition of a dataclass, the
+    interpreter ends the process by SIGINT, even if the exception is caught later.
     """
 
 
@@ -212,7 +212,7 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
-    """Interrupt a moment later where an interruption was ignored, as within a callback of the compiler."""
+    """Interrupt again a moment after an ignored interruption, such as one in a callback of numba."""
     if isinstance(ignored.exc_value, _Interruption):
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     else:
@@ -234,11 +234,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # click exits by itself in two cases: after completing a line for a shell, and on a broken pipe
         return int(leaving.code or 0) if COMPLETION_VARIABLE in os.environ else ExitCode.BROKEN_PIPE
     except BrokenPipeError:
-        # what is still buffered has no reader either, and must not fail again when the process ends
+        # buffered output must not fail again at exit:
+        # https://docs.python.org/3/library/signal.html#note-on-sigpipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
-        # click takes the end of whatever file for an interruption
+        # click turns every EOFError into an Abort, which stands for an interruption otherwise
         is_end = isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError)
         reported = error.__cause__ or error if is_end else error
         report_error(reported)
@@ -261,7 +262,7 @@ class ExitCode(IntEnum):
     """An internal error, or a failure of the machine."""
     INTERRUPTED = 130
     BROKEN_PIPE = 141
-    """The reader of standard output closed it; the code that a shell gives for SIGPIPE."""
+    """The reader of standard output closed it. Shells give this code for SIGPIPE."""
 
 
 _VERDICTS = {
@@ -283,7 +284,7 @@ _MOST_SEVERE_FIRST = (
 
 
 def most_severe(codes: Iterable[ExitCode]) -> ExitCode:
-    """Return the code that stands for several; `SATISFIED` for none."""
+    """Return the most severe of several codes; `SATISFIED` for none."""
     return min(codes, key=_MOST_SEVERE_FIRST.index, default=ExitCode.SATISFIED)
 
 
@@ -312,7 +313,7 @@ def exit_code_from_error(error: BaseException) -> ExitCode:
 
 
 def message_from_error(error: BaseException) -> str:
-    """Return what an error says to the user, in a few lines."""
+    """Return the message of an error for the user, in a few lines."""
     match error:
         case click.Abort() | KeyboardInterrupt():
             # click raises its Abort in place of the interruption, which carries the notes
@@ -321,7 +322,7 @@ def message_from_error(error: BaseException) -> str:
         case click.UsageError(ctx=click.Context() as context):
             path, what = context.command_path, error.format_message()
             if isinstance(error, click.MissingParameter):
-                # its choices come one a line, after tabs
+                # click lists the choices of a parameter one per line, after tabs
                 what = " ".join(what.split())
             if isinstance(error, click.NoSuchOption):
                 remedy = new_form(error.option_name, context.command)
@@ -350,7 +351,7 @@ def message_from_error(error: BaseException) -> str:
 
 
 def new_form(option: str, command: click.Command) -> str | None:
-    """Return what to write instead of an option of an earlier version; None for any other option."""
+    """Return the remedy for an option of an earlier version; None for any other option."""
     from spatial_replay.mapping.yaml_document import schema_of
 
     key = option.removeprefix("--").replace("-", "_")
@@ -365,7 +366,7 @@ def report_error(error: BaseException) -> None:
     if os.environ.get(DEBUG_VARIABLE):
         show(*"".join(traceback.format_exception(error)).splitlines(), err=True)
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
-        # a command without arguments: what it takes is no error message
+        # a command without arguments shows its help, which is no error message
         show(*error.format_message().splitlines(), err=True)
         return
     if isinstance(error, SpecificationError):

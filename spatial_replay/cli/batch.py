@@ -61,13 +61,13 @@ _KIND_CODES: Final = {
     "machine": ExitCode.INTERNAL,
 }
 _BATCH: Final = 10_000
-"""Rows that are turned into JSON at once."""
+"""Rows per batch of JSON lines."""
 
 
 def print_totals(table: pa.Table, by: By) -> None:
-    """Print how many results there are of each verdict, for each spec or for each log.
+    """Print the numbers of results by verdict, for each spec or for each log.
 
-    After a comparison with a baseline, also the numbers of worse and missing results.
+    After a comparison with a baseline, it also prints the numbers of worse and missing results.
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.run_table import EDITED_SINCE, counts_of, totals
@@ -82,7 +82,7 @@ def print_totals(table: pa.Table, by: By) -> None:
         line: list[str | Coloured] = [f"  {title:<{width}}"]
         for name, counts in columns.items():
             count = counts[place]
-            # of verdicts that all were expected, none is bad
+            # if all verdicts are as expected, none is coloured as bad
             colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
             cell = f"{count:>9,}" if count else f"{'-':>9}"
             line += ["  ", Coloured(cell, colour) if count and colour else cell]
@@ -93,10 +93,10 @@ def print_totals(table: pa.Table, by: By) -> None:
 
 
 def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
-    """Print the worst rows, each with the sentence that explains it.
+    """Print the worst rows with their reasons.
 
     Args:
-        failing: only those that fail.
+        failing: whether only failing rows are printed.
     """
     from spatial_replay.batch.run_table import (
         damage_word,
@@ -146,7 +146,7 @@ def write_json_lines(
 
 
 def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
-    """Return the exit code of a run: that of a replay of all its logs, but for what was expected."""
+    """Return the exit code of a run: that of a replay of all its logs, without expected results."""
     names = ("failure", "error_kind", "verdict", "faults")
     codes = set()
     for failure, kind, verdict, faults in zip(*(table.column(n).to_pylist() for n in names), strict=True):
@@ -168,7 +168,7 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
 
 
 def code_of_errors(table: pa.Table) -> ExitCode:
-    """Return the exit code of damaged logs, and of errors in place of verdicts."""
+    """Return the exit code of damaged logs and of errors."""
     rows = _columns(table, "faults", "error_kind")
     codes = [_KIND_CODES[kind] for _, kind in rows if kind is not None]
     return most_severe([*codes, *(ExitCode.DAMAGED for faults, _ in rows if faults)])
@@ -190,7 +190,7 @@ _MOST_DIFFERENCES = 20
 
 @dataclass(frozen=True, slots=True)
 class BatchOutputs:
-    """Where results go, and what they are compared with."""
+    """Outputs of a batch, and the baseline of its comparison."""
 
     output: str | None
     junit: Path | None
@@ -256,8 +256,8 @@ def batch(
 ) -> int:
     """Evaluate many logs (a suite file, or logs with specifications) and show what fails.
 
-    LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
-    folder; another run evaluates only what is new. A log that cannot be read has a row with its error.
+    LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are stored in a
+    folder, and another run evaluates only missing ones. A log that cannot be read has a row with its error.
 
     One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
     anything fails, 3 if logs are damaged or unfit, 4 if results are unknown, doubtful or tested by nothing.
@@ -292,14 +292,14 @@ def batch(
         differences = None if before is None else compare(evaluated.table, before, tolerance)
 
         def with_comparison(evaluated: BatchResult) -> BatchResult:
-            # what is worse than the baseline fails wherever results are shown
+            # results that are worse than the baseline fail in all outputs
             if before is None:
                 return evaluated
             return replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
 
         is_exported = any((outputs.junit, outputs.html, outputs.json_file, is_github()))
         failing = failing_places(with_comparison(evaluated).table, None if is_exported else _WORST)
-        # results that only the baseline has come last
+        # rows of gone results come last, and have no log to explain
         failing = [place for place in failing if place < len(evaluated.table)]
         evaluated = explain_batch(evaluated, failing, workers, results=folder, progress=progress)
         result = with_comparison(evaluated)
@@ -321,7 +321,7 @@ def batch(
 
 @contextmanager
 def resumable(folder: str) -> Iterator[None]:
-    """Have an interruption say where the results so far are."""
+    """Add a note to an interruption, which names the folder of the results so far."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -332,7 +332,7 @@ def resumable(folder: str) -> Iterator[None]:
 def _write_outputs(
     outputs: BatchOutputs, suite: Suite, evaluated: BatchResult, result: BatchResult, workers: Workers
 ) -> None:
-    """Write the files that were asked for.
+    """Write the requested files.
 
     Args:
         result: the evaluated batch, compared with a baseline if there is one.
@@ -355,10 +355,10 @@ def _write_outputs(
 
 
 def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
-    """Return the suite that is named, or that the logs and options make up.
+    """Return the named suite, or the suite of given logs and options.
 
     Raises:
-        UsageError: both, no specification, or a suite that is not valid.
+        UsageError: both are given, there is no specification, or the suite is invalid.
     """
     from spatial_replay.batch.suite import Conditions, load_suite
 
@@ -375,10 +375,10 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
 
 
 def suite_of_logs(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
-    """Return the suite that logs and options make up.
+    """Return the suite of given logs and options.
 
     Raises:
-        UsageError: no specification, or a time that is none.
+        UsageError: there is no specification, or a time is invalid.
     """
     from spatial_replay.batch.suite import Suite
 
@@ -401,7 +401,7 @@ def _conditions(given: ConditionArguments, semantics: Semantics) -> Conditions:
 
 
 def inputs_of(suite: Suite) -> list[Path]:
-    """Return the files that are read, but for the logs, of which there may be very many."""
+    """Return the input files of a suite, except its logs, which may be very many."""
     mappings = [case.conditions.mapping for case in suite.cases if case.conditions.mapping is not None]
     specs = [spec for case in suite.cases for spec in case.specs]
     suites = [] if suite.path is None else [suite.path]
@@ -430,7 +430,7 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
 
 
 def evaluated_batch(cases: Sequence[PreparedCase], folder: str, workers: Workers) -> BatchResult:
-    """Evaluate what is new; an interruption says where the results so far are."""
+    """Evaluate the logs without stored rows. An interruption names the folder of the results so far."""
     from spatial_replay.batch.run import run_batch
 
     with resumable(folder):
@@ -438,10 +438,10 @@ def evaluated_batch(cases: Sequence[PreparedCase], folder: str, workers: Workers
 
 
 def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
-    """Print the results of a run, compared with a baseline or not, as all other outputs show them.
+    """Print the results of a run, with the comparison that all outputs show.
 
     Args:
-        evaluated: the same without the comparison.
+        evaluated: the results without the comparison.
     """
     import pyarrow.compute as pc
 
@@ -449,7 +449,7 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
 
     reused = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
-    # a log that is gone is on the page and in the summary, too
+    # gone logs count here as on the page and in the summary
     gone = len(set(result.table["log"].to_pylist()) - set(evaluated.table["log"].to_pylist()))
     news = f"{news}, {gone:,} gone" if gone else news
     show(f"{plural(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
@@ -475,7 +475,7 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
 
 
 def warn_of_names(table: pa.Table) -> None:
-    """Warn of names that logs lack, and of what is remarkable about logs; the same is reported once."""
+    """Warn of missing names, and show remarks on logs. Equal messages are reported once."""
     logs: dict[str, tuple[str, dict[str, None]]] = {}
     for name in ("missing", "remarks"):
         for log, messages in _columns(table, "log", name):
@@ -487,7 +487,7 @@ def warn_of_names(table: pa.Table) -> None:
 
 
 def warn_of_damage(table: pa.Table) -> None:
-    """Name the logs that are damaged or cannot be read, for which the exit code is 3."""
+    """Warn of damaged, unreadable and unfit logs, which give the exit code 3."""
     rows = _columns(table, "log", "faults", "error_kind")
     for what, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
         logs = dict.fromkeys(
@@ -498,7 +498,7 @@ def warn_of_damage(table: pa.Table) -> None:
 
 
 def _join_names(names: Sequence[str]) -> str:
-    """Return the first few names, and how many others there are."""
+    """Return the first few names, and the number of others."""
     more = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
     parts = [*names[:_MOST_NAMED], *more]
     return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
@@ -509,7 +509,7 @@ def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
 
 
 def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bool:
-    """Print what differs from the baseline, and return whether any of it fails."""
+    """Print the differences from the baseline, and return whether any of them fails."""
     failing = [difference for difference in differences if difference.fails]
     worse = [difference for difference in failing if not difference.is_edited]
     edited = [difference for difference in failing if difference.is_edited]
@@ -558,10 +558,10 @@ def results(
     json_file: str | None,
     tolerance: str | None,
 ) -> ExitCode:
-    """Show what the last run of a batch found: totals, and the worst results with their reasons.
+    """Show the last run of a batch: totals, and the worst results with their reasons.
 
-    With the results of a LATER run over the same logs, it lists the verdicts that flipped and the numbers
-    that got less. It then exits with 1 if a verdict flipped.
+    With the results of a LATER run over the same logs, it lists flipped verdicts and lower robustness. It
+    then exits with 1 if a verdict flipped.
 
     EXPR compares columns with texts and numbers: == != < <= > >=, "text" in COLUMN, and, or, not, none.
 
@@ -602,11 +602,11 @@ def results(
 
 
 _MOST_HERE = 64
-"""Results that are explained by this process alone."""
+"""Largest number of results that this process explains alone."""
 
 
 def explain_table_rows(table: pa.Table, places: Collection[int]) -> pa.Table:
-    """Return the table of a run in which the rows at some places are explained, from their logs."""
+    """Explain the rows of a run's table at some places from their logs, and return the table."""
     from spatial_replay.batch.explanations import explain_rows
     from spatial_replay.batch.run import workers_of
 
@@ -617,7 +617,7 @@ def explain_table_rows(table: pa.Table, places: Collection[int]) -> pa.Table:
 
 
 def _compare_results(folder: str, other: str, json_file: str | None, tolerance: str | None) -> ExitCode:
-    """Show what differs between two runs."""
+    """Show the differences between two runs."""
     from spatial_replay.batch.flips import diff_runs
     from spatial_replay.batch.run_table import Tolerance
     from spatial_replay.batch.store import ResultsFolder

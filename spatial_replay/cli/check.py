@@ -72,7 +72,7 @@ finding_format_option = click.option(
 
 @contextmanager
 def findings_of(specification: str, form: Form) -> Iterator[None]:
-    """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
+    """Print the errors of an unparsable specification also in the requested form."""
     try:
         yield
     except SpecificationError as error:
@@ -84,7 +84,7 @@ def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None
     """Print errors and warnings as workflow commands of GitHub, or as one SARIF object; not as text.
 
     Args:
-        path: the file that they are about, or its address, as it was given.
+        path: path or address of the specification, as given.
     """
     if form == "github":
         # imported here so that --help stays fast
@@ -234,10 +234,10 @@ class _Compared:
     """Findings of a comparison with a log.
 
     Attributes:
-        diagnostics: what does not fit.
-        windows: those in samples, as seconds.
-        ranges: what is compared with thresholds.
-        summary: of all, in one line.
+        diagnostics: errors and warnings.
+        windows: time windows in samples, converted to seconds.
+        ranges: ranges of the numbers that are compared with thresholds.
+        summary: summary in one line.
     """
 
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -247,7 +247,7 @@ class _Compared:
 
 
 def _refuse_log_options(reading: Reading, strict_names: bool) -> None:
-    """Refuse options that say something about a log where there is none."""
+    """Refuse options about a log if no log is given."""
     for name in [*reading, *(["strict_names"] if strict_names else [])]:
         option = f"--read {name}" if name in READING_KEYS else f"--{name.replace('_', '-')}"
         raise UsageError(f"{option} applies to the log to compare with; add --log LOG")
@@ -256,7 +256,7 @@ def _refuse_log_options(reading: Reading, strict_names: bool) -> None:
 def _compare_with_log(
     specification: Specification, log: LogFile, reading: Reading, strict_names: bool
 ) -> _Compared:
-    """Compare names, thresholds, regions and windows with what a log has."""
+    """Compare names, thresholds, regions and windows with the contents of a log."""
     # only needed with --log: log readers load the numerical libraries
     from spatial_replay.monitor.ends import Needs, RunEnds
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
@@ -311,7 +311,7 @@ def _compare_with_log(
 
 
 class _CutResults:
-    """The results that a window decides which the end of the log cuts; templates are left out."""
+    """Finds results that are decided by a window cut by the end of the log. Templates are left out."""
 
     def __init__(self, specification: Specification) -> None:
         # only needed with --log: the monitor loads the numerical libraries
@@ -415,10 +415,10 @@ def _node_rows(formula: Formula) -> list[dict[str, object]]:
 def _check_automaton_options(
     specification: Specification, name: str | None, file: str, inputs: Sequence[Path]
 ) -> None:
-    """Check, before anything is printed, that `_write_automata` can do its work.
+    """Check the options of `_write_automata` before anything is printed.
 
     Raises:
-        UsageError: an unknown file type, a file that is an input, no such spec, several to choose from.
+        UsageError: the file type is unknown, the file is an input, the spec is missing, or there are several.
     """
     from spatial_replay.automata.compile import chosen_spec
     from spatial_replay.logs.output_file import refuse_inputs
@@ -443,13 +443,13 @@ def _write_automata(
     *,
     quiet: bool,
 ) -> None:
-    """Write the automaton of one spec to a file, or print those of all results.
+    """Write the automaton of one spec to a file, or print the automata of all results.
 
     Args:
         quiet: keep the message about the file off standard output.
 
     Raises:
-        NoAutomatonError: a spec has none; if several are printed, after the others.
+        NoAutomatonError: a spec has no automaton; raised after the others are printed.
         UsageError: Graphviz is not installed.
         OutputError: the file cannot be written.
     """
@@ -514,12 +514,12 @@ def doctor(
     as_json: bool,
     form: Form,
 ) -> int:
-    """Find what is wrong with a specification before any run.
+    """Find faults of a specification before any run.
 
-    Finds specs that no run can satisfy, that every run satisfies, that follow from another one or contradict
-    it. It also finds implications whose antecedent never holds. It uses the automaton and laws of geometry.
-    For each result prints the shortest run that satisfies it, and the shortest that violates it. Exits with 1
-    if it finds something, otherwise with 0.
+    It finds specs that no run can satisfy, that every run satisfies, or that follow from another spec or
+    contradict it. It also finds implications whose antecedent never holds. It uses the automaton and laws of
+    geometry. For each result, it prints the shortest run that satisfies it, and the shortest run that
+    violates it. Exits with 1 if there is a fault, otherwise with 0.
 
     \b
     Examples:

@@ -56,11 +56,10 @@ def clip(
 ) -> int:
     """Copy the smallest part of a log that shows a verdict, for a bug report.
 
-    The clip has the same verdicts, robustness and witnesses as the log, of the results that are violated or,
-    where none is, of all. It is an annotated log: every
-    viewer plays it, and `replay` evaluates it without other files. Messages of all topics are cut to its
-    time; before it come the last message of each topic and the last transform of each frame, with their own
-    times.
+    The clip has the same verdicts, robustness and witnesses as the log for the violated results; if none is
+    violated, for all results. It is an annotated log: every viewer plays it, and `replay` evaluates it
+    without other files. It has the messages of all topics in its time. It also has the last earlier message
+    of each topic and the last earlier transform of each frame, with their own times.
 
     T is 5s or 500ms. Exits with 0 if the clip was written, 3 if the log is damaged.
 
@@ -122,12 +121,12 @@ _MOST_LISTED = 20
 @click.argument("log", type=LogPath())
 @log_output_option("Recovered log to write (MCAP).")
 def recover(log: LogFile, output: Path) -> int:
-    """Save all that can be read of a damaged log, and list what is missing.
+    """Save the readable part of a damaged log, and list the missing data.
 
-    Takes MCAP logs, ours and external ones, and ROS bags: truncated, damaged, or left without an index by a
-    recorder that was killed. The output is a proper log with an index: every message byte for byte, in the
-    order of time, with metadata and attachments. The list of what is missing is also a metadata record of
-    the output, and whatever reads the output later warns of it.
+    It reads MCAP logs, ours and external ones, and ROS bags: truncated, damaged, or left without an index by
+    a killed recorder. The output is a proper log with an index. It has every readable message byte for byte,
+    in the order of time, with metadata and attachments. The list of missing data is also a metadata record of
+    the output, and later readers of the output warn of it.
 
     Exits with 0 if nothing is missing, with 3 if something is.
 
@@ -225,9 +224,9 @@ def verify(
     """Recompute a log's certificate and compare it with the recorded one.
 
     The log is evaluated with its own specifications and options. With --decisions, every planner decision is
-    recomputed from the recorded samples, with all its maps, and compared bit for bit; with --source, the
-    decisions in the source. With --sign, a certificate that is right is signed with your SSH key, into
-    LOG.sig; with --signer, this signature is checked. Exits with 0 if all is equal, otherwise with 1.
+    recomputed from the recorded samples, with all its maps, and compared bit for bit. With --source, these
+    are the decisions in the source. With --sign, a correct certificate is signed with your SSH key, into
+    LOG.sig. With --signer, this signature is checked. Exits with 0 if all is equal, otherwise with 1.
 
     \b
     Examples:
@@ -259,7 +258,7 @@ def verify(
     annotated = open_source(log)
     original = None
     if source is not None:
-        # what is given here has precedence over what the log was made with
+        # options of the command line have precedence over the recorded ones
         options = ReadOptions(**reading).non_defaults()
         original = open_source(source, **{**reading, **recorded_reading(annotated, source.name), **options})
     with progress("samples") as advance:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading, Feature
 
 _MOST_LABELS: Final = 1_000
-"""Episodes whose labels are counted."""
+"""Episodes whose labels are counted, at most."""
 _MOST_TASKS: Final = 5
 _MOST_NAMED: Final = 5
 """Episodes that a warning names."""
@@ -28,10 +28,10 @@ _MOST_PLACES: Final = 60
 
 
 def show_data_set(data_set: DataSet, as_json: bool) -> int:
-    """Print what a data set contains.
+    """Print the contents of a data set.
 
     Raises:
-        UsageError: it has no poses.
+        UsageError: the data set has no poses.
     """
     from spatial_replay.mapping.suggest_features import why_poseless
 
@@ -49,7 +49,7 @@ def show_data_set(data_set: DataSet, as_json: bool) -> int:
 
 
 def show_episode(data_set: DataSet, number: int, as_json: bool) -> int:
-    """Print what an episode contains, without a mapping: its task, label, and the range of each number."""
+    """Print the contents of an episode without a mapping: its task, its label, and ranges of numbers."""
     from spatial_replay.mapping.suggest_features import mappable_features
 
     episode, features = data_set.episode(number), mappable_features(data_set)
@@ -109,14 +109,14 @@ def _seconds(columns: EpisodeColumns) -> float:
 
 
 def _any_rate(data_set: DataSet) -> EpisodeReading:
-    """Return a reading for what does not depend on times."""
+    """Return options of reading for values that do not depend on times."""
     from spatial_replay.logs.formats.episodes import AS_STORED
 
     return AS_STORED._replace(fps=data_set.fps or 1.0)
 
 
 def _read_labels(data_set: DataSet) -> list[bool | None]:
-    """Return the labels of the first episodes; None for an episode without one, or that cannot be read."""
+    """Return the labels of the first episodes; None for a missing or unreadable label."""
     if data_set.label is None:
         return []
     episodes = data_set.episodes[:_MOST_LABELS]
@@ -139,7 +139,7 @@ def _read_labels(data_set: DataSet) -> list[bool | None]:
 
 
 def _bodies(data_set: DataSet) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the bodies of the first episode, and why they cannot be read."""
+    """Return the bodies of the first episode, and remarks, or the reason why it cannot be read."""
     if not data_set.names_bodies or not data_set.episodes:
         return [], []
     try:
@@ -227,7 +227,7 @@ def _lines(
 
 
 def _labels_text(data_set: DataSet, labels: Sequence[bool | None]) -> str:
-    """Return how many episodes are labelled successes, and which state a label is about."""
+    """Return a text with the number of labelled successes, and the state that a label describes."""
     if data_set.label is None:
         return "none; `label: FIELD` in a mapping names one"
     about = "; it is about the state after each frame's action" if data_set.label.is_about_next else ""

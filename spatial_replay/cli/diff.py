@@ -65,18 +65,17 @@ def diff(
 ) -> int:
     """Compare two versions of a specification over one log or many, or two logs.
 
-    With two specifications (--spec OLD --spec NEW), it shows which verdicts and numbers changed, which sample
-    differs first, and which edit is the cause. With one --spec, OLD is the specification in the log. The
-    cause is checked: OLD with this edit alone, and NEW without it, are evaluated.
+    With two specifications (--spec OLD --spec NEW), it shows the changed verdicts and numbers, the first
+    sample that differs, and the edit that is the cause. With one --spec, OLD is the specification in the log.
+    The cause is checked: OLD with this edit alone, and NEW without it, are evaluated.
 
-    Over several logs, a folder or a pattern, it lists the verdicts that flipped and the numbers that got
-    less.
+    Over several logs, a folder or a pattern, it lists flipped verdicts and lower robustness.
 
-    With two logs and one specification, it shows which objects moved differently and since when, the effect
-    on each spec, and the planner's first different decision.
+    With two logs and one specification, it shows the objects that moved differently and since when, the
+    effect on each spec, and the planner's first different decision.
 
-    Exits with 0 if nothing differs, or only names of specs, and otherwise with 1; over several logs with 1 if
-    a verdict flipped. If a log is damaged, it exits with 3.
+    Exits with 0 if nothing differs except names of specs, and otherwise with 1. Over several logs, it exits
+    with 1 if a verdict flipped. If a log is damaged, it exits with 3.
 
     \b
     Examples:
@@ -190,8 +189,8 @@ def _causes(
     """Yield the first flipped result of the first few specs, with its log and the log's first time.
 
     Args:
-        paths: of logs, by name.
-        specifications: the old one and the new one.
+        paths: paths of logs, by name.
+        specifications: the old specification and the new one.
     """
     from spatial_replay.compare.specifications import diff_over_source
 
@@ -257,5 +256,5 @@ def _of_logs(
 
 
 def _inputs(request: EvaluationArguments, other: LogFile | None) -> Sequence[Path]:
-    """Return the files that are read."""
+    """Return the input files."""
     return request.inputs if other is None else (*request.inputs, *local_files([other]))

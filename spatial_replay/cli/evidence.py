@@ -1,4 +1,4 @@
-"""The evidence of how each topic of a log was read, as lines that a person checks at a glance."""
+"""Evidence of how each topic of a log was read, as lines for a check at a glance."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 _AXES: Final = ("x", "y", "z")
 _LONG_PAUSE: Final = 2.0
-"""Periods from which on the longest pause is named with its time."""
+"""Length of a pause that is shown with its time, in median periods."""
 
 
 def evidence_lines(overview: Overview) -> Iterator[str]:
-    """Yield a block of lines for each mapped topic of a log, those that contradict an assumption first."""
+    """Yield lines for each mapped topic of a log; topics that contradict an assumption come first."""
     first_ns, unit = overview.start_ns or 0, overview.axes.units.get("", "")
     contradictions = {facts.topic: list(_contradictions(overview, facts.topic)) for facts in overview.facts}
     for facts in sorted(overview.facts, key=lambda facts: not contradictions[facts.topic]):
@@ -52,7 +52,7 @@ def _arrivals(facts: TopicFacts, first_ns: int) -> str:
 
 
 def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, str]]:
-    """Yield a label and a text for each kind of facts; the text is "" where there are none."""
+    """Yield a label and a text for each kind of facts; the text is "" without any."""
     if facts.lateness_s is not None:
         yield "lateness", f"{_range(facts.lateness_s, 's')} after the stamps"
     yield "publishers", plural(facts.publishers, "channel") if facts.publishers > 1 else ""

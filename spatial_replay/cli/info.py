@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from spatial_replay.spec.load import SpecificationText
 
 _EXTENSION = "spatial-replay.foxe"
-"""For Foxglove and Lichtblick."""
+"""File name of the extension for Foxglove and Lichtblick."""
 _EPOCH_LIKELY_NS = 10**18
-"""Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
+"""Least time (in 2001) that counts from 1970. Smaller times count from the start of the run."""
 
 
 _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
-"""Options of reading that say something about an external log."""
+"""Options of reading for external logs."""
 
 
 @click.command(cls=JsonCommand)
@@ -94,8 +94,8 @@ def info(
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
 
-    For an external log, lists the topics that could map to objects; with a mapping, the mapped objects. For a
-    data set of episodes, lists its tasks, labels and features; push_v3#2 is one episode.
+    For an external log, it lists the topics that could map to objects; with a mapping, the mapped objects.
+    For a data set of episodes, it lists tasks, labels and features; push_v3#2 is one episode.
 
     Reads the whole log. Exits with 0, or with 3 if the log is damaged; the damage is reported on standard
     error.
@@ -171,10 +171,10 @@ def info(
 def _print_data_set(
     log: LogFile, as_json: bool, suggest_mapping: bool, contents: Sequence[str], reading: Reading
 ) -> int | None:
-    """Print what a data set contains, or an episode without a mapping; None for anything else.
+    """Print the contents of a data set, or of an episode without a mapping; None for other logs.
 
     Raises:
-        UsageError: a data set as a whole has no such content.
+        UsageError: only single episodes have the requested content.
     """
     from spatial_replay.cli.data_sets import show_data_set, show_episode
     from spatial_replay.logs.formats.datasets import data_set_address, open_data_set
@@ -202,7 +202,7 @@ def _print_data_set(
 
 
 def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
-    """Print what a log contains."""
+    """Print the contents of a log."""
     # imported here so that --help stays fast
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.sources.open_log import open_source
@@ -248,7 +248,7 @@ def _episode_facts(source: Source) -> dict[str, str | None]:
 
 
 def _print_decisions(log: LogFile, number: str, as_json: bool) -> int:
-    """Print the decisions of a planned run, or the one with a number."""
+    """Print the decisions of a planned run, or the decision with a given number."""
     from spatial_replay.planning.read import read_decisions
     from spatial_replay.replay.selection import known_zero_ns
     from spatial_replay.sources.open_log import open_source
@@ -265,13 +265,13 @@ def _print_decisions(log: LogFile, number: str, as_json: bool) -> int:
 
 
 def _print_fitness(log: LogFile, reading: Reading) -> int:
-    """Print what a suite may require of logs like this one."""
+    """Print the section `requires` of a suite for logs like this one."""
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import Regularity, fitness_of
 
     def rows(found: Mapping[str, Regularity]) -> Iterator[str]:
         for name, regularity in found.items():
-            # what comes once, such as a map, has no rate
+            # a message that comes once, such as a map, has no rate
             rate, max_gap = regularity.rate, regularity.max_gap
             regular = f"rate: {rate:g}, max_gap: {max_gap:g}s" if rate else ""
             yield f"{name}: {{{regular}}}  # {regularity.count:,}"
@@ -289,7 +289,7 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
 
 
 def _write_blueprint(log: LogFile, output: Path | None) -> int:
-    """Write which panels show an annotated log in Rerun."""
+    """Write the panels that show an annotated log in Rerun."""
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
     from spatial_replay.annotate.rerun_blueprint import blueprint_rows, write_blueprint
@@ -323,7 +323,7 @@ def _write_blueprint(log: LogFile, output: Path | None) -> int:
 
 
 def _print_layout(log: LogFile, *, panels: bool) -> int:
-    """Print the layout stored in a log, or the one for viewers that have the extension."""
+    """Print the layout in a log, or its form for viewers that have the extension."""
     from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
     from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.replay.engine import planned_result
@@ -343,7 +343,7 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
 
 
 def _print_specification(log: LogFile, name: str) -> int:
-    """Print the texts of the specifications that a log was written with, or the one of a name."""
+    """Print the texts of the specifications in a log, or the text with a given name."""
     from spatial_replay.replay.engine import recorded_texts
     from spatial_replay.sources.open_log import open_source
 
@@ -373,7 +373,7 @@ def _names_of(text: SpecificationText) -> list[str]:
 
 
 def _requirements(source: Source) -> dict[str, NamedSpec]:
-    """Return the specs of requirements that a log was written with, by the names of their results."""
+    """Return the specs with requirements in a log, by the names of their results."""
     from spatial_replay.replay.engine import recorded_texts
 
     files = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
@@ -389,12 +389,12 @@ def _requirements(source: Source) -> dict[str, NamedSpec]:
 
 
 def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
-    """Yield the verdicts stored in a log, each with the requirement that it is about."""
+    """Yield the verdicts stored in a log, each with its requirement."""
     from spatial_replay.logs.topics import VERDICTS
 
     for data in (data for name, data in container.metadata if name == VERDICTS):
         for result, verdict in data.items():
-            # of a template, without the object
+            # the result of a template has the object in its name: reach(cup)
             spec = about.get(result) or about.get(result.partition("(")[0])
             requirement, title = (None, None) if spec is None else (spec.id, spec.title)
             yield {"name": result, "verdict": verdict, "requirement": requirement, "title": title}
@@ -408,7 +408,7 @@ def _specs_of(text: SpecificationText) -> Sequence[NamedSpec]:
     try:
         return parse_specification(text.text, filename=text.filename).specs
     except SpecificationError:
-        # relations defined in Python: the text can be printed, but not read here
+        # a text with relations defined in Python can be printed, but not parsed here
         return ()
 
 
@@ -474,12 +474,12 @@ def _document(
 
 
 def _declarations(axes: dict[str, object]) -> dict[str, object]:
-    """Return axes as JSON, without units where none are declared."""
+    """Return axes as JSON, without undeclared units."""
     return {name: value for name, value in axes.items() if value or name not in ("unit", "signals")}
 
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:
-    """Return how many messages each channel of a topic has: each publisher may have one of its own."""
+    """Return the numbers of messages of a topic's channels. Each publisher may have its own channel."""
     counts: dict[tuple[str, str, str], list[int]] = {}
     for summary in container.channels:
         channel = summary.channel
@@ -548,7 +548,7 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     if verdicts := list(_verdicts(container, about)):
         kinds = [(verdict["verdict"] or "").split(",")[0] for verdict in verdicts]
         is_known = set(kinds) <= set(WORST_FIRST)
-        # of those violated, the log has those first that were so first; logs of earlier versions have not
+        # the log lists violations in the order of time, except logs of earlier versions; the sort keeps it
         places = sorted(
             range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
         )
@@ -592,7 +592,7 @@ _LONGEST_ENTRY: Final = 120
 
 
 def _shorten(text: str) -> str:
-    """Return the beginning of a metadata value, and how long it is if that is not all."""
+    """Return a metadata value; a long one is cut, and its length is added."""
     if len(text) <= _LONGEST_ENTRY:
         return text
     return f"{text[:_LONGEST_ENTRY]}… ({len(text):,} characters; --json prints all)"

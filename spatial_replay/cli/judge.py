@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class JudgeOutputs:
-    """Where results, the page, and the verdicts as labels go."""
+    """Outputs: results, page, JSON, and verdicts as labels."""
 
     output: str | None
     html: Path | None
@@ -203,7 +203,7 @@ def judge(
 
 
 def _check_outputs(outputs: JudgeOutputs, inputs: Sequence[Path], logs: Sequence[str]) -> Path | None:
-    """Refuse outputs that cannot be written; return the data set that is copied, if one is."""
+    """Refuse outputs that cannot be written. Return the data set to copy, if there is one."""
     from spatial_replay.judging.writers import check_annotation, ending_of_labels
 
     json_file = None if outputs.json_file == "-" else outputs.json_file

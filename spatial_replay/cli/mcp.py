@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from spatial_replay.agents.calls import Call
 
 _PROGRESS_S: Final = 0.2
-"""Least time between two reports of progress."""
+"""Least time between two reports of progress, seconds."""
 
 
 @click.command()
@@ -60,7 +60,7 @@ def mcp(roots: tuple[str, ...], output: Path | None, limit: float) -> None:
     """Serve the commands to agents as tools, by the Model Context Protocol.
 
     It speaks over standard input and output, until the client closes them. Only files below the roots are
-    read; nothing leaves this machine, but to the client. Plug-ins are off.
+    read. Data leaves this machine only to the client. Plug-ins are off.
 
     \b
     Examples:
@@ -86,7 +86,7 @@ def work(channel: Connection, call: Call) -> None:
     os.environ.pop(PLUGINS_VARIABLE, None)
     os.chdir(call.folder)
     tempfile.tempdir = call.folder
-    # before any code of the call runs: this process reads nothing else
+    # installed before any code of the call runs
     sys.addaudithook(_guard(call.readable, is_online=call.is_online))
     sent_s = time.monotonic()
 
@@ -107,14 +107,14 @@ def work(channel: Connection, call: Call) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when the server ends, however that ends."""
+    """End this process when the server ends, even if it is killed."""
     if (parent := parent_process()) is not None:
         connection.wait([parent.sentinel])
         os._exit(1)
 
 
 def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
-    """Find the logs and data sets in some folders: each once, a data set with the number of its episodes."""
+    """Find the logs and data sets in some folders, each once; data sets with their numbers of episodes."""
     from spatial_replay.batch.run import find_logs
     from spatial_replay.batch.suite import LogPattern
     from spatial_replay.errors import UsageError
@@ -136,10 +136,10 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
 
 
 def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[Any, ...]], None]:
-    """Return an audit hook that refuses files outside some folders, and connections.
+    """Return an audit hook (PEP 578) that refuses files outside some folders, and connections.
 
-    Mappings, bags and data sets name further files; these are refused, too. Libraries in C that open files by
-    themselves are not seen.
+    It also refuses further files that mappings, bags and data sets name. It does not see files that libraries
+    in C open by themselves.
     """
     places = [*readable, sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *_SYSTEM]
     places += [str(Path(__file__).parents[1]), *filter(None, map(os.environ.get, _CACHES))]

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _STATUS_S: Final = 0.5
 _GONE_S: Final = 30.0
-"""With --until, the run ends if the server is away for so long."""
+"""Absence of the server after which a run with --until ends, seconds."""
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
 
@@ -180,8 +180,8 @@ def monitor(
     Ctrl-C ends the run. Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown
     or doubtful, 3 if the server does not answer or its time jumps back.
 
-    With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
-    fires it, too, and so does the service `trigger` of --serve.
+    With --clips, nothing is written until a trigger fires. Then a log of the time before and after it is
+    written. SIGUSR1 and the service `trigger` of --serve fire it, too.
 
     \b
     Examples:
@@ -258,7 +258,7 @@ def monitor(
 
 
 def _refuse_endless(files: Sequence[Specification]) -> None:
-    """Refuse to wait until specs are satisfied that a run can violate as long as it goes on."""
+    """Refuse --until satisfied for specs that a run can still violate at any later time."""
     from spatial_replay.spec.walks import can_settle
 
     specs = [spec for file in files for spec in file.results]
@@ -271,7 +271,7 @@ def _refuse_endless(files: Sequence[Specification]) -> None:
 
 
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
-    """Say what logs, clips and viewers lack besides the samples that were not evaluated."""
+    """Show the losses of logs, clips and viewers beyond the samples that were not evaluated."""
     for writer in writers:
         lost = [plural(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
         lost += [plural(writer.messages_dropped, "message")] if writer.messages_dropped else []
@@ -280,7 +280,7 @@ def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
 
 
 class _SignalTrigger:
-    """Fires the trigger at SIGUSR1; one that comes earlier than the recorder fires it once that is there."""
+    """Fires the trigger at SIGUSR1. A signal before the recorder exists fires it as soon as it exists."""
 
     def __init__(self) -> None:
         self._fire: Callable[[str], None] | None = None
@@ -288,7 +288,7 @@ class _SignalTrigger:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Take the signal as long as this lasts."""
+        """Handle the signal within this context."""
         try:
             before = signal.signal(signal.SIGUSR1, self._take)
         except ValueError:
@@ -301,7 +301,7 @@ class _SignalTrigger:
             signal.signal(signal.SIGUSR1, before)
 
     def attach(self, fire: Callable[[str], None]) -> None:
-        """Fire this from now on."""
+        """Set the function that fires the trigger."""
         self._fire = fire
         if self._is_waiting:
             fire("SIGUSR1")
@@ -358,7 +358,7 @@ class _Run:
         self._verdicts: list[str] = []
 
     async def follow(self) -> None:
-        """Print what happens until the run ends, and then the verdicts."""
+        """Print changes and notes until the run ends, and then the verdicts."""
         loop = asyncio.get_running_loop()
         with self._signals(loop):
             ticking = asyncio.create_task(self._tick())
@@ -385,7 +385,7 @@ class _Run:
         return exit_code_from_verdicts(self._verdicts, damaged=self._session.failure is not None)
 
     def show_remarks(self) -> None:
-        """Print what recorders have done or could not hold."""
+        """Print the remarks of recorders."""
         for recorder in self._recorders:
             for remark in recorder.take_remarks():
                 self._print(f"  {remark}")
@@ -417,7 +417,7 @@ class _Run:
             self._session.stop()
 
     async def _tick(self) -> None:
-        """Write the status line, and what happens without a sample."""
+        """Update the status line, and print notes that come without a sample."""
         before, then_s = self._session.status, time.monotonic()
         rate, connected_s = 0.0, math.inf
         while True:

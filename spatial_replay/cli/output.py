@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 
 WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
-"""Results that are printed in the order of the file; more are counted and sorted."""
+"""Results that are printed without counts, at most. More results are also counted."""
 _MOST_SHOWN: Final = 20
-"""Results that are printed; of more, as templates have, the worst of them, and how many others there are."""
+"""Results that are printed, at most. If there are more, the worst `_SHOWN` are printed, and the others
+counted.
+"""
 _SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 _CHANGE_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "holds": "blue", "pending": "yellow"})
@@ -33,7 +35,7 @@ def change_line(change: VerdictChange, first_ns: int) -> Line:
     """Return a change of a verdict as a line.
 
     Args:
-        first_ns: that times are counted from.
+        first_ns: zero of printed times.
     """
     label = Coloured(f"{change.state:<9}", _CHANGE_COLOURS[change.state])
     return f"{time_text(change.time_ns, first_ns):>12}  ", label, f"  {change.sentence}"
@@ -68,7 +70,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     damaged += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
     show(f"{replayed.log}: {plural(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
-    # escaped here, so that what is printed is as wide as what is measured
+    # escaped before the widths are measured, because escapes are wider
     titles = [
         escape_text(f"{result.title} [{result.spec.id}]" if result.spec.id else result.title)
         for result in results
@@ -78,7 +80,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     for title, result in zip(titles, results, strict=True):
         verdict = Coloured(f"{result.verdict:<9}", VERDICT_COLOURS[result.verdict])
         show((f"  {title:<{width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
-        # results of one template share its words
+        # results of one template share its title
         if result.spec.title and result.name not in titled:
             show(f"  {'':<{width}}  {result.spec.title}")
             titled.add(result.name)
@@ -111,7 +113,7 @@ def write_document(
 
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
-    """Return the results to print and, of too many, the others; the worst first."""
+    """Return the results to print, the worst first, and the others if there are too many."""
     # imported here since it loads numerical libraries
     from spatial_replay.monitor.result import worst_first
 
@@ -124,7 +126,7 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
     """Return the line about results that are not printed.
 
     Args:
-        verdicts: theirs, where these are not the final ones.
+        verdicts: verdicts of these results; by default the final ones.
     """
     hint = ", --each VAR=OBJECT shows one" if any(result.object is not None for result in others) else ""
     counts = counts_text([result.verdict for result in others] if verdicts is None else verdicts)
@@ -183,7 +185,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
-    """Return how often, and when first, a spec was violated over the sliding window."""
+    """Return a text on the violations of a spec over the sliding window: their number, and the first."""
     if result.leaves is None:
         return ""
     values, times_ns = result.window_signal(window_ns)[0], result.times_ns
@@ -203,7 +205,7 @@ def _number_text(number: float, unit: str = "") -> str:
 
 def align_rows(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
     """Yield rows as lines with aligned columns."""
-    # escaped here, so that what is printed is as wide as what is measured
+    # escaped before the widths are measured, because escapes are wider
     cells = [tuple(map(escape_text, row)) for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:

@@ -58,7 +58,7 @@ _SETTINGS = (
 
 
 def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that change a planner's settings; the command takes what they change as `changes`."""
+    """Add the options of a planner's settings. The command receives the changed settings as `changes`."""
 
     @wraps(command)
     def changing(*, settings: LogFile | None, texts: tuple[str, ...], **arguments: Any) -> Any:
@@ -68,10 +68,11 @@ def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _setting_changes(file: LogFile | None, texts: tuple[str, ...]) -> dict[str, Any]:
-    """Return what a settings file and options change.
+    """Return the settings that a file and options change.
 
     Raises:
-        MissingFileError: there is no such file. UsageError: invalid values.
+        MissingFileError: there is no such file.
+        UsageError: a value is invalid.
     """
     if file is None and not texts:
         return {}
@@ -143,7 +144,7 @@ def _why(log: LogFile, number: int | None, name: str | None, place: str | None) 
 
 
 _OF_RUNS = ("durability", "also", "timings", *SimulationArguments.__annotations__)
-"""Parameters that say how a run is made."""
+"""Parameters of a simulated run."""
 _NOT_WHY = (*_OF_RUNS, "scenario", "log", "as_json", "output", "spec", "of", "constants", "settings", "texts")
 
 
@@ -213,8 +214,8 @@ def plan(
     the planned specification is satisfied, 1 if it is violated, 4 if it is unknown or if the planner timed
     out.
 
-    With --redo, show the decisions on recorded samples with another specification or other settings: how many
-    are equal, and the first one that differs. Exits with 0 if all are equal, otherwise with 1.
+    With --redo, it decides on recorded samples with another specification or other settings. It shows how
+    many decisions are equal, and the first one that differs. Exits with 0 if all are equal, otherwise with 1.
 
     \b
     Examples:

@@ -221,7 +221,7 @@ def _open_cameras(
 
 
 def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return by how much the stamps of each camera are shifted, so that none is before the start."""
+    """Return the shift of each camera's stamps; none is negative."""
     offsets = [0] * len(names)
     for text in texts:
         name, _, value = text.rpartition("=")
@@ -308,7 +308,7 @@ _SIMULATION = (
 
 
 class SimulationArguments(TypedDict):
-    """How to simulate a world, as given on the command line."""
+    """Options of a simulated world."""
 
     seed: int
     noise_m: float
@@ -319,7 +319,7 @@ class SimulationArguments(TypedDict):
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that say how to simulate a world; the command takes them as `simulation`."""
+    """Add the options of a simulated world. The command receives them as `simulation`."""
     return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
 
 
@@ -354,7 +354,7 @@ class RecordGroup(click.Group):
         if not ctx.args:
             return click.Command.invoke(self, ctx)
         name, *arguments = ctx.args
-        # beside this context: below it, the usage would name SCENARIO, too
+        # a sibling of this context, because the usage of a child would name SCENARIO, too
         path = f"{ctx.info_name} {name}"
         with self.commands[name].make_context(path, arguments, parent=ctx.parent) as context:
             return context.command.invoke(context)
@@ -368,7 +368,7 @@ def scenario_argument(*, required: bool, others: Sequence[str] = ()) -> Callable
 
     Args:
         required: whether the command needs one.
-        others: commands that may stand there, for completion.
+        others: names of commands that may replace it, for completion.
     """
 
     def complete(context: click.Context, parameter: click.Parameter, begin: str) -> list[str]:

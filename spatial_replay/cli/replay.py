@@ -86,10 +86,10 @@ watch_option = click.option(
 
 
 def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
-    """Return the files to watch, from their first state on that can be read: errors are shown until then.
+    """Return the files to watch as soon as they can be read. Errors are shown until then.
 
     Raises:
-        UsageError: no file, values of constants that none has, a folder that does not exist.
+        UsageError: there is no file, a constant is unknown, or a folder does not exist.
         LogError: the log cannot be read.
     """
     # imported here so that --help stays fast
@@ -102,14 +102,14 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     except (SpecificationError, MissingFileError) as error:
         if not all(path.parent.is_dir() and not path.is_dir() for path in files.paths):
             raise
-        # with a log that cannot be read, no save would help
+        # raises for an unreadable log, because no save would help then
         open_inputs(replace(request, specs=(), constants={}), can_do_without=True)
         _wait_for_files(files, error)
     return files
 
 
 def _wait_for_files(files: SpecificationFiles, error: SpatialReplayError) -> None:
-    """Wait until files that have errors, or are not there, are saved without."""
+    """Wait until faulty or missing files are saved without errors."""
     saved: Sequence[Specification] | SpatialReplayError | None = error
     saves = files.iter_saves()
     while saved is None or isinstance(saved, SpatialReplayError):
@@ -129,7 +129,7 @@ def load_log(
     """Read a log into memory.
 
     Args:
-        files: what is watched, or None.
+        files: the watched files, or None.
     """
     from spatial_replay.replay.loaded_log import LoadedLog
 
@@ -168,13 +168,13 @@ def follow_saves(
     refuse: Callable[[SpatialReplayError], None] = lambda error: None,
     check: Callable[[], None] = lambda: None,
 ) -> ExitCode:
-    """Print what each save of the files gives, until Ctrl-C; after an error, what was shown before stays.
+    """Print the results of each save of the files, until Ctrl-C. After an error, the previous results stay.
 
     Args:
-        evaluate: evaluates the files as saved.
-        write: writes constants into the files, and returns those that changed; for the key w.
-        refuse: takes the error of a file that cannot be read.
-        check: called about ten times a second; raises an error that ends it.
+        evaluate: evaluates the saved files.
+        write: writes constants into the files, and returns the changed ones; for the key w.
+        refuse: receives the error of an unreadable file.
+        check: called about ten times a second; an error that it raises ends the loop.
     """
     names = _names(files)
     try:
@@ -221,7 +221,7 @@ def _show_constants(written: Mapping[str, Any], names: str) -> None:
 
 @contextmanager
 def pressed_keys() -> Iterator[Callable[[], str]]:
-    """Give a function that returns the keys pressed since its last call; "" if there is no terminal."""
+    """Yield a function that returns the keys pressed since its last call; "" without a terminal."""
     if not sys.stdin.isatty():
         yield lambda: ""
         return
@@ -232,7 +232,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     before = termios.tcgetattr(terminal)
 
     def keys() -> str:
-        # what is left in the terminal's own buffer, past that of Python
+        # read past Python's buffer, which `select` does not see
         waiting = select.select([terminal], [], [], 0.0)[0]
         return os.read(terminal, _MOST_KEYS).decode(errors="replace") if waiting else ""
 
@@ -440,7 +440,7 @@ def replay(
 
 
 def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) -> Iterator[str]:
-    """Yield "violated" for what the user counts as a failure, "unknown" for what shows nothing."""
+    """Yield "violated" for each kind of failure in `kinds`, and "unknown" for inconclusive results."""
     results = replayed.results
     if "unknown" in kinds and any(result.verdict == "unknown" for result in results):
         yield "violated"
@@ -528,9 +528,9 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
 
     With --spec, or any option about the evaluation, LOG is evaluated first, and may be of any format.
 
-    A column is named after the named specs on the way to its node, task/deliver, and the text of an unnamed
-    node. Others hold the seconds since the first row and the states of the automata. Empty cells are numbers
-    that are not determined.
+    A column title lists the named specs on the path to its node, such as task/deliver, and the text of an
+    unnamed node. Other columns hold the seconds since the first row and the states of the automata. Empty
+    cells are undetermined numbers.
 
     \b
     Examples:
@@ -558,13 +558,13 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
 
 
 def _is_evaluated(request: EvaluationArguments) -> bool:
-    """Return whether a log is evaluated first; an annotated one has its numbers already."""
+    """Return whether the log is evaluated first. An annotated log has its numbers already."""
     options = (request.specs, request.constants, request.choices, request.start, request.end)
     return any(options) or request.every > 1 or request.reading.get("mapping") is not None
 
 
 def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:
-    """Evaluate specifications over a log, write what comes out, and return what was lost."""
+    """Evaluate specifications over a log, write the results, and return the losses."""
     from spatial_replay.replay.engine import run_replay
 
     inputs = open_inputs(request)
@@ -632,7 +632,7 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
         fitting = [
             result for result in replayed.results if verdict_of(result, node, goes_on=goes_on) is not None
         ]
-        # where none fits, the nearest name is looked for among all
+        # if none fits, the error suggests the nearest name among all
         worst, others = worst_of(fitting) if fitting else (replayed.results, ())
         if len(fitting) > MANY:
             verdicts_of_all = [verdict_of(result, node, goes_on=goes_on) for result in fitting]
@@ -671,7 +671,7 @@ _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")
 
 
 def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
-    """Yield each explanation below the requirement that it is about, which several in a row share."""
+    """Yield each explanation, below its requirement. Consecutive explanations of a node share the heading."""
     before = None
     for explanation in explanations:
         spec = explanation.document["specification"], explanation.document["node"]
@@ -682,7 +682,7 @@ def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
 
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:
-    """Return the same inputs with a window that ends with the samples at a time."""
+    """Return the inputs with a window that ends with the sample at a time."""
     from spatial_replay.replay.selection import absolute_ns
 
     if at is None:

@@ -25,7 +25,7 @@ _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def _ids(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[int, ...] | None:
-    """Return the numbers that a text such as 0-7,12 names."""
+    """Return the numbers in a text such as 0-7,12."""
     if text is None:
         return None
     numbers: list[int] = []
@@ -85,7 +85,8 @@ def tags() -> None:
 def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, output: Path) -> ExitCode:
     """Write sheets of tags in true size, with a ruler to check what the printer did.
 
-    Print at 100 %, not fitted to the page. Cut so that a white rim stays, an eighth of the tag wide or wider.
+    Print at 100 %, not fitted to the page. Leave a white rim around each tag, at least an eighth of its
+    width.
 
     \b
     Examples:

@@ -1,6 +1,6 @@
 """Output to the terminal.
 
-Everything printed passes through here, so names from a log cannot control a terminal.
+All printed text passes through this module, so names from a log cannot control a terminal.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PROGRAM: Final = "spatial-replay"
 
 
 _HUES: Final = MappingProxyType({"blue": 32, "red": 166, "yellow": 130, "cyan": 30})
-"""Colours of terminals, of 256, that can be read on black and on white."""
+"""Terminal colours (of 256) that are readable on black and on white."""
 
 
 class Coloured(NamedTuple):
@@ -51,16 +51,16 @@ Line: TypeAlias = str | tuple[str | Coloured, ...]
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
 _BEFORE_UNIT: Final = re.compile(r"(?<=\d) (?=[^\W\d][\w/^²]{0,4}(?![\w]))")
 _LEAST_WIDTH: Final = 60
-"""Width of lines on narrow terminals."""
+"""Least width of lines, characters."""
 
 
 def show(*lines: Line, err: bool = False) -> None:
-    """Print lines, with escapes such as `\\x1b` in place of what is not printable.
+    """Print lines, with escapes such as `\\x1b` for unprintable characters.
 
-    Lines that are too long for a terminal are cut at spaces.
+    Lines that are too long for a terminal are broken at spaces.
 
     Args:
-        lines: each without its end; a line end within is escaped.
+        lines: lines without line ends; a line end within a line is escaped.
         err: print to standard error.
     """
     for line in lines:
@@ -85,7 +85,7 @@ def _style(pieces: Iterable[str | Coloured], most: int) -> str:
 
 
 class StatusLine:
-    """A line at the bottom of a terminal that is written again and again; nothing where there is none."""
+    """A line at the bottom of a terminal that is updated in place; nothing without a terminal."""
 
     def __init__(self) -> None:
         self._is_shown = False
@@ -105,7 +105,7 @@ class StatusLine:
 
 
 def terminal_width() -> int:
-    """Return the characters of a line of the terminal, 100 where there is none."""
+    """Return the width of the terminal, characters; 100 without a terminal."""
     return shutil.get_terminal_size((100, 24)).columns
 
 
@@ -113,14 +113,14 @@ def _fit_lines(line: str) -> list[str]:
     """Return a line cut at spaces, so that it fits into the terminal; the rest is indented."""
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     width = max(terminal_width(), _LEAST_WIDTH)
-    # a number stays with its unit
+    # a no-break space keeps a number with its unit
     joined = _BEFORE_UNIT.sub(_NO_BREAK, line)
     pieces = wrap(joined, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return [piece.replace(_NO_BREAK, " ") for piece in pieces] or [line]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:
-    """Print a value as JSON, with JSON's escapes in place of what is not printable."""
+    """Print a value as JSON, with JSON's escapes for unprintable characters."""
     text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
     click.echo(
         "".join(sign if sign == "\n" or sign.isprintable() else json.dumps(sign)[1:-1] for sign in text)
@@ -132,7 +132,7 @@ class Listener(NamedTuple):
 
     Attributes:
         document: called with each result, as values for JSON.
-        progress: called with a label, the steps so far, and their number or None.
+        progress: called with a label, the steps so far, and the total or None.
     """
 
     document: Callable[[Any], None]
@@ -163,7 +163,7 @@ def show_result(document: Callable[[], Any], lines: Callable[[], Iterable[Line]]
 
 
 def show_file(text: str) -> None:
-    """Print the text of a file: as it is to a file or a pipe, escaped to a terminal."""
+    """Print the text of a file: unchanged to a file or a pipe, escaped to a terminal."""
     if sys.stdout.isatty():
         text = "\n".join(escape_text(line, "\t") for line in text.splitlines()) + "\n"
     click.echo(text, nl=not text.endswith("\n"))
@@ -171,11 +171,11 @@ def show_file(text: str) -> None:
 
 @contextmanager
 def printing_to(output: Path | None, inputs: Iterable[Path] = ()) -> Iterator[None]:
-    """Write to a file, while this lasts, what is printed to standard output; None leaves it there.
+    """Redirect standard output to a file within this context; None redirects nothing.
 
     Raises:
-        UsageError: the output is an input, a folder, or in none.
-        OutputError: it cannot be written.
+        UsageError: the output is an input or a folder, or its folder is missing.
+        OutputError: the output cannot be written.
     """
     if output is None:
         yield
@@ -199,19 +199,19 @@ def show_message(severity: str, message: str, colour: str) -> None:
     """Print "spatial-replay: SEVERITY: MESSAGE" to standard error; further lines are indented."""
     first, *others = message.split("\n")
     label = Coloured(f"{severity}:", colour)
-    # carets stand below what they point at
+    # indented lines stay as they are, because carets point into the line above
     indented = (line if line.startswith("  ") else f"  {line}" for line in others)
     show((f"{PROGRAM}: ", label, f" {first}"), *indented, err=True)
 
 
 def warn(*messages: str) -> None:
-    """Print warnings to standard error, each as "spatial-replay: warning: …"; one of many alike."""
+    """Print warnings to standard error as "spatial-replay: warning: …", one of several similar ones."""
     for message in without_repetition(messages):
         show_message("warning", message, "yellow")
 
 
 PATIENCE_S = 1.0
-"""Shorter work shows no bar."""
+"""Time of work after which a bar appears, seconds."""
 COMPILING = "compiling, once on this machine"
 """Label of a bar while kernels are compiled."""
 
@@ -225,12 +225,12 @@ Advance = Callable[[int], None]
 def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     """Show the progress of some work: `with progress("reading", len(items)) as advance: ... advance(1)`.
 
-    The bar appears on standard error, if that is a terminal, once the work has taken a second. It is removed
-    at the end of the work. While kernels are compiled, its label says so. A cell of a notebook shows none,
-    though it runs `!spatial-replay …` on a terminal.
+    If standard error is a terminal, a bar appears after a second. It is removed at the end of the work. While
+    kernels are compiled, its label says so. A cell of a notebook shows no bar, although it runs
+    `!spatial-replay …` on a terminal.
 
     Args:
-        total: number of steps; None if it is not known.
+        total: number of steps; None if unknown.
     """
     if (listener := _LISTENER.get()) is not None:
         yield _counting(listener, label, total)
@@ -238,7 +238,7 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     if not sys.stderr.isatty() or _NOTEBOOK in os.environ:
         yield lambda steps: None
         return
-    # imports the compiler, which all work that is worth a bar needs anyway
+    # this import is slow, but all work that is worth a bar needs it anyway
     from spatial_replay.compiled import compilations
 
     bar = _Bar(label, total)
@@ -292,14 +292,14 @@ class _Bar:
             self._shown.update(self._shown.task_ids[0], description=self._description, completed=self._done)
 
     def _appear(self) -> None:
-        # there is one bar at a time: that of the work as a whole
+        # None within other work: there is one bar at a time, that of the whole work
         self._shown = _start_bar(self._description, self._total, self._done)
-        # the work went on while the bar was made
+        # steps may have been done while the bar was made
         self._update()
 
     def close(self) -> None:
         self._timer.cancel()
-        # the timer may be showing the bar right now
+        # the timer may be about to show the bar
         self._timer.join()
         if self._shown is not None:
             self._shown.stop()
@@ -314,7 +314,7 @@ def _start_bar(label: str, total: int | None, done: int) -> Progress | None:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        # the share or, of work whose end is not known, the steps that are done
+        # the share of finished work; without a total, the number of finished steps
         TaskProgressColumn(text_format_no_percentage="{task.completed:,.0f}"),
         TimeRemainingColumn(),
     )

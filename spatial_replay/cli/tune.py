@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 _PICTURES = (".png", ".svg", ".html")
 _MANY = frozenset({"--good", "--bad"})
 _MOST_LISTED = 20
-"""The most runs that are listed; JSON has all."""
+"""Runs that are listed, at most. JSON has all."""
 
 
 class ManyLogs(JsonCommand):
-    """A command whose options --good and --bad take all that follows, as shells expand `good/*.mcap`."""
+    """A command whose options --good and --bad take several values, because shells expand `good/*.mcap`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         return super().parse_args(ctx, list(_one_by_one(args)))
@@ -127,12 +127,12 @@ def tune(
 ) -> ExitCode:
     """Find the constants with which good runs satisfy a specification and bad runs violate it.
 
-    With good and bad runs these are the values of the widest margin between them; with good runs only, the
-    tightest ones. Constants to tune have a range in the text, const near = 70 in [40, 100], or are named by
-    --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
+    With good and bad runs, these values have the widest margin between them. With good runs only, they are
+    the tightest ones. Constants to tune have a range in the text, const near = 70 in [40, 100], or are named
+    by --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
 
-    Exits with 0 if there are such values, and with 1 if not: then the runs that contradict each other are
-    listed.
+    Exits with 0 if there are such values. Otherwise it lists the runs that contradict each other, and exits
+    with 1.
 
     \b
     Examples:
@@ -180,7 +180,7 @@ def tune(
 
 
 def _warn_of_doubts(runs: Sequence[LabelledRun]) -> None:
-    """Warn of assumptions that logs contradict, which limits would be fitted to."""
+    """Warn of assumptions that logs contradict, because limits are fitted to these logs."""
     warn(*(doubt.remark(run.name) for run in runs for doubt in run.trace.doubts))
 
 
@@ -245,11 +245,11 @@ def learn(
 ) -> ExitCode:
     """Find a short specification that all GOOD runs satisfy and that bad ones violate.
 
-    It says what always holds, how runs end, what holds at some time, and what comes before what, of objects
-    by their names or of all of a class. With bad runs each of its lines is violated by some of them, the most
-    distinctive one first; without, it says what good runs have in common. Its comments have the evidence.
+    Its lines are invariants, ends of runs, goals and orders of events, for objects by name or for a class.
+    With bad runs, some bad run violates each line, and the most distinctive line comes first. Without bad
+    runs, the lines are common properties of the good runs. Comments have the evidence.
 
-    Exits with 0 if there is one that all bad runs violate, and with 1 if not.
+    Exits with 0 if all bad runs violate the specification, otherwise with 1.
 
     \b
     Examples:

@@ -67,7 +67,7 @@ def _run(name: str) -> None:
 
 
 def compile_task(name: str) -> None:
-    """Compile the kernels of one of `TASKS` in this process, beside a program that uses them."""
+    """Compile the kernels of one of `TASKS` at low priority, while another program uses them."""
     os.nice(10)
     _run(name)
 
@@ -140,7 +140,7 @@ TASKS: Mapping[str, Callable[[], None]] = MappingProxyType(
         "bag": _read_bag,
     }
 )
-"""The longest first, so that no core waits for the last one."""
+"""Tasks by name, the longest first, so that no core waits for the last one."""
 
 
 @click.command()
@@ -148,11 +148,11 @@ TASKS: Mapping[str, Callable[[], None]] = MappingProxyType(
     "--jobs", type=click.IntRange(1), default=None, help="Number of processes.  [default: one per core]"
 )
 def warmup(jobs: int | None) -> None:
-    """Compile every kernel once, so that no later run on this machine has to.
+    """Compile every kernel once, for all later runs on this machine.
 
-    Short logs are evaluated without compiled code; this is for container images, and before a control loop.
-    The code is kept beside the installed package or, if that is read-only, in the user's cache folder.
-    SPATIAL_REPLAY_CACHE names another place.
+    It is for container images, and for use before a control loop. Short logs are evaluated without compiled
+    code. The code is stored next to the installed package or, if that is read-only, in the user's cache
+    folder. SPATIAL_REPLAY_CACHE names another folder.
 
     \b
     Examples, the second in a Dockerfile:
