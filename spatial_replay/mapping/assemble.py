@@ -598,9 +598,9 @@ class _Silences:
         self._sampled = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
         self._others = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
         self._others_begin_ns: int | None = None
-        # times of the sampled topic, from the last two messages before the next samples on
+        # times of the sampled topic: the last two before the next samples, and all later ones
         self._past_ns = self._times_ns = np.empty(0, np.int64)
-        # whether fallback topics are sampled after each of these and, as the last element, before the first
+        # whether fallback topics are sampled after each of these times; the last element: before the first
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None

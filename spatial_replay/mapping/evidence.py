@@ -215,6 +215,7 @@ class Arrivals:
         self.log_passed_s = (int(log_ns[-1]) - self._first_stamp_log_ns) / 1e9
         is_new = np.append(stamps_ns[0] != self._stamp_ns, stamps_ns[1:] != stamps_ns[:-1])
         self.stamps_vary = self.stamps_vary or bool(is_new.any())
+        # for each message, the log time of the first message with the same stamp
         since_ns = np.where(is_new, log_ns, 0)
         since_ns[0] = since_ns[0] or self._since_ns
         since_ns = np.maximum.accumulate(since_ns)
@@ -351,6 +352,7 @@ class Motions:
         course = np.arctan2(step[moves, 1], step[moves, 0])
         yaw, number = earlier[moves, _YAW], earlier[moves, _TURN]
         sign = -1.0 if turns_back else 1.0
+        # another interpretation differs from the yaw by the differences of zero and scale
         readings = (base - zero + (unit - scale) * number for base, unit in HEADINGS.values())
         angles = [yaw, *(yaw + sign * reading for reading in readings)]
         offsets = [np.exp(1j * (course - angle)).sum() for angle in angles]

@@ -138,6 +138,7 @@ def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
             return owner_path
     value = walk(path, example) if leads_somewhere(path, example) else None
     names = field_names(value)
+    # corners are lists in a list, rings are one level deeper
     has_rings = _INNER in names or "coordinates" in names or _depth(value) > 2
     return path if has_rings else None
 
@@ -174,6 +175,7 @@ def _polygons_in(holder: Any) -> list[Any]:
         # points and lines cover no area
         kinds: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
         return list(kinds.get(get_field(holder, "type"), ()))
+    # a polygon has three levels (rings, corners, numbers), a MultiPolygon four
     return list(holder) if _depth(holder) > 3 else [holder]
 
 

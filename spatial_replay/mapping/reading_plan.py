@@ -329,6 +329,7 @@ def _plan_of_topic(
     mapping: LogMapping, entry: TopicMapping | None, topic: Topic, place: int, needs_frames: bool
 ) -> PlannedTopic:
     kind = short_type((entry.type if entry is not None else None) or topic.type)
+    # only the first entry of a topic adds its transforms
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and place == 0
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None

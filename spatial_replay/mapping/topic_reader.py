@@ -315,6 +315,7 @@ class Extractor:
     def _forget_unset(self, binding: Binding, numbers: Floats, objects: Sequence[object]) -> None:
         """Replace the defaults of protobuf fields that were not set by NaN."""
         for column, path, default in binding.unset:
+            # a number other than the default was set; at the default, presence decides
             for row in np.flatnonzero(numbers[:, column] == default).tolist():
                 if not is_set(path, objects[row]):
                     numbers[row, column] = nan

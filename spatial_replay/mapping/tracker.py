@@ -151,7 +151,7 @@ def events_from_messages(
         left_name = np.concatenate([left_name, deleted[:, 1]])
     every_name = np.concatenate([left_name, name])
     every_message = np.concatenate([left_message, message])
-    # the sort is stable with departures first, so that an object that a message deletes and reports exists
+    # departures come first in the stable sort, so that an object deleted and reported by a message exists
     order = np.lexsort((every_message, every_name))
     count = len(left_name)
 

@@ -451,6 +451,7 @@ class FrameTree:
         after = np.searchsorted(series.times_ns, times_ns, "left")
         inside = after <= last
         after = np.minimum(after, last)
+        # at the time of a transform nothing is interpolated
         before = np.where(inside & (series.times_ns[after] == times_ns), after, after - inside)
         is_known = (before >= 0) | is_still
         before, after = np.where(is_still, newest, np.maximum(before, 0)), np.where(is_still, newest, after)
@@ -530,6 +531,7 @@ class FrameTree:
         poses = np.array([entry.pose for entry in entries])
 
         def apart(first: Floats, second: Floats) -> Floats:
+            # the absolute value, because q and -q are the same rotation
             cosine = np.abs(np.einsum("ij,ij->i", first[:, 3:], second[:, 3:]))
             turn = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
@@ -631,7 +633,7 @@ class _Question(NamedTuple):
 
 
 def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
-    """Return transforms in order of a clock, without all but the last of those with equal times.
+    """Return transforms in order of a clock; of transforms with equal times, only the last.
 
     Args:
         clock: attribute of entries with the time.

@@ -137,6 +137,7 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
         return [_value(element, (*place, index), document) for index, element in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
+    # a scalar with a style is quoted or a block, and so a text
     if not isinstance(node, yaml.ScalarNode) or node.style is not None:
         return cast("Value", node.value)
     value = _scalar(node.value)

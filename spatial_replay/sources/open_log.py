@@ -279,6 +279,7 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
     if file.name == BAG_METADATA:
         return file
     try:
+        # the version is read from the server, so that this fails if there is no such file
         _ = file.version
     except MissingFileError:
         # the address of a folder without the slash at its end
