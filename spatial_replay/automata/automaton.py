@@ -66,8 +66,8 @@ class Automaton(Displayed):
         accepting: states in which a run must end to satisfy the formula. For state 0 this matters only if
             samples lead back to it, because no run is empty.
         entries: for each state, the index of its first decision, or ~q if every symbol leads to state q.
-        decisions: rows of a proposition, the next place if it is false, and the next place if it is true.
-            A place is an index or ~q, as in `entries`, and decides on a later proposition.
+        decisions: rows (proposition, next place if it is false, next place if it is true). A place is an
+            index or ~q, as in `entries`, and decides on a later proposition.
     """
 
     name: str
@@ -242,6 +242,7 @@ class Automaton(Displayed):
                 for target in self.successors[end]
                 if (end, target) not in left_out and distances.get(target) == distances[end] - 1
             ]
+            # the list is a stack, so the path over the state with the lowest number is popped first
             paths.extend((*path, self._moves.transition(end, target)) for target in reversed(nearer))
 
     def guard_words(self, transition: Transition, longest: int | None = None) -> str:
@@ -417,6 +418,7 @@ def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, res
     for t in range(values.shape[1]):
         place = entries[state]
         while place >= 0:
+            # column 1 is for a false proposition, column 2 for a true one
             place = decisions[place, 1 + values[decisions[place, 0], t]]
         state = ~place
         result[t] = state
@@ -428,6 +430,7 @@ def _spread(
 ) -> None:
     # sample of the last visit of each decision: states share decisions, which are followed once per sample
     visited = np.full(decisions.shape[0], -1, np.int64)
+    # each visited decision adds at most one entry to the stack
     stack = np.empty(decisions.shape[0] + 2, np.int64)
     before = states
     for t in range(values.shape[1]):
@@ -446,6 +449,7 @@ def _spread(
                 if visited[place] == t:
                     continue
                 visited[place] = t
+                # an unknown value, -1, follows both branches
                 value = values[decisions[place, 0], t]
                 if value != 1:
                     stack[height] = decisions[place, 1]
@@ -505,6 +509,7 @@ def state_colour(automaton: Automaton, state: int) -> str:
 def abbreviate(automaton: Automaton) -> Automaton:
     """Return the automaton with short names for propositions that are too long for arrows."""
     labels = {proposition.label for proposition in automaton.propositions}
+    # twice as many names suffice, because labels take at most half of them
     names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
     short = (
         proposition if len(proposition.label) <= _LONGEST_LABEL else replace(proposition, name=next(names))

@@ -35,7 +35,7 @@ from spatial_replay.text import named_arguments
 _MAX_DEPTH = 220
 """Maximum depth of nested operators: ltlf2dfa recurses, and fails beyond 243."""
 _MAX_SIZE = 20_000
-"""Maximum number of written subformulas to translate, which takes about two seconds."""
+"""Maximum number of subformulas to translate, counted as often as they are written; about two seconds."""
 
 _SIGNS: MappingProxyType[Kind, str] = MappingProxyType({"and": "&", "or": "|", "U": "U", "R": "R"})
 
@@ -137,7 +137,10 @@ _MOVE = re.compile(r"State (\d+): ([01X]*) -> state (\d+)")
 
 
 def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
-    """Return MONA's automaton of a skeleton with this number of propositions.
+    """Compile a skeleton with MONA.
+
+    Args:
+        propositions: number of propositions.
 
     Raises:
         NoAutomatonError: MONA or ltlf2dfa is not installed, MONA fails or takes too long, or the formula is
@@ -163,6 +166,7 @@ def _output(executable: str, program: str) -> str:
 
     The program goes through a pipe instead of a file, so any number of processes may run at once.
     """
+    # -q: quiet, -u: a conventional automaton, -w: printed as a whole (`mona` without arguments explains them)
     command = [executable, "-q", "-u", "-w", "/dev/stdin"]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -197,7 +201,9 @@ def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
     except BrokenPipeError:
         # MONA has ended; its exit code and output tell the reason
         pass
+    # one more byte shows that the output is too long
     printed = process.stdout.read(_MAX_OUTPUT + 1)
+    # a process with more output would wait for the full pipe forever; the caller kills it
     if len(printed) <= _MAX_OUTPUT:
         process.wait()
     return printed
@@ -236,7 +242,7 @@ def _machine(printed: str, propositions: int) -> Machine:
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
-    """Return the diagram of disjoint cubes that cover all symbols, beginning with a variable."""
+    """Return the diagram of disjoint cubes that cover all symbols, deciding from `variable` on."""
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
@@ -328,6 +334,7 @@ class Obligations:
     def _begin(self, obligation: Obligation) -> None:
         number, strong = obligation
         members = self._members.get(obligation, (number,))
+        # the number of failing members is from 0 to len(members)
         bits = len(members).bit_length()
         chain = Chain(members, strong, self._first + len(self._chains), bits)
         self._chains += [chain] * bits
@@ -335,7 +342,7 @@ class Obligations:
 
 
 def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
-    """Return the members of its chain for each obligation that is in a chain."""
+    """Map each obligation of a chain to the members of its chain."""
     later = {(number, strong) for (_, strong), number in longer.items()}
     chains: dict[Obligation, tuple[int, ...]] = {}
     for begin, strong in longer:
@@ -365,9 +372,10 @@ def machine_by_progression(
     states: int = MAX_STATES,
     decisions: int = MAX_DECISIONS,
 ) -> Machine:
-    """Return an automaton of a skeleton with this number of propositions.
+    """Compile a skeleton by progression.
 
     Args:
+        propositions: number of propositions.
         number: number of the subformula to compile; None for the whole formula.
         states, decisions: maximum numbers of states and of decisions.
 
@@ -378,6 +386,7 @@ def machine_by_progression(
     try:
         return _Progression(skeleton, propositions, states, decisions).machine(root)
     except RecursionError:
+        # diagrams are built recursively, once for each nested decision
         raise NoAutomatonError("the automaton takes decisions that are nested too deeply") from None
 
 
@@ -471,7 +480,10 @@ _FEW_STATES, _FEW_DECISIONS = 1_000, 20_000
 
 
 def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
-    """Return an automaton of a skeleton with this number of propositions.
+    """Compile a skeleton as a whole if it is small, and else operand by operand.
+
+    Args:
+        propositions: number of propositions.
 
     Raises:
         NoAutomatonError: it would take more states or decisions than are explored.
@@ -502,6 +514,7 @@ class _Composition:
             try:
                 return self._join(operands, kind == "and")
             except NoAutomatonError:
+                # an operand or a product was too large; the whole formula may still be small enough
                 pass
         return self._progress(number, MAX_STATES, MAX_DECISIONS)
 
@@ -523,7 +536,7 @@ class _Composition:
 
 
 def join_machines(first: Machine, second: Machine, both: bool) -> Machine:
-    """Return the product of two machines, which accepts the runs that both accept or, if not `both`, either.
+    """Return the product of two machines, for the intersection of their runs or, if not `both`, the union.
 
     Args:
         first, second: machines without equivalent states.
@@ -560,6 +573,7 @@ class _Joining:
         join = np.logical_and if self._both else np.logical_or
         pairs = np.array(self._pairs, np.int64)
         accepting = join(first.accepting[pairs[:, 0]], second.accepting[pairs[:, 1]])
+        # a decided pair is rejected by an intersection, and accepted by a union
         accepting[pairs[:, 0] < 0] = not self._both
         rows = np.array(self._rows, np.int64).reshape(-1, 3)
         return Machine(np.array(moves, np.int64), rows, accepting, start)
@@ -601,7 +615,7 @@ class _Joining:
 
 
 def _permanent_states(machine: Machine, accepts: bool) -> frozenset[int]:
-    """Return the places of states that accept permanently or, if not `accepts`, never."""
+    """Return the places of states whose result is permanent: acceptance or, if not `accepts`, rejection."""
     stays = machine.moves == ~np.arange(len(machine.moves))
     return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
 
@@ -647,6 +661,7 @@ def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -
     if entries is None or accepting is None or decisions is None or len(propositions) > MAX_PROPOSITIONS:
         return None
     automaton = Automaton(spec.name, tuple(propositions), frozenset(accepting), tuple(entries), decisions)
+    # kernels follow places without checks, so a damaged file must not reach them
     return automaton if _is_sound(automaton) else None
 
 
@@ -658,6 +673,7 @@ def _numbers(value: object) -> list[int] | None:
     if (
         not isinstance(value, list)
         or len(value) > MAX_ROWS
+        # bool is a subclass of int, and is refused
         or any(type(number) is not int for number in value)
     ):
         return None
@@ -719,8 +735,8 @@ def automaton(
 
     Raises:
         NoAutomatonError: past operators, bounds in seconds without a rate, or too large.
-        UsageError: no specification, no such spec, several to choose from, no such compiler, a rate that is
-            not above 0.
+        UsageError: no specification, no such spec, several results without `name`, no such compiler, or a
+            rate that is not above 0.
     """
     require_specification(specification)
     if compiler is not None and compiler not in get_args(Compiler):
@@ -780,6 +796,7 @@ class _Shape:
     root: int
     chains: frozenset[tuple[tuple[int, bool], int]]
     propositions: int
+    # the input of the compiler, which the other fields determine
     skeleton: Skeleton = field(compare=False, repr=False)
 
     @classmethod
@@ -823,7 +840,7 @@ def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
     """Return the spec with a name; without a name, the only result of the specification.
 
     Raises:
-        UsageError: no such spec, several to choose from.
+        UsageError: no such spec, or several results without a name.
     """
     specs_by_name = {spec.name: spec for spec in specification.specs}
     if name is None:

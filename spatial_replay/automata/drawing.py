@@ -183,6 +183,7 @@ def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[in
 
 def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
     """Return the length of the longest path to each state, without back edges."""
+    # lists suffice, because a drawing has at most `MOST_STATES` states
     ended: list[int] = []
     on_way: set[int] = set()
     back: set[tuple[int, int]] = set()

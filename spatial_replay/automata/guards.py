@@ -59,6 +59,7 @@ class Diagrams:
         self._numbers: dict[Decision, int] = {}
         self._chosen: dict[tuple[int, int, int], int] = {}
         self._limit = limit
+        # so that they are nodes `NO` and `YES`
         self.leaf(0), self.leaf(1)
 
     def __len__(self) -> int:
@@ -317,6 +318,7 @@ def _split_sign(atom: Atom) -> tuple[Expression, bool]:
         match expression:
             case Negative(operand=operand):
                 expression = operand
+            # of `a - b` and `b - a`, the one that sorts first
             case Sum(first=first, second=Negative(operand=operand)) if repr(operand) < repr(first):
                 expression = Sum(operand, Negative(first))
             case _:
@@ -461,6 +463,7 @@ def guard_words(move: Transition, propositions: Sequence[Proposition], longest: 
         text = " and ".join(propositions[number].literal(value) for number, value in cube)
         parts.append(text if len(move.guard) == 1 or len(cube) == 1 else f"({text})")
         length += len(parts[-1])
+        # further cubes would be cut off below
         if longest is not None and length > longest:
             break
     words = " or ".join([*parts, "…"] if move.is_cut else parts)

@@ -163,8 +163,8 @@ class Skeleton:
     Attributes:
         nodes: subformulas, indexed by number.
         root: number of the whole formula.
-        chains: from the number of a subformula, and whether it is an until, to the number of the same
-            subformula over a window that is longer by one sample. A shorter until implies the longer until.
+        chains: mapping from (number of a subformula, whether it is an until) to the number of the same
+            subformula with a window that is longer by one sample. A shorter until implies the longer until.
             A longer release implies the shorter release.
     """
 
@@ -197,6 +197,7 @@ class Skeleton:
         self._written = {id(node) for node in _temporal(formula)}
         self._operator: Formula | None = None
         self._unrolled: Formula | None = None
+        # so that they have the numbers `FALSE` and `TRUE`
         self._node("false"), self._node("true")
         self.root = self._of(formula, True)
 
@@ -274,6 +275,7 @@ class Skeleton:
     def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
         """Unroll an until (`strong`) or a release over a window."""
         lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
+        # checked before the loops, which take a step for each sample of the window
         if max(lower, upper or 0) > MAX_NODES:
             raise self._too_large()
         hold, free = (self._both, self._either) if strong else (self._either, self._both)

@@ -22,8 +22,8 @@ class Machine:
 
     Attributes:
         moves: (S,), place of each state's first decision.
-        decisions: (D, 3), rows of a proposition, the place if it is false, and the place if it is true.
-            Rows at these places decide on later propositions and have smaller indices.
+        decisions: (D, 3), rows (proposition, place if it is false, place if it is true). Rows at these places
+            decide on later propositions and have smaller indices.
         accepting: (S,), whether each state accepts.
         start: place of the first decision of a run.
     """
@@ -40,7 +40,7 @@ class Machine:
 
 
 def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[bool], start: int) -> Machine:
-    """Return the machine of moves that are nodes of decision diagrams, with states as leaves."""
+    """Convert moves, which are nodes of diagrams with states as leaves, into a machine."""
     places: list[int] = []
     rows: list[tuple[int, int, int]] = []
     for node in range(len(diagrams)):
@@ -80,6 +80,7 @@ def least(machine: Machine) -> Machine:
     # compilers differ in their unreachable states, so these are dropped
     same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
     if len(same):
+        # argmin prefers False: a state that does not accept
         first = int(same[np.argmin(machine.accepting[same])])
     else:
         first = len(machine.moves)
@@ -194,6 +195,7 @@ def _split_classes(machine: Machine) -> list[int]:
     while pending:
         copies: dict[int, int] = {}
 
+        # the default binds the dictionary of this round
         def copy(place: int, copies: dict[int, int] = copies) -> int:
             if place < 0:
                 return diagrams.leaf(classes[~place])

@@ -134,6 +134,7 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     if isinstance(what, _Below):
         monitor = next(monitor for monitor in monitors if name in monitor.names)
         below = f"{name} {'possibly ' if what.is_possible else ''}below {what.number:g}"
+        # the lower end shows that the value may be below, the upper end that it certainly is
         end = 0 if what.is_possible else 1
         return lambda updates, _: below if monitor.interval(name)[end] < what.number else None
     return lambda updates, _: f"{name} {what}" if _verdict(updates, name) == what else None
@@ -187,7 +188,7 @@ _MOST_EVENTS: Final = 256
 _MOST_MISSED: Final = 2**18
 """Maximum number of times of dropped samples in memory, and of dropped messages."""
 _STATIC: Final = "tf_static"
-"""Last part of the topics of static transforms, which each clip needs, however old they are."""
+"""Last part of the topics of static transforms; every clip needs these transforms regardless of their age."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +241,7 @@ class _Open:
         self.channels: Mapping[int, Channel] = {}
         self._stream = open_output(path)
         try:
+            # with a clock, chunks are closed after a second, so that a kill loses little
             self._writer = LogWriter(self._stream, clock=time.monotonic)
             self._recording = Recording(self._writer, files, {**about, "trigger": fired})
         except BaseException:
@@ -268,6 +270,7 @@ class _Open:
                 messages.append(entry.content._replace(log_time_ns=entry.time_ns))
             elif isinstance(entry.content, RunEvent):
                 events.append(entry.content)
+            # times of samples in a log must increase
             elif entry.time_ns > self._sample_ns:
                 samples.append(entry.content)
                 self._sample_ns = entry.time_ns
@@ -389,13 +392,14 @@ class ClipLog(RecorderLog):
             self._begin_due()
         if self._open is not None:
             self._open.write()
+            # a clip may not hold more memory than the ring
             while self._open.waiting_bytes > self._trigger.most_bytes:
                 self._open.write()
             if not self._open.waiting and self._is_past(self._open.until_ns):
                 self._finish(is_interrupted=False)
 
     def miss(self, time_ns: int, kind: Missed) -> None:
-        """Record the time of a dropped sample or message, which a clip of that time counts."""
+        """Record the time of a dropped sample or message; a clip counts those within its time."""
         self._missed[kind].append(time_ns)
 
     def report(self, event: RunEvent) -> None:
@@ -412,6 +416,7 @@ class ClipLog(RecorderLog):
         if self._open is None:
             return
         self._open.flush()
+        # without entries for longer than the clip lasts, the run has stopped
         if not self._open.waiting and time.monotonic() - self._open.last_s > self._trigger.after_s + 2.0:
             self._finish(is_interrupted=True)
 
@@ -437,11 +442,12 @@ class ClipLog(RecorderLog):
             reason = condition(updates, has_changed)
             if reason is not None and not self._held_before[text]:
                 self._begin(reason, sample.time_ns)
+            # every event fires; any other condition fires only when it begins to hold
             self._held_before[text] = reason is not None and text != EVENT
 
     @property
     def _is_due(self) -> bool:
-        """Whether the ring has the time of the oldest trigger by hand; False before the first entry."""
+        """Whether the ring has reached the time of the oldest trigger by hand; False before any entry."""
         if not self._manual or self._newest_ns < 0:
             return False
         evaluated_ns, _ = self._progress.get(Sample, (-1, 0.0))
@@ -497,6 +503,7 @@ class ClipLog(RecorderLog):
             following = self._between(clip.until_ns + 1, at_ns + self._after_ns)
         else:
             number = len(self.written) + 1
+            # logs of an earlier run in this folder keep their numbers
             while any(self._folder.glob(f"{number:04d}-*.mcap")):
                 number += 1
             slug = re.sub(r"[^A-Za-z0-9_]+", "-", reason).strip("-")[:60] or "trigger"
@@ -507,6 +514,7 @@ class ClipLog(RecorderLog):
             begin_ns = clip.begin_ns = at_ns - self._before_ns
             for held in self._static:
                 if held.time_ns < begin_ns:
+                    # older static transforms are repeated at the clip's begin
                     clip.put(held._replace(time_ns=max(begin_ns, 0)))
             following = self._between(begin_ns, at_ns + self._after_ns)
         for entry in following:
@@ -535,6 +543,7 @@ class ClipLog(RecorderLog):
             dropped = ring.popleft()
             self._evicted_ns = max(self._evicted_ns, dropped.time_ns)
             self.held_bytes -= dropped.size
+            # this entry was within `before_s`, so the ring is too small
             if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True
                 held_s = max(0.0, (reached_ns - dropped.time_ns) / 1e9)

@@ -23,6 +23,7 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    # the default and ignoring "handlers" are constants, which are not callable
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     arrived: list[int] = []
     for number, handler in handlers.items():

@@ -170,7 +170,7 @@ class Recording:
 
     def layout_ahead(self) -> Attachment:
         """Return the layout for viewers before the first sample, with panels for all possible contents."""
-        # imported late, because a written log needs its layout only at its end
+        # imported late, because only live viewers need a layout before the end of the log
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
         return layout_attachment(self._evaluation.contents(None, (), self._axes))
@@ -381,11 +381,13 @@ class FileLog(RecorderLog):
         refuse_ending(path)
         self._stream = open_output(path, durability, overwrite=overwrite)
         try:
+            # with a clock, chunks are closed after a second, so that a kill loses little
             self._writer = LogWriter(self._stream, clock=time.monotonic)
             self._recording = Recording(self._writer, files, about)
             self.flush()
             warm_up(self._recording.files, self._recording.automata)
         except BaseException:
+            # also after an interruption during the compilation
             with suppress(OutputError):
                 self._stream.close()
             raise
@@ -430,6 +432,7 @@ class FileLog(RecorderLog):
         begun = time.monotonic()
         self._recording.evaluate(trace.slice(0, count))
         self.backlog -= count
+        # the next batch follows from the measured speed
         took_s = max(time.monotonic() - begun, 1e-6)
         self._at_once = max(1, min(int(count * _EVALUATING_S / took_s), _MOST_AT_ONCE))
 

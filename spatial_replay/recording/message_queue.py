@@ -123,6 +123,7 @@ class MessageQueue:
             time.sleep(PAUSE_S)
         self._bytes_in += size
         self._queue.put(message)
+        # the writing thread is woken before the queue is full
         if self._bytes_in - self._bytes_out > _TOGETHER_BYTES or self._queue.qsize() * 2 >= self._limit:
             self._ring()
         return True
@@ -218,6 +219,7 @@ class MessageChannel:
             number = operator.index(time_ns)  # type: ignore[arg-type]
         except TypeError:
             number = -1
+        # operator.index also accepts booleans
         if isinstance(time_ns, bool) or not 0 <= number <= LATEST_NS:
             raise UsageError(
                 f"the time of a message on {self.topic} is {shortened(time_ns)}; give integer nanoseconds"

@@ -19,7 +19,7 @@ MOST_WAITING_SAMPLES: Final = 150
 
 
 class Robot(Executor, Protocol):
-    """A robot that executes the steps of `plan`. It writes every sample to the recorder, also in a motion."""
+    """A robot that executes the steps of `plan`, and writes every sample to the recorder, also in motions."""
 
     def look(self) -> None:
         """Write one more sample to the recorder, while nothing moves."""

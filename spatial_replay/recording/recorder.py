@@ -40,7 +40,10 @@ FLUSH_S = 0.3
 """Interval between two flushes to the operating system, s."""
 
 MOST_LOST_S = 0.8
-"""Age of the oldest unflushed sample from which `write` waits, or drops samples if it may not wait, s."""
+"""Age of the oldest unflushed sample from which `write` waits, or drops samples if it may not wait, s.
+
+In a campaign, each of 2,468 kills lost at most 0.79 s of samples (docs/reliability.md).
+"""
 
 _TOGETHER = 1024
 """Maximum number of samples that are encoded at once."""
@@ -72,6 +75,7 @@ class SampleWriter:
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._waiting = waiting
+        # half a batch wakes the writing thread
         self._enough = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
         self._most_lost_s = most_lost_s
@@ -84,6 +88,7 @@ class SampleWriter:
         self._last_ns = self._queued_ns = -1
         self._unsafe_s: float | None = None
         self._drains = False
+        # a daemon, so that a program that never closes its recorder can end
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -94,6 +99,7 @@ class SampleWriter:
 
     def reserve(self) -> bool:
         """Return whether the queue has room; the next `write` then accepts its sample without waiting."""
+        # after a failure the next `write` raises it at once
         self._is_reserved = self._messages.failure is not None or not self._is_behind()
         return self._is_reserved
 
@@ -170,6 +176,7 @@ class SampleWriter:
             OutputError: a sample or message could not be written.
         """
         with uninterrupted():
+            # a forked process has no writing thread
             if os.getpid() != self._messages.process:
                 return
             with self._messages.lock:
@@ -215,6 +222,7 @@ class SampleWriter:
                 self._try(self._log.flush)
                 flushed_s = time.monotonic()
                 self._unsafe_s = drained_s if self._queue.qsize() else None
+        # messages that were queued until the recorder was closed
         while len(messages := self._messages.take()):
             self._record([], messages)
 
@@ -285,8 +293,8 @@ class Recorder(SampleWriter):
     closing is delayed until the log is closed.
 
     With a trigger, samples wait in memory until it fires; each firing writes one log of the time around it.
-    With a planner, the log also has its decisions. Give samples and outcomes to the recorder and take steps
-    from it, in their order, or call `plan(planner, robot, recorder)`.
+    With a planner, the log also has its decisions. Samples, decisions and outcomes then go through the
+    recorder in their order, as in `plan(planner, robot, recorder)`.
 
     Use as:
 
@@ -321,7 +329,7 @@ class Recorder(SampleWriter):
             path: path of the log or, with a trigger, of the folder for its logs.
             specifications: one or several specifications without templates, evaluated as samples arrive.
             about: further metadata of the log, such as a seed or the origin of the samples.
-            units: units for sentences, axes and viewers: of signals by their names, of lengths by "".
+            units: units of signals by name, and of lengths by "", for sentences, axes and viewers.
             waiting: maximum number of waiting samples, and maximum number of waiting messages of channels.
             block: whether `write` waits while the queue is full or, without a trigger, while more than 0.8 s
                 of samples have not reached the operating system. Otherwise new samples are dropped, and the

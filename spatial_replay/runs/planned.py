@@ -117,6 +117,7 @@ def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
     if settings.skill == "push":
         # strokes turn objects, which matters only if the planner plans orientations
         yaw = target.yaw if settings.workspace.yaws else None
+        # the first waypoint is the place of the object itself
         return world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
     return world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
 
@@ -212,7 +213,7 @@ def record_plan(
         settings = _settings(world, spec.formula, changes)
         planner = Planner(main_file, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
-        # a replay has no rate, so no automaton for bounds in seconds; the log has none either, to be equal
+        # a replay does not know the rate, so the log stores no automaton for bounds in seconds either
         automata = (
             [SpecAutomaton(spec.name, main_file, spec, planner.automaton)] if planner.rate_hz is None else []
         )

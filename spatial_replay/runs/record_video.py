@@ -180,6 +180,7 @@ def _ring(vertices: Floats, radius: float) -> Floats:
     around = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     if len(vertices) == 1:
         return vertices + around
+    # each direction belongs to the corner that is farthest in it
     support = (around @ vertices.T).argmax(axis=1)
     return np.asarray(vertices[support] + around, np.float64)
 
@@ -410,6 +411,7 @@ class _Picture:
         self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
         self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
         self._kept, self._copied = keep_mode, camera.channel
+        # a copied topic must not be one of the log's own topics
         if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
             self._kept = "none"
         self._encoder: H264Encoder | None = None

@@ -339,6 +339,7 @@ class Film:
                 look.pose,
                 # the first camera's noise does not depend on the number of cameras
                 seed=(self._seed, self._taken, *([number] if number else [])),
+                # OpenCV orders colours as blue, green, red
                 backdrop=Backdrop(
                     enlarge(colours[..., ::-1], views.coarse), 1 / enlarge(nearness, views.coarse)
                 ),

@@ -114,6 +114,7 @@ class Arm:
         longer, further = math.hypot(x, y) - radius, math.atan2(y, x) - angle
         turned = self._yaw
         turn = yaw - turned
+        # the radius counts at least 0.4 m, which limits the angular speed around the base
         lengths = math.hypot(longer, further * max(radius, 0.4))
         for share in _shares(lengths / _FAST, abs(turn) / _TURNING):
             r, a = max(radius + share * longer, _INSIDE), angle + share * further
@@ -132,6 +133,7 @@ class Arm:
             for _ in range(6):
                 yield
             now = self.width
+            # the fingers have stopped: at their distance, or at a body
             if abs(now - last) < 2e-4:
                 return
             last = now
@@ -174,7 +176,7 @@ def _shares(*durations_s: float) -> list[float]:
 
 
 def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> float:
-    """Return `yaw` plus the number of periods that brings it closest to the middle of the last joint's range.
+    """Return `yaw` shifted by whole periods to be closest to the middle of the last joint's range.
 
     The period is pi for an empty gripper, because it is symmetric, and 2 pi for a gripper that holds a body.
     """
@@ -282,9 +284,10 @@ class Grasp:
 def best_grasp(
     scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
 ) -> Grasp | Outcome:
-    """Return the grasp with the most clearance, or the failure; among equal ones, across the thinnest side.
+    """Return the grasp with the most clearance, or the failure if there is none.
 
-    A body that is not lifted is turned in the shorter direction.
+    Among equal grasps, the one across the thinnest side is preferred. A body that is not lifted is turned in
+    the shorter direction.
     """
     start = scene.place_of(name)
     if not in_reach(*start):
@@ -297,6 +300,7 @@ def best_grasp(
         thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
         return Outcome(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
     bottom, top = scene.height(name)
+    # the fingertips stay 3 mm above the body's lowest point
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
     for thickness, angle in sorted(across):
@@ -356,6 +360,7 @@ def _turns(
     pose, start = scene.pose(name), scene.place_of(name)
     # a round body has no yaw, so the tool keeps its yaw relative to the direction from the base
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
+    # the hand can hold a body in two opposite orientations
     for picked in (angle, angle + math.pi):
         grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
         further = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
@@ -548,6 +553,7 @@ def pushing(
     """
     corners = straighten([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
+        # corners need less precision than the goal
         trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
         if trouble is not None:
             return trouble
@@ -656,6 +662,7 @@ def _advance(
         remaining = length - (now[0] - x) * u - (now[1] - y) * v
         if remaining <= _MARGIN:
             return True
+        # the fingers have passed the goal without the body
         if travelled > length + back + _AWAY:
             return False
         travelled += min(_PUSH_FAST, _PUSH_SLOW + 2.0 * remaining) / TICKS_PER_S

@@ -271,10 +271,12 @@ class Engine:
             focal: focal length, pixels; the principal point is in the middle.
         """
         width, height = size
+        # PyBullet's field of view is vertical, in degrees
         angle = math.degrees(2 * math.atan(height / 2 / focal))
         bullet = self._bullet
         view = bullet.computeViewMatrix(eye, look_at, (0.0, 0.0, 1.0))
         lens = bullet.computeProjectionMatrixFOV(angle, width / height, _NEAR, _FAR)
+        # the software renderer also works without a display
         seen = self._call(
             "getCameraImage", width, height, view, lens, renderer=bullet.ER_TINY_RENDERER, shadow=0
         )

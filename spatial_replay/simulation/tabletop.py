@@ -164,7 +164,7 @@ class Tabletop:
 
     @property
     def skill(self) -> Skill:
-        """Motions of the robot."""
+        """The skill of the robot, "push" or "place"."""
         return self._scenario.skill
 
     @property
@@ -206,6 +206,7 @@ class Tabletop:
         self._seed, self._ticks, self._last_sampled = seed, 0, -1
         # a reset of PyBullet leaves internal state behind; only a new simulator repeats a run exactly
         self._engine = engine = Engine(gui=self._gui)
+        # another stream of random numbers than the detection noise has
         scenario, generator = self._scenario, np.random.default_rng([seed, 0])
         for placement in scenario.placements:
             dx, dy, turn = (generator.random(3) * 2 - 1).tolist()

@@ -43,7 +43,7 @@ _TURNED = 0.15
 def setting_by_tree(
     scene: Scene, goals: Mapping[str, Goal], via: Sequence[Point] = ()
 ) -> Generator[None, None, Outcome]:
-    """Place bodies one after the other, with up to `_ATTEMPTS` each; carry each body along `via`."""
+    """Place bodies one after the other, with up to `_ATTEMPTS` attempts each; carry each along `via`."""
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
     tree = composites.Sequence("set", memory=True, children=tasks)
