@@ -42,7 +42,7 @@ class Reason:
 
     @classmethod
     def from_text(cls, text: str) -> Reason:
-        """Parse a reason from its text in a log, which `str` returns."""
+        """Parse a reason from its text in a log, the result of `str`."""
         kind, _, detail = text.partition(" (")
         return cls(kind, detail.removesuffix(")"))
 

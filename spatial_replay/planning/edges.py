@@ -73,7 +73,7 @@ class Demand(NamedTuple):
 
 
 def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bool], ...]]:
-    """Return conjunctions of atoms of which each implies a formula, or its negation if not `wanted`."""
+    """Return alternatives that imply a formula, or its negation if not `wanted`, as conjunctions of atoms."""
     formula = expand(formula)
     match formula:
         case Truth():
@@ -100,7 +100,9 @@ def _conjoin(
 ) -> list[tuple[tuple[Formula, bool], ...]]:
     combined: list[tuple[tuple[Formula, bool], ...]] = [()]
     for part in parts:
+        # cut at each step, because the number of products grows exponentially
         combined = [(*left, *right) for left, right in product(combined, part)][:MOST_ALTERNATIVES]
+    # without duplicate literals, and without contradictions
     unique = (dict.fromkeys(conjunction) for conjunction in combined)
     return [
         tuple(literals)
@@ -280,7 +282,7 @@ def refuse_template(specification: Specification, name: str) -> None:
 
 
 def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
-    """Return the names of the innermost specs in a formula that contain each proposition."""
+    """Return, for each proposition, the names of the innermost specs in a formula that contain it."""
     parts = {
         spec.name: list(iter_formulas(spec))[1:] for spec in list(iter_formulas(formula))[1:] if spec.name
     }
@@ -429,7 +431,7 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
 def moved_later(
     path: Sequence[Transition], symbol: Symbol, formulas: Sequence[Formula], names: Iterable[str]
 ) -> frozenset[str]:
-    """Return the objects that later edges of a path, after its first edge, may require to be moved."""
+    """Return the objects that may have to be moved for the later edges of a path."""
     literals = (literal for transition in path[1:] for cube in transition.guard for literal in cube)
     unmet = {number for number, value in literals if symbol[number] is not value}
     return frozenset(name for name in names if any(concerns(formulas[number], name) for number in unmet))
@@ -498,7 +500,7 @@ class FailedMotion(NamedTuple):
 class Attempts:
     """The motions of a run, by edge.
 
-    Failures count separately for each edge and object, so that a robot that often fails can go on.
+    Failures count separately for each edge and object, so that a robot that often fails can continue.
 
     Attributes:
         motions: number of concluded motions, without refused ones.
@@ -523,6 +525,7 @@ class Attempts:
 
     def forgiven(self) -> Attempts:
         """Return these attempts with only refused motions as failures, so that other motions are repeated."""
+        # a shallow copy: both share the counts of motions
         attempts = copy(self)
         attempts._motions, attempts._places = [motion for motion in self._motions if motion.refused], {}
         return attempts
@@ -635,7 +638,7 @@ def _count_text(count: int) -> str:
 
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
-    """Return whether a sample has the scene in which a failed motion began, with no object moved."""
+    """Return whether all objects stand as before a failed motion; for a push, only nearby objects count."""
     moved_name, before = motion.target.name, motion.before
     tracked = before.objects[moved_name]
     names = list(dict.fromkeys([moved_name, *before.objects, *sample.objects]))

@@ -105,7 +105,7 @@ _MOST_STALLED: Final = 2
 _STEP: Final = 0.5
 """Cost of such a step, maps."""
 _TOWARDS: Final = (1.0 / 16.0, 1e-6)
-"""Margins of demands at places between cells, cells; the second margin is tried if the first fails."""
+"""Margins of demands at places between cells, as shares of a cell; the second is tried if the first fails."""
 _NUDGES: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 """Displacements (x, y) that measure slopes, in small steps; the first is the object's own place."""
 _OLDEST_CUTS: Final = 4
@@ -155,7 +155,7 @@ class Arranger:
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
         self._visits = 0
-        # shortfall at the centre of a cell up to which another place in the cell may meet a demand
+        # allowed shortfall of a demand at a cell's centre, because another place in the cell may meet it
         self._slack = 0.0
         self._is_placed = settings.refine and settings.skill == "place"
 
@@ -243,6 +243,7 @@ class Arranger:
             self._slack = 0.0
 
     def _over_cells(self, most: int) -> Iterator[dict[str, Pose]]:
+        # the number of a set comes before the set, so that equally good sets keep their order
         queue = [(self._hubs_in(group), len(group), n, group) for n, group in enumerate(self._bases(most))]
         heapq.heapify(queue)
         seen = {group for *_, group in queue}
@@ -279,7 +280,7 @@ class Arranger:
                         heapq.heappush(queue, (self._hubs_in(wider), len(wider), count, wider))
 
     def _bases(self, most: int) -> list[tuple[str, ...]]:
-        """Return the smallest sets of objects of which every unmet demand concerns one."""
+        """Return the smallest sets of objects that have an object of every unmet demand."""
         sets: dict[tuple[str, ...], None] = {(): None}
         for demand in self._unmet:
             wider: dict[tuple[str, ...], None] = {}
@@ -385,7 +386,9 @@ class Arranger:
         used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
         for first, second in combinations(chosen, 2):
             if (stencil := self._stencil(first, second, chosen, used)) is not None:
+                # both objects may be off the centres of their cells, so twice the slack is allowed
                 conflicts[first, second] = is_conflict = stencil < -2.0 * self._slack
+                # seen from the second object, the vector has the opposite sign
                 conflicts[second, first] = is_conflict.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
         return conflicts
 
@@ -551,6 +554,7 @@ class Arranger:
                     }
                 if stalled > _MOST_STALLED:
                     break
+                # demands that are met by far do not limit the step
                 near = met < 2.0 * size
                 normals = slopes[near].reshape(-1, places.size)
                 least = normals @ places.ravel() - met[near] + towards * size
@@ -563,6 +567,7 @@ class Arranger:
         self, sample: Sample, demands: Sequence[Demand], poses: Mapping[str, Pose], places: Floats
     ) -> tuple[Floats, Floats]:
         """Return the surplus of demands (D,) with objects at places (N, 2), and its slopes (D, N, 2)."""
+        # slopes are forward differences
         step = 1e-4 * self._grid.cell_size
         objects: dict[str, TrackedObject] = {}
         nudges: list[tuple[str, TrackedObject]] = []
@@ -733,6 +738,7 @@ class Lookahead:
             return ()
         key = state, scene.moved
         if key not in self._known:
+            # None for now, so that a search that returns to this scene and state gives up
             self._known[key] = None
             self._known[key] = self._search(scene, state)
         return self._known[key]
@@ -843,6 +849,7 @@ class Lookahead:
         """Yield conjunctions of demands that take all edges and avoid traps."""
         never = self._expected.traps(aims[0].source)
         safety_demands: list[Demand] = []
+        # slightly more than the margin, so that rounding does not leave a constraint at it
         least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
         for cube in never:
             if len(cube) == 1:
@@ -970,7 +977,7 @@ class Lookahead:
         return self._needing(self._hopeless_literals)
 
     def _needing(self, literals: Collection[tuple[int, bool]]) -> frozenset[Edge]:
-        """Return the edges that need one of these literals in every cube."""
+        """Return the edges whose guards need one of these literals in every cube."""
         if not self._automaton.is_listable:
             return frozenset()
         return frozenset(

@@ -100,7 +100,7 @@ def _contour(values: Floats, margin: float) -> Floats:
 
 
 def _run_ends(before: Floats, after: Floats, margin: float) -> Floats:
-    """Return the row and ends (2 N, 2) of each run of columns where one of two rows reaches the margin."""
+    """Return row and ends (2 N, 2) of each run of columns where only one of two rows reaches the margin."""
     parted: Booleans = np.isfinite(before) & np.isfinite(after) & ((before >= margin) != (after >= margin))
     changes = np.diff(np.pad(parted, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     return np.argwhere(changes).astype(np.float64)
@@ -171,6 +171,7 @@ def _round_numbers(low: float, high: float) -> Iterator[float]:
     least = (high - low) / (_MOST_TICKS - 1)
     power = 10.0 ** math.floor(math.log10(least))
     step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
+    # the tolerances keep ticks at the ends in spite of rounding
     for place in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
         yield place * step
 
@@ -234,6 +235,7 @@ def _line(
     *,
     pixels: float = _PIXELS,
 ) -> LinePrimitive:
+    # scale_invariant: the thickness is in pixels (https://docs.foxglove.dev/docs/sdk/schemas/line-primitive)
     line = LinePrimitive(type=kind, thickness=pixels, scale_invariant=True)
     line.pose.position.z, line.pose.orientation.w = height, 1.0
     for x, y in points:

@@ -138,7 +138,7 @@ def gradient_map(
     margin: float = 0.0,
     after: PropositionMaps | None = None,
 ) -> GradientMap:
-    """Return the map of a progress set, with cells blocked at which the constraint set would hold.
+    """Return the map of a progress set, in which cells are blocked if the constraint set would hold.
 
     Args:
         progress: cubes of which one must hold.
@@ -268,6 +268,7 @@ def proposition_maps(
     for places in _slices(len(centres), math.prod(shape) * len(formulas)):
         posed = _trace_over_poses(trace, tracked, name, centres[places], turns)
         static = _static_distance(posed, name, workspace.obstacles).reshape(len(turns), -1)
+        # the first two rows are bounds without uncertainty
         values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
         values = values.reshape(*values.shape[:2], *static.shape)
         to_obstacles[:, :, places] = [*values[0, len(concerned) :], static]
@@ -405,7 +406,7 @@ def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[
 AVOIDED_CELLS: Final = 2.0
 """Distance of a new target from a place where a motion failed, cells."""
 MOST_LAYERS: Final = 12
-"""Maximum number of conjuncts with a layer in a log, varying ones first; the log only names the others."""
+"""Maximum number of conjuncts with a layer in a log, varying ones first; a log names all conjuncts."""
 MOST_CAUSES: Final = 1000
 """Maximum number of listed causes; cells with a further cause refer to the last listed one."""
 
@@ -568,6 +569,7 @@ def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floa
 def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
     """Return the causes that block cells, and the index of each cell's cause."""
     maps, blocked = gradient.made_of.now, gradient.blocked
+    # kind and number of a cause as one integer, so that np.unique counts causes
     codes = np.full(blocked.shape, -1, np.int64)
     for reason, family in _KIND_OF.items():
         codes[blocked == reason] = family * _NUMBERS

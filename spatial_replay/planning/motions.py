@@ -70,7 +70,7 @@ _MOST_NAMED: Final = 2
 _LONGEST_NAME: Final = 60
 """Maximum length of such a constraint, characters."""
 _DIGITS: Final = 9
-"""Number of decimal places at which lengths and robustness are compared."""
+"""Number of decimal places to which lengths and robustness are rounded for comparisons."""
 
 
 @dataclass(eq=False)
@@ -188,6 +188,7 @@ class Movables:
             gradient = gradient_map(
                 now, progress, constraints, settings.workspace, settings.constraint_margin, after
             )
+            # places that later motions of other objects occupy
             gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
             return gradient, np.minimum(now.room(room_from), after.room(room_from))
 
@@ -559,6 +560,7 @@ class MotionOrder:
     def _next_state(self, scene: PredictedState, state: int, is_first: bool) -> int:
         """Return the state after a motion; `_LOST` or `_ASTRAY` if it is not on the path."""
         aim, is_strict = self.aims[0].target, is_first or len(self.aims) == 1
+        # later samples repeat the scene, and may take further transitions
         for _ in range(len(self.aims)):
             states = self.expected.states_after(scene, state)
             (after,) = states if len(states) == 1 else (_LOST,)
@@ -651,7 +653,7 @@ class MotionOrder:
         parked: tuple[str, ...],
         is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
-        """Yield motions that park objects on the path of an object, or at its place."""
+        """Yield motions that park the objects that block the path or the place of an object."""
         constraints, settings = self._constraints_at(state, is_first), self.expected.settings
         names = [movable for movable in self.expected.movables(scene).names if movable != name]
         names = [movable for movable in names if movable in left or movable not in {*parked, *self.places}]
@@ -684,7 +686,7 @@ class MotionOrder:
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
     ) -> TrackedObject | None:
-        """Return the area that an object covers on its path, without regard to `others`."""
+        """Return an object with the area that it covers on its path, without regard to `others`."""
         settings, tracked = self.expected.settings, scene.sample.objects[name]
         place = self._place_of(scene, name)
         if settings.skill == "place":
@@ -740,7 +742,7 @@ class MotionOrder:
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
     ) -> tuple[Booleans, PropositionMaps]:
-        """Return the cells (A, rows, columns) where an object is clear without a constraint, and its maps."""
+        """Return in which cells (A, rows, columns) an object is clear and keeps constraints, and its maps."""
         settings = self.expected.settings
         maps = proposition_maps(formulas, self.expected.regions, sample, name, settings.workspace, grid)
         is_kept = danger_of(maps, constraints) < -settings.constraint_margin

@@ -34,7 +34,10 @@ from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Sample, Trace
 
 AHEAD: Final = 90
-"""Minimum number of predicted samples."""
+"""Minimum number of predicted samples.
+
+With only 30 samples, ten of about 80 simulated runs past a person were violated.
+"""
 MOST_AHEAD: Final = 600
 """Maximum number of predicted samples, for long motions."""
 _BEGINNINGS: Final = 15
@@ -44,7 +47,7 @@ _MOST_BEGINNINGS: Final = 9
 _CORNER: Final = math.radians(2.0)
 """Least change of direction at which a pushing robot takes hold again, radians."""
 _UNSURE: Final = 2
-"""Maximum deviation of an object from its prediction, in its motions per sample; it may have turned back."""
+"""Maximum deviation of an object from its predicted course, in steps of a sample; it may turn back."""
 _JITTER: Final = 1.0 / 30.0
 """Motion between two samples up to which an object counts as standing, cells."""
 _DIRECTIONS: Final = 16
@@ -89,7 +92,7 @@ def _advance(tracked: TrackedObject, motion: Pose) -> TrackedObject:
 
 
 def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: Skill) -> TrackedObject:
-    """Return the moved object one sample later, at most at its target unless it strays from its path."""
+    """Return the moved object one sample later; it stops at its target unless it strays from its path."""
     turned = 0.0
     if target.turn and target.yaw is not None and tracked.yaw is not None:
         left = math.remainder(target.yaw - tracked.yaw, math.tau)
@@ -99,12 +102,13 @@ def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: 
     if length == 0.0:
         return moved_object(tracked, x, y, turned) if turned else tracked
     before = x - motion[0], y - motion[1]
+    # more than half of its motion leads away from the path
     strays = _beside_way(target.waypoints, (x, y)) - _beside_way(target.waypoints, before) > length / 2.0
     if strays:
         return moved_object(tracked, x + motion[0], y + motion[1], turned)
     if skill == "push" or len(target.waypoints) > 2:
         return moved_object(tracked, *_place_on_way(target.waypoints, (x, y), length), turned)
-    # the robot chose the path, so only its end is known
+    # the robot chooses the path, so only its end is known
     share = min(1.0, math.dist((x, y), target.waypoints[-1]) / length)
     return moved_object(tracked, x + share * motion[0], y + share * motion[1], turned)
 
@@ -140,7 +144,7 @@ def _beside_way(waypoints: Sequence[tuple[float, float]], place: tuple[float, fl
 def _nearest_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float]
 ) -> tuple[float, tuple[float, float]]:
-    """Return the point of a path nearest to a place, after its distance from the start along the path."""
+    """Return the point of a path nearest to a place, preceded by its distance along the path."""
     begin, nearest, at = 0.0, math.inf, (0.0, place)
     for (u, v), (x, y) in pairwise(waypoints):
         whole = math.dist((u, v), (x, y))
@@ -244,7 +248,7 @@ class Prospect(NamedTuple):
 
 
 class Evasion(NamedTuple):
-    """The evasion of other objects by an object.
+    """A decision on how an object evades others.
 
     Attributes:
         aside: target of a motion aside; None if the object stays.
@@ -296,6 +300,7 @@ class Lookout:
         going = Prospect(*map(min, zip(*prospects, strict=True)))
         if going.perhaps == math.inf:
             return None
+        # tuples compare `perhaps` first, then `surely`
         best = max(going, staying)
         aside: Target | None = None
         if best.perhaps < math.inf:
@@ -344,7 +349,7 @@ class Lookout:
         return replace(target, waypoints=(*direct.waypoints[:-1], (target.x, target.y)))
 
     def _others(self, motions: Mapping[str, Pose], target: Target) -> dict[str, Pose]:
-        """Return the motions of all other objects that do not stand."""
+        """Return the motions of all other moving objects."""
         least = least_motion(self._settings)
         return {
             name: motion
@@ -378,7 +383,7 @@ class Lookout:
         numbers: Sequence[int],
         ways: Sequence[Floats],
     ) -> list[Prospect]:
-        """Return the prospect of each path (N, 2), which has the places of an object in predicted samples.
+        """Return the prospect of each path, which is given as places (N, 2) in the predicted samples.
 
         Args:
             motions: motions of the other objects between two samples.
@@ -386,6 +391,7 @@ class Lookout:
         """
         if not ways:
             return []
+        # measured positions count as certain; only predictions of others are uncertain
         certain = {who: replace(tracked, uncertainty=0.0) for who, tracked in sample.objects.items()}
         courses = {who: _course_ahead(certain[who], motion, numbers) for who, motion in motions.items()}
         courses[name] = Course(np.concatenate(ways))

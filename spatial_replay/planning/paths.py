@@ -101,6 +101,7 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
     directions = np.zeros((8, 2), np.int64)
     first = start_row * columns + start_column
     straight[first] = 0
+    # the number of the cell breaks ties, so that equal inputs give equal paths
     queue = [(_at_least(start_row, start_column, box), np.int64(first))]
     while len(queue) > 0:
         current = heapq.heappop(queue)[1]

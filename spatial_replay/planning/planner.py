@@ -207,8 +207,9 @@ class Planner:
         """The reason why a motion must stop now; empty while it may continue.
 
         A motion must stop if the predicted next sample loses acceptance. In this sample every object repeats
-        its motion between the newest two samples, and the moved object stays within its path. A motion must
-        also stop if a moving object may come too near before its end, and waiting or a motion aside is safer.
+        its motion between the newest two samples, but the moved object stops at the end of its path. A
+        motion must also stop if a moving object may come too near before its end, and waiting or a motion aside
+        is safer.
         A robot that checks after each sample ends the motion with `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
@@ -229,8 +230,8 @@ class Planner:
 
         Raises:
             TraceError: its time is not after the previous sample's time.
-            UsageError: not a sample, or a first sample with objects missing that the settings name, or a
-                first sample without objects if there are no settings.
+            UsageError: not a sample; at the first sample, settings that name unknown objects, or neither
+                settings nor objects.
         """
         require_sample(sample)
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
@@ -603,7 +604,7 @@ def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
 
 
 MOST_YIELDED: Final = 1800
-"""Maximum number of samples and motions aside that motions spend on moving objects without a success.
+"""Maximum number of waiting samples and motions aside without a successful motion; then motions do not wait.
 
 In a minute at 30 Hz, a person who walks two metres to and fro at 0.1 m/s leaves the path free.
 """

@@ -243,7 +243,7 @@ def is_number(value: object) -> bool:
 
 
 def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
-    """Return a sentence for each value, by name, that is not a finite number of at least `least`."""
+    """Return a fault for each value, by name, that is not a finite number of at least `least`."""
     expected = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
     return [
         f"{name} is {value!r}; give {expected}"
@@ -253,7 +253,7 @@ def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[s
 
 
 def count_faults(values: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each value, by name, that is not a whole number of at least 1."""
+    """Return a fault for each value, by name, that is not a whole number of at least 1."""
     return [
         f"{name} is {value!r}; give a whole number of at least 1"
         for name, value in values.items()
@@ -262,14 +262,14 @@ def count_faults(values: Mapping[str, Any]) -> list[str]:
 
 
 def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
-    """Return a sentence if a value is not of a type."""
+    """Return a fault if a value is not of a type."""
     return [] if isinstance(value, kind) else [f"{name} is {value!r}; give {wanted}"]
 
 
 def member_faults(
     name: str, members: Collection[Any], collection: type, member: type, wanted: str
 ) -> list[str]:
-    """Return sentences if a value is not a collection, or has members that are not of a type."""
+    """Return faults if a value is not a collection, or has members that are not of a type."""
     return kind_faults(name, members, collection, wanted) or [
         f"{name} has {value!r}; give {wanted}" for value in members if not isinstance(value, member)
     ]
@@ -332,6 +332,7 @@ class Settings:
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
         if self.skill == "push" and self.workspace.yaws and not self.workspace.keeps_yaw:
+            # the dataclass is frozen
             object.__setattr__(self, "workspace", replace(self.workspace, keeps_yaw=True))
 
     def _faults(self) -> Iterator[str]:

@@ -86,12 +86,13 @@ def find_target(
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
-        # cells a finger's width from failed targets or, if there are none, cells with another pose
+        # cells at least a finger's width from failed targets; without any, cells with other poses than these
         for apart in (_spread(settings), _SAME * _cell(settings)):
             untried = good & ~tried_poses(gradient, failures, apart)
             if untried.any():
                 good = untried
                 break
+        # after failures, the cells with the most room count if no cell has the preferred room
         least_room = min(settings.room, float(room[good].max())) if failures else settings.room
         roomy = good & (room >= least_room)
         values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
@@ -256,6 +257,7 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
             (), about.regions, about.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
         ).clearance[0, 0, 0]
         > workspace.clearance
+        # the first point is where the object is already
         for x, y in points[1:]
     )
 
@@ -405,8 +407,8 @@ def refine_target(
     """Return the most robust target near a target, or the target itself.
 
     This is a compass search: each step takes the best of 5 x 5 places around the newest place, in up to three
-    turns. If no place is better, the spacing is halved. All places are free. If the target has the preferred
-    room, they have it too.
+    turns. If no place is better, the spacing is halved. Only free places count. If the target has the
+    preferred room, only places with this room count.
 
     Args:
         tracked: object before the motion.
@@ -430,6 +432,7 @@ def refine_target(
             tuple((tracked.yaw or 0.0) + turn + offset for offset in turns) if settings.workspace.yaws else ()
         )
         gradient, room = measure(Grid(*low, spacing, 5, 5), yaws)
+        # other places need the preferred room only if the target itself has it
         if number == 0:
             middle = len(gradient.turns) // 2, 2, 2
             least = settings.room if room[middle] >= settings.room else -math.inf
@@ -486,6 +489,7 @@ def _cell(settings: Settings) -> float:
 def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, settings: Settings) -> Booleans:
     """Return whether each pose is within the permitted distance of a target, (A, rows, columns)."""
     offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
+    # with a tolerance, because places of grids are rounded
     near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
     turned = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (1.0 + 1e-9)
     return np.asarray(turned[:, None, None] & near.reshape(gradient.grid.shape))
@@ -508,9 +512,11 @@ def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
     The dual problem is solved by accelerated projected gradients.
     """
     gram, missing = normals @ normals.T, least - normals @ point
+    # the largest eigenvalue bounds the curvature, so its inverse is a safe step
     rate = 1.0 / max(float(np.linalg.norm(gram, 2)), 1e-12)
     weights = ahead = np.zeros(len(least))
     for number in range(400):
+        # Nesterov's momentum, in its common form k / (k + 3)
         newest = np.maximum(ahead + rate * (missing - gram @ ahead), 0.0)
         weights, ahead = newest, newest + number / (number + 3.0) * (newest - weights)
     return np.asarray(point + normals.T @ weights)
