@@ -59,7 +59,7 @@ class Diagrams:
         self._numbers: dict[Decision, int] = {}
         self._chosen: dict[tuple[int, int, int], int] = {}
         self._limit = limit
-        # so that they are nodes `NO` and `YES`
+        # the constants come first, so that their nodes are `NO` and `YES`
         self.leaf(0), self.leaf(1)
 
     def __len__(self) -> int:

@@ -197,7 +197,7 @@ class Skeleton:
         self._written = {id(node) for node in _temporal(formula)}
         self._operator: Formula | None = None
         self._unrolled: Formula | None = None
-        # so that they have the numbers `FALSE` and `TRUE`
+        # the constants come first, so that their numbers are `FALSE` and `TRUE`
         self._node("false"), self._node("true")
         self.root = self._of(formula, True)
 

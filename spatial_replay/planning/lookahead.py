@@ -1012,8 +1012,7 @@ class Lookahead:
     def why_not(self, state: int) -> str:
         """Return the infeasible condition of every path to acceptance, and the objects in the way.
 
-        Without such a condition, return the objects with places but without an order of motions; "" without
-        these.
+        If there is no such condition, return a sentence on objects for whose motions no order was found, or "".
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
@@ -1042,7 +1041,7 @@ class Lookahead:
         return f"{what}: {'; '.join(filter(None, said))}"
 
     def _why_impossible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> str:
-        """Return why no arrangement meets demands, or that none was found; "" if one was found."""
+        """Return "" if an arrangement meets demands, or else why none does, or that none was found."""
         about = Arranger(sample, self._regions, self._settings, demands, budget)
         why = about.why_hopeless()
         arrangement = None if why else next(about.arrangements(self._settings.motions), None)

@@ -228,7 +228,7 @@ class Movables:
             path = shortest_path(reached & (danger < -distance), grid.cell(*start), goals)
             if path is not None:
                 turns = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
-                # a path of two waypoints would leave the path to the robot, so a straight path has a middle
+                # a straight path gets a third waypoint, because two would leave the path to the robot
                 middle = ((start[0] + end[0]) / 2.0, (start[1] + end[1]) / 2.0)
                 return replace(target, waypoints=(start, *(turns or [middle]), end))
         # the reason names the constraints that the shortest path crosses

@@ -208,9 +208,9 @@ class Planner:
 
         A motion must stop if the predicted next sample loses acceptance. In this sample every object repeats
         its motion between the newest two samples, but the moved object stops at the end of its path. A
-        motion must also stop if a moving object may come too near before its end, and waiting or a motion aside
-        is safer.
-        A robot that checks after each sample ends the motion with `Outcome(False, planner.stop_reason)`.
+        motion must also stop if a moving object may come too near before its end, and waiting or a motion
+        aside is safer. A robot that checks after each sample ends the motion with
+        `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 
