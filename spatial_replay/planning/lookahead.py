@@ -1012,7 +1012,7 @@ class Lookahead:
     def why_not(self, state: int) -> str:
         """Return the infeasible condition of every path to acceptance, and the objects in the way.
 
-        If there is no such condition, return a sentence on objects for whose motions no order was found, or "".
+        Without such a condition, return a sentence on objects for whose motions no order was found, or "".
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
