@@ -600,7 +600,7 @@ class _Silences:
         self._others_begin_ns: int | None = None
         # times of the sampled topic: the last two before the next samples, and all later ones
         self._past_ns = self._times_ns = np.empty(0, np.int64)
-        # whether fallback topics are sampled after each of these times; the last element: before the first
+        # whether fallback topics are sampled after each of these times; the last flag is for before the first
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None

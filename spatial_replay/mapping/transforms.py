@@ -536,7 +536,7 @@ class FrameTree:
             turn = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
 
-        # lags at which a pose and a later one may be of the same publisher, with other poses between them
+        # two poses of one publisher may have poses of other publishers between them
         lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
         aside = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
         usual = min(float(np.quantile(distances, 0.3)) for distances in aside.values())
