@@ -178,9 +178,11 @@ class Departures:
         cells = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
         # a stand-in replaces each member in its samples, so that one call measures all members
         rows = np.column_stack([rows[cells], rows])
+        # without its own column, a member is not in the group that it is compared with
         rows[cells[0], cells[1] + 1] = ABSENT
         stand_in = replace(
             trace,
+            # rows repeat samples in any order, and times of a trace have to increase
             times_ns=np.arange(len(rows), dtype=np.int64),
             names=(_STAND_IN, *trace.names),
             rows=rows,
@@ -283,11 +285,13 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
     present_terms = {part.term for part in iter_parts(formula) if isinstance(part, Present)}
     for node, quantifiers in iter_bound(formula):
         distances = list(_distances_of(node)) if isinstance(node, Atom) else []
+        # an atom of several distances has no threshold for one of them
         if not isinstance(node, Atom) or len(distances) != 1:
             continue
         groups = {variable: scope.group for scope in quantifiers for variable in scope.variables}
         terms = distances[0].first, distances[0].second
         limits = (abs(limit) for limit in node.parameters if isinstance(limit, float))
+        # enlarged terms meet at the sum of their radii
         threshold = max(limits, default=0.0) + sum(map(_enlargement, terms))
         first, second = (_with_group(_without_enlargement(term), groups) for term in terms)
         for member, reference in ((first, second), (second, first)):

@@ -89,6 +89,7 @@ def doubts_of_instances(
     Args:
         traces: iterates over the samples; called only if there are doubts and groups of a class.
     """
+    # without doubts, the samples are not read again
     if all(doubt.is_accepted for doubt in doubts):
         return [()] * len(instances)
     needs_by_instance = [needs_of_spec(instance.spec, instance.object) for instance in instances]

@@ -54,6 +54,7 @@ class Needs:
                 elif kind == "all":
                     classes.add(ANY_CLASS)
                 else:
+                    # the name of an object may contain a colon
                     objects.add(kind if not name else f"{kind}:{name}")
         return cls(frozenset(objects), frozenset(signals), frozenset(name.casefold() for name in classes))
 
@@ -68,6 +69,7 @@ class Needs:
         A live run cannot know later objects, but it has to begin where a replay of its log begins.
         """
         patterns = {span.pattern for span in spans}
+        # the pattern of a topic with one fixed object is the escaped name
         fixed = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
         unseen = self.objects - fixed.keys()
         return [span for span in spans if span.pattern in fixed.values() or self._is_needed(span, unseen)]
@@ -134,6 +136,7 @@ class RunEnds:
 
         One trace is returned for each added trace, perhaps later, without the samples left out.
         """
+        # evaluation has begun, and no end is searched: nothing has to be recorded
         if self.begin_ns is not None and not self._end and not self.late:
             return [trace]
         if len(trace):
@@ -253,7 +256,7 @@ class RunEnds:
                 yield span
 
     def _open_since_ns(self) -> int:
-        """Return the earliest time from which a needed topic may have ended; FOREVER if none may have."""
+        """Return the time from which a needed topic may have ended, the earliest of them; else FOREVER."""
         return min((self._since_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
 
     def _release(self, before_ns: int) -> list[Trace]:

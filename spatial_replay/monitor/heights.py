@@ -110,12 +110,14 @@ def _samples_with_one_above(trace: Trace, specification: Specification) -> Integ
     batch = trace.footprints
     if not len(batch.bottom) or np.isnan(batch.bottom).all():
         return np.empty(0, np.int64)
+    # absent objects read the appended infinities, which decide no extremum
     rows = np.where(trace.rows >= 0, trace.rows, len(batch.bottom))
     heights = [outline.height for outline in specification.regions.values() if outline.height is not None]
     highest = np.append(np.where(np.isnan(batch.bottom), -np.inf, batch.bottom), -np.inf)[rows].max(axis=1)
     lowest = np.append(np.where(np.isnan(batch.top), np.inf, batch.top), np.inf)[rows].min(axis=1)
     highest = np.maximum(highest, max((bottom for bottom, _ in heights), default=-np.inf))
     lowest = np.minimum(lowest, min((top for _, top in heights), default=np.inf))
+    # if the highest bottom is above the lowest top, an object is above another
     return np.flatnonzero(highest > lowest)
 
 

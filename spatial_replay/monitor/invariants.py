@@ -162,6 +162,7 @@ def _intervals_of(
     is_asked = np.zeros(len(nodes.times_ns), np.bool_)
     is_asked[begins[0] : ends[0]] = True
     low, high = nodes.judged_ends(invariant.operand)
+    # `not F p` is `G not p`, so the robustness of p is negated
     robustness = high if invariant.end is End.HIGH else -low
     runs = _Runs.of(is_asked & (robustness < 0.0))
     intervals, worst = [], []
@@ -175,6 +176,7 @@ def _intervals_of(
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
     condition_runs = _Runs.of(is_asked & (nodes.ends(invariant.condition)[0] >= 0.0))
+    # the number of starts up to a violation identifies the interval of the condition
     missed = np.unique(np.searchsorted(condition_runs.starts, runs.starts, side="right"))
     condition = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
     entries = len(condition_runs.starts), len(missed)
@@ -199,6 +201,7 @@ def _with_atoms(
     deciding_samples = [
         path.steps[-1].sample for path in (*paths, *response_paths, *condition_paths) if path is not None
     ]
+    # one pass over the log for all samples
     scene_at = evidence.scenes(set(nodes.times_ns[deciding_samples].tolist())).__getitem__
     for interval, path, condition_path in zip(intervals, paths, condition_paths, strict=True):
         deciding = atom_of_path(evidence, nodes, path, scene_at)

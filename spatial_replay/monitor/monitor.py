@@ -305,10 +305,12 @@ class Monitor:
         self._monitored = Monitored(
             tuple(zip(self._specs, node_names, self._units, strict=True)), _places_of_names(node_names)
         )
+        # the two semantics have different kernels to compile
         task = "paper" if checked == "paper" else "monitor"
         compiled.start(task, partial(_run_trial, specification, checked), wait=wait)
         first_ns = start_ns or 0
         self._begin = partial(LiveStream, specification, checked, first_ns)
+        # no violation is permanent under the paper's semantics
         self._remember: Callable[[], ViolationLog | None] = lambda: None
         if checked == "ltlf":
             self._remember = partial(ViolationLog, specification, first_ns, declared_units)
@@ -334,6 +336,7 @@ class Monitor:
         for index, final in enumerate(self._live.finals):
             if final is None or final_verdict(*final[0]) is not Verdict.UNKNOWN:
                 self._unknown.pop(index, None)
+            # later samples cannot say why the result became unknown
             elif index not in self._unknown:
                 self._unknown[index] = self._violations.unknown(self._specs[index])
 
@@ -403,6 +406,7 @@ class Monitor:
                 f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
+        # the same tuple comes back until a name arrives, so identity suffices
         if remarks is not self._settlement.remarks:
             self._settlement = self._settlement._replace(remarks=remarks)
         self._last_ns = time_ns
@@ -471,6 +475,7 @@ class _AwaitedNames:
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         missing = len(self._objects) + len(self._signals)
+        # an object with unknown position has come as well
         objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
         self._learn(
             objects,
@@ -814,6 +819,7 @@ class ViolationLog:
             if upper < 0.0:
                 conjuncts.remove(conjunct)
                 newly_violated = self._verdict_with_samples(spec, conjunct, Verdict.VIOLATED, upper)
+                # a new tuple, because earlier updates keep the old one
                 self.settled = (*self.settled, newly_violated)
 
     def _verdict_with_samples(

@@ -74,7 +74,7 @@ def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
 
 @piece
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: Steps) -> None:
-    """Run an unbounded once, historically or since."""
+    """Run an unbounded O, H or S."""
     value = np.inf if code == codes.HISTORICALLY else -np.inf
     for i in range(steps.length):
         k = _at(steps, i)
@@ -86,7 +86,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
 ) -> None:
-    """Write to each step the value of the latest step at least `distance` back; `missing` without one."""
+    """Delay a column by `distance`: each step gets the value of the latest step that far back."""
     back = -1
     for i in range(steps.length):
         while back < i and _distance(steps, unit, back + 1, i) >= distance:
@@ -237,7 +237,7 @@ class OfflineTable(SignalTable):
         for number, (code, a, b, *window) in enumerate(self._rows):
             operands = (a, b) if code == codes.LEAF else (column[a], column[b])
             rows.append((code, *operands, *window, column[number]))
-        # equal nodes share a row, but each has a column of its own
+        # equal nodes share a row, but each has its own column: `and` of a column with itself copies it
         copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
         rows += [copy for copy in copies if copy[1] != copy[-1]]
         return array_of_rows(rows, codes.OFFLINE_WIDTH)
@@ -489,6 +489,7 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
     if bound is None or bound.upper is None:
         return np.zeros(count, np.bool_)
     if bound.unit == "samples":
+        # capped, because the sum could exceed 64 bits
         return np.arange(count) + min(bound.upper, count) < count
     # Python integers: a time and a duration may add up to more than 64 bits
     span_ns = int(times_ns[-1]) - bound.upper

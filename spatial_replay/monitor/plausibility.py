@@ -333,6 +333,7 @@ def plausibility_warnings(
             message = f"no object of class {empty_class!r} is ever in this log"
             warnings.setdefault(empty_class, source.diagnostic("warning", node.span, message, hint))
     for spec in specification.results:
+        # without a rate, windows in samples count as 0 s
         reach_s, windows = _reach(spec.formula, log.rate or inf)
         name = _nesting_text(windows)
         if len(windows) > 1 and reach_s > log.seconds and name not in warnings:
@@ -398,9 +399,11 @@ def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -
     if is_length and limit < 0.0:
         # only overlapping footprints have a negative distance
         return True
+    # a limit is near if it is no further away than the range is wide, or its ends are large
     reach = max(greatest - least, abs(least), abs(greatest))
     if limit < least - reach or limit > greatest + reach:
         return True
+    # lengths and speeds are positive, so they are also compared by their ratio
     if least > 0.0 and limit > 0.0:
         return limit < least / _APART or limit > greatest * _APART
     return False

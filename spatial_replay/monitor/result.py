@@ -330,6 +330,7 @@ class SpecResult(Displayed):
     ) -> tuple[Cause, ...]:
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
+        # the name of a result may begin with the stem of its file
         named = {**self.evidence.instance.named, self.name: self.spec}
         return find_causes(
             self._conjuncts_of(node), self.values, self.final, self.settled_ns, witnesses, named
@@ -823,6 +824,7 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
+    # before trimming: sentences count time from the first sample of the log
     first_ns, needs = int(trace.times_ns[0]), Needs.of([specification], each or {})
     trace, left_out = trim_trace(trace, needs, start=not window[0], end=window[1] >= FOREVER)
     specification = with_numbers(specification, trace.units)

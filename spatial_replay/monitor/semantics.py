@@ -575,6 +575,7 @@ class PaperRun:
         samples, rows = self._position + len(times_ns), self._table.rows
         # unbounded windows only: pairs of bounded ones are counted when their samples come
         lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
+        # half of all pairs, because no end comes before its start
         self._check_pairs(int((np.maximum(samples - lows, 0) ** 2 // 2).sum()), samples)
         for t in range(0, len(times_ns), _TILE):
             count = min(_TILE, len(times_ns) - t)

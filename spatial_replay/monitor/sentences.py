@@ -326,6 +326,7 @@ def verdict_sentence(
     """
     since_parts = (", certain since ", certain_since) if certain_since is not None else ()
     part_text = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
+    # times are compared as the sentence shows them
     is_later = least_at is not None and str(least_at) != str(certain_since)
     least_parts = (", least at ", least_at) if least_at is not None and is_later else ()
     verdict_words = f"{verdict}{_ENDED if has_ended else ''}"
@@ -463,6 +464,7 @@ def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) ->
     if witness.closest is not None:
         best, best_ns = witness.closest
         measurement = measurement_clause(best, witness.units, first_ns)
+        # the response itself is the closest atom: one sentence suffices
         if (best.text, best_ns) == (missed.response, missed.time_ns):
             clause = Sentence(clause, ": ", measurement)
         else:
@@ -487,6 +489,7 @@ def _how_it_decides(
     witness: Witness, deciding: DecidingAtom, first_ns: int, *, is_open: bool = False
 ) -> Sentence:
     amount, least = deciding.value, _end(deciding)
+    # with uncertainty, the deciding end may have another sign than the value
     if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
         amount = least
     is_violated = witness.verdict is Verdict.VIOLATED and not is_open

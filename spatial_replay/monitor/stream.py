@@ -173,6 +173,7 @@ def _appearances(
             # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
+                # an object may change its class: one fitting sample suffices
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
                     fitting[parameter].add(name)
     return {parameter: {name: spans[name] for name in names} for parameter, names in fitting.items()}

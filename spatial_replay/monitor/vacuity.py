@@ -368,6 +368,7 @@ def _scopes(
     tree = nodes_with_operands(formula)
     # the verdict is the number of the root at the first sample
     scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
+    # parents precede their operands, so an entry is final when the loop reaches it
     for scope, (node, operands) in zip(scopes, tree, strict=True):
         for place, operand in enumerate(operands):
             operand_scope = scope
@@ -397,6 +398,7 @@ def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) ->
     # +1 where a window begins, -1 after its end: the running sum counts the windows over a sample
     edges = np.zeros(len(scope) + 1, np.int64)
     is_open = begin < end
+    # `add.at`, because several windows may begin or end at one sample
     np.add.at(edges, begin[is_open], 1)
     np.add.at(edges, end[is_open], -1)
     is_covered: _Samples = np.cumsum(edges[:-1]) > 0

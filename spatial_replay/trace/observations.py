@@ -204,6 +204,7 @@ def _normalise_shapes(
         return shapes, {}
     owner = np.repeat(np.arange(len(readable)), part_counts)
     # few polygons are concave, so the slow decomposition treats them one by one
+    # unreadable parts stay unknown, and parts without vertices have a fault already
     odd = np.flatnonzero((fault != SOUND) & readable[owner] & (np.diff(vertex_start) > 0))
     pieces: dict[int, Footprint] = {}
     faults: dict[int, str] = {}

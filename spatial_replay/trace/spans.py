@@ -36,6 +36,7 @@ class TopicSpan:
 
     def may_have(self, name: str) -> bool:
         """Return whether the topic may report an object of this name."""
+        # DOTALL, because a name may contain a line break
         return self.pattern is not None and re.fullmatch(self.pattern, name, re.DOTALL) is not None
 
     def join(self, later: TopicSpan) -> TopicSpan:

@@ -51,6 +51,7 @@ def require_time(value: object, name: str) -> None:
     """
     if value is None:
         return
+    # a truth value is an integer in Python
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
         raise UsageError(f"{name} is {shortened(value)}; give integer nanoseconds, 0 or more")
 
@@ -169,7 +170,7 @@ class Sample:
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
-        # a report time equal to the sample's is the default: without it, equal samples compare equal
+        # the sample's time is the default: equal samples store no report time equal to it
         others = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
@@ -430,7 +431,7 @@ class Trace(Displayed):
 
     @property
     def is_unknown(self) -> NDArray[np.bool_]:
-        """(T,), whether no object and no signal is known in each sample."""
+        """(T,), whether a sample has no known object and no known signal."""
         unknown: NDArray[np.bool_] = np.asarray((self.rows < 0).all(axis=1))
         for values in self.signals.values():
             unknown &= np.isnan(values)
@@ -644,6 +645,7 @@ class Trace(Displayed):
                 reported_ns[sample : sample + len(trace), columns] = own_ns
             sample += len(trace)
             row += len(trace.footprints)
+        # one column for each length, shared by all missing signals
         unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
         codes = (np.array([code[n] for n in trace.classes], np.int64)[trace.class_code] for trace in traces)
         return cls(
@@ -887,6 +889,7 @@ class Pauses:
     def is_regular(self) -> bool:
         """Whether there are enough intervals to determine the usual one, and few are long."""
         long = int(np.count_nonzero(self._held[1] > LONG_PAUSE * self.usual_ns))
+        # a single long interval is a pause, however short the log
         return self._count >= _FEWEST and long <= max(1, self._count // _RARE)
 
     @property
@@ -925,6 +928,7 @@ class ReportsBack:
         """Add samples that follow the previous ones."""
         before, self._last = self._last, trace if len(trace) else self._last
         if any(part.reported_ns is not None or part.signals_reported_ns for part in (before, trace)):
+            # with the last sample before, so that steps between two blocks count
             joined = Trace.concatenate([before.slice(len(before) - 1, len(before)), trace])
             if joined.reported_ns is not None:
                 for name, rows, times in zip(joined.names, joined.rows.T, joined.reported_ns.T, strict=True):

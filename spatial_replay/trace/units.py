@@ -95,7 +95,7 @@ class Axes:
 
     def convert_yaw(self, yaw: Floats) -> Floats:
         """Return angles (R,) of the source as angles of samples."""
-        # as for vertices, zero stays zero
+        # 0 - yaw rather than -yaw: zero stays zero
         return 0.0 - yaw if self.y == "down" else yaw
 
     def convert_trace(self, trace: Trace) -> Trace:
@@ -150,4 +150,5 @@ def _size(trace: Trace, name: str) -> float:
     rows = rows[rows >= 0]
     if not len(rows):
         return 0.0
+    # ceiling division, so that the rows are spread evenly and no more than the limit
     return float(np.median(trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)]).sizes))

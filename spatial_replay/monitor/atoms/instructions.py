@@ -214,6 +214,7 @@ def run_instructions(
                     for k in range(count):
                         columns[target, k] = constants[a]
                 elif op == MEASURED:
+                    # channels 2 and 3 are the low and high end with uncertainty
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
                     _copy_to(values, row, count, columns, target)
                     if sign:
@@ -222,6 +223,7 @@ def run_instructions(
                 elif op == SIGNAL:
                     for k in range(count):
                         value = signals[row + k]
+                        # a text is stored as a number up to `TEXTS`, but is none
                         columns[target, k] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
                     for k in range(count):
@@ -443,8 +445,10 @@ class LeafCode:
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER
+        # the value over no member
         row = self._constant(inf if is_forall else -inf)
         if self._groups.may_be_unknown(group):
+            # the quantifier is unknown in samples with unknown members
             row = self._row(op, row, row, self._member(group, ()))
         # permutations: different variables stand for different members
         for indices in permutations(range(len(names)), len(formula.variables)):

@@ -532,6 +532,7 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
     Returns:
         C, the number of channels in use.
     """
+    # the work space holds floats and integers in one buffer
     plan, lists = plan_at(whole), sample.view(np.int64)
     count = plan.geometric_count + plan.yaw_count
     # work space for results, operands and rows: allocating arrays would take as long as the distances

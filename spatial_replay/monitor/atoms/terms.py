@@ -346,6 +346,7 @@ class TraceScene:
         if isinstance(base, Group):
             is_open = base.members is None
             rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[samples]
+            # an absent object is no member of an open group, but makes a named group unknown
             unknown = (rows < (ABSENT if is_open else 0)).any(axis=1)
         else:
             rows = self._rows_of(base.name)[samples, None]
@@ -380,6 +381,7 @@ class TraceScene:
         is_there, stands = current >= 0, np.isnan(seconds) & (name in self.trace.lasting)
         before_rows = np.where(before < 0, ABSENT, self._rows_of(name)[before])
         rows = np.where(is_there & ~stands, _NO_REPORT, current)
+        # row -1, for samples without the object, reads the appended 0
         uncertainty = np.append(self.trace.uncertainty, 0.0)
         spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
         is_previous = is_there & (seconds == shortest)
@@ -397,11 +399,13 @@ class TraceScene:
 
     def _add_moved_rows(self, newer: Integers, older: Integers, share: Floats) -> Integers:
         """Add copies of newer rows, moved by a share of the way to older rows; return their row numbers."""
+        # the joined batch has to include the new rows
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
         moved_batch = shift_rows(
             self._whole.select(newer), (centres[older] - centres[newer]) * share[:, None]
         )
+        # interleave the moved rows with their centres
         pairs = np.arange(2 * len(newer)).reshape(2, -1).T.ravel()
         self._moved.append(FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(pairs))
         first = 2 * len(self._whole) + self._moved_count

@@ -46,7 +46,7 @@ def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
 
 @inlined
 def past_value(code: int, first: float, second: float, before: float) -> float:
-    """Return once, historically or since at a sample, from its value at the previous sample."""
+    """Return the value of an unbounded O, H or S at a sample, given its value at the previous sample."""
     if code == codes.ONCE:
         return max(first, before)
     if code == codes.HISTORICALLY:

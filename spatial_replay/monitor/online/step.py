@@ -296,9 +296,11 @@ class _OpenPart:
         head = self.state[windows.HEAD]
         head[windows.OFFSET] += drop_count
         head[windows.BASE] -= drop_count
+        # windows in seconds are recorded again for the new positions
         head[windows.ENTERED :] = 0
         head[windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
         self.state[[windows.LOWS, windows.BOUNDARY], : self._nodes] -= drop_count
+        # -1 stays: there is no state yet
         self.state[windows.STATE, : self._nodes] -= np.where(
             self.state[windows.STATE, : self._nodes] < 0, 0, drop_count
         )
@@ -520,6 +522,7 @@ class OnlineRun:
         used = self._position - self._offset
         if used + requested > self.room:
             drop_count = self._kept_from() if used else 0
+            # dropping less than half would move numbers often; the capacity doubles instead
             if 2 * drop_count >= self.room:
                 self._forget(drop_count, used - drop_count)
                 used -= drop_count
@@ -539,6 +542,7 @@ class OnlineRun:
                 first_needed = min(first_needed, last - far)
             else:
                 behind = stamps[last] - stamps
+                # a delay also reads the last sample that is further back
                 first_needed = min(first_needed, int(np.count_nonzero(behind > far)) - (code == codes.DELAY))
         for _, parts in self._open:
             for part in parts:
@@ -566,6 +570,7 @@ class OnlineRun:
         times = np.zeros((len(self._times), self.room + RING), np.int64)
         times[0, :old_room] = self._stamps
         for ring, grown in zip(self._times[1:], times[1:], strict=True):
+            # places in a ring are modulo the capacity, which changes
             entries = np.arange(ring[HEAD], ring[TAIL])
             grown[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
             grown[RING + entries % self.room] = ring[RING + entries % old_room]

@@ -184,6 +184,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
                 while next_begin <= position and time_ns - stamps[next_begin] >= near:
                     state[times, next_begin] = position
                     next_begin += 1
+                # far is -1 without an upper end
                 while far >= 0 and next_close < position and time_ns - stamps[next_close] > far:
                     state[times + 1, next_close] = position
                     next_close += 1
@@ -585,6 +586,7 @@ def run_windows(
                 corner = 0 if mode == codes.OPEN_LOW else corners - 1
                 columns[result_row, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
+            # columns are computed again if they lack the previous sample
             is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
             state[HEAD, KNOWN + mode] = last
             if is_fresh:
@@ -599,6 +601,7 @@ def run_windows(
                 columns[rows[root, codes.NODE_B], last],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
             )
+        # counted from the first sample of the run, so that tiles of any length absorb at the same samples
         if (state[HEAD, OFFSET] + last) % CLOSING == CLOSING - 1:
             _absorb(rows, stamps, columns, state, tables, last)
 

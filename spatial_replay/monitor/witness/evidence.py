@@ -250,6 +250,7 @@ def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_
     is_at_ends = bool(((starts == 0) | (ends > last)).all()) and not missing.all()
     window_start = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
     window_end = int(times_ns[starts[-1]]) if ends[-1] > last else None
+    # a gap at the end of the log has no sample after it
     spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last)]))
     contains_time = (spans[0] <= time_ns) & (time_ns < spans[1])
     longest = spans[:, (contains_time if contains_time.any() else np.diff(spans, axis=0)).argmax()]

@@ -285,7 +285,7 @@ class _Walk:
     def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
         """Return the least left operand so far of an until with an open window, if it decides the until.
 
-        The low end of an until never depends on later samples, so it is None for this end.
+        None for the low end, which no later sample can lower.
         """
         formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
@@ -633,6 +633,7 @@ def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) 
     if pair is None or len(present) < 3:
         return everyone
     rows = np.array([scene.resolve(TrackedName(name)).operand.rows[0, 0] for name in present])
+    # an object with unknown position may decide, too
     if (rows < 0).any():
         return everyone
     pairs = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
@@ -684,6 +685,7 @@ def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
             low, high = _intervals(scene, [_as_atom(part)])[0]
             names = tuple(map(format_term, part.terms)) or ((part.signal or part).name,)
             quantity, reports_ns = "speed" if part.terms else "rate", scene.compared_ns(part)
+            # the ends of the interval are value - spread and value + spread
             return Measured(quantity, names, (low + high) / 2, (high - low) / 2, reports_ns=reports_ns)
         case Present():
             return Measured("present", (part.term.name,), float(scene.signal(part)[0]))

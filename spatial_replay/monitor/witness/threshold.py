@@ -252,8 +252,8 @@ def threshold_of(
 ) -> Threshold | Obstacle | None:
     """Find the nearest number of the deciding atom that flips a verdict, or the reason why no number does.
 
-    A constant is varied in all its atoms. A number without a name is varied in all atoms that come from the
-    same place in the text, such as those of a macro or a quantifier over a named group.
+    A constant is varied in all its atoms. A number without a name is varied in all atoms from the same place
+    in the text: a macro, or a quantifier over a named group, creates several.
 
     Args:
         leaves: (C, A, T), leaves of the instance in each sample.
@@ -423,6 +423,7 @@ class _Search:
         return None
 
     def _size_by_rounds(self, direction: float) -> float | None:
+        # sizes double from the least change that can flip, which may be 0
         unit = max(self._least, 1e-6 * (abs(self._dial.value) + 1.0))
         sizes = [self._least, *(unit * 2.0**k for k in range(1, _DOUBLINGS))]
         for _ in range(_ROUNDS):
@@ -529,7 +530,7 @@ def _radii_in(expression: Expression) -> list[float]:
 
 
 def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
-    """Yield changes that make an atom without a number hold by a margin."""
+    """Yield changes of an atom without a number that make it ask for a margin."""
     match atom.relation, atom.expression:
         case "ovlp", _:
             yield partial(_as_distance, margin=margin)

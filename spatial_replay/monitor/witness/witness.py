@@ -361,6 +361,7 @@ def time_of_least(
     order = instance.program.leaves
     nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
     path = deciding_path(nodes, node, End.HIGH)
+    # the number depends on all samples of its path
     earliest = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
 
     def is_reached(sample: int) -> bool:
