@@ -187,8 +187,8 @@ def diff_logs(
 
     Args:
         specifications: one or several, parsed or as files; None takes the specifications in a log.
-        align: "time" since the zero of each log, the "progress" of an automaton, or the name of a spec, whose
-            first change of sign in each run is the event.
+        align: "time" since the zero of each log, "progress" of an automaton, or the name of a spec. The
+            spec's first change of sign in each run is then the event.
         output: a page to write, with both under one time cursor; its name ends in .html.
         options: options of evaluation and reading for both logs, as for `replay_log`.
 
@@ -330,8 +330,8 @@ def learn(
         reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: there are fewer than two good runs, a run is too short, runs are equal or in different
-            units, or the good runs have nothing in common.
+        UsageError: a run is too short, runs are equal or in different units, or the good runs are fewer than
+            two or have nothing in common.
         LogError: a log cannot be read.
     """
     refuse_unknown(reading, Reading.__annotations__)

@@ -187,7 +187,7 @@ def json_value(value: Any) -> Any:
 
 
 def json_fields(record: Any, *names: str) -> dict[str, Any]:
-    """Return attributes of a record for JSON, by names without "is_"; by default all its fields."""
+    """Return attributes of a record for JSON, all fields by default. Keys are names without "is_"."""
     keys = names or getattr(record, "_fields", None) or [field.name for field in fields(record)]
     return {key.removeprefix("is_"): json_value(getattr(record, key)) for key in keys}
 

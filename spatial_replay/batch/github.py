@@ -103,7 +103,7 @@ def write_summary(table: pa.Table) -> None:
     """Add the totals and the worst rows to the summary of the job, if there is one.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the summary cannot be written.
     """
     file = os.environ.get("GITHUB_STEP_SUMMARY")
     if not file:

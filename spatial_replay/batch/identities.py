@@ -154,7 +154,7 @@ def _version_at(address: str) -> str:
     """Return the identity of a log at an address.
 
     Raises:
-        UsageError, RemoteError: it cannot be read.
+        UsageError, RemoteError: the log cannot be read.
     """
     file = log_file(address)
     assert isinstance(file, RemoteFile)

@@ -269,7 +269,7 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     """Return the open log of a task and the options of its replay.
 
     Raises:
-        UsageError, LogError: it cannot be opened, or its first sample cannot be read.
+        UsageError, LogError: the log cannot be opened, or its first sample cannot be read.
     """
     conditions = task.conditions
     source = open_source(task.log, mapping=conditions.mapping, **dict(conditions.reading))

@@ -98,7 +98,7 @@ class LocalFolder:
 
     @staticmethod
     def _files(folder: Path) -> Iterator[str]:
-        """Yield the paths of all whole files in a folder and below."""
+        """Yield the paths of all files in a folder and below, without partial ones."""
         for parent, _, names in os.walk(folder):
             yield from (f"{parent}/{name}" for name in names if not name.endswith(_PARTIAL))
 
@@ -380,7 +380,7 @@ class ResultsFolder:
         """Return a writer of rows. The last rows are written when the block ends, even after an interruption.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: rows cannot be written.
         """
         rows = NewRows(self._files)
         try:
@@ -407,7 +407,7 @@ class ResultsFolder:
         """Write identities of logs by state.
 
         Raises:
-            OutputError: they cannot be written.
+            OutputError: identities cannot be written.
         """
         if self._files.is_on_this_machine:
             pa = _pyarrow()
@@ -422,7 +422,7 @@ class ResultsFolder:
         """Write the table of a run, whole or not at all.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the table cannot be written.
         """
         self._files.write(LAST_RUN, _encode_table(table))
 
@@ -431,7 +431,7 @@ class ResultsFolder:
 
         Raises:
             UsageError: no run has ended.
-            LogError: its file is damaged.
+            LogError: the file of the run is damaged.
         """
         try:
             return self._read(LAST_RUN)
@@ -464,7 +464,7 @@ class ResultsFolder:
         """Return the table of a file.
 
         Raises:
-            LogError: it is damaged.
+            LogError: the file is damaged.
         """
         try:
             return _decode_table(data)

@@ -286,7 +286,7 @@ def load_suite(path: str | PathLike[str]) -> Suite:
 
     Raises:
         MissingFileError: there is no such file.
-        UsageError: it is not UTF-8.
+        UsageError: the file is not UTF-8.
     """
     path = Path(path)
     text = read_yaml_text(path, LARGEST_SUITE)

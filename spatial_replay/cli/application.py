@@ -202,8 +202,8 @@ _AGAIN_S = 0.05
 class _Interruption(KeyboardInterrupt):
     """An interruption that can be caught everywhere.
 
-    If a plain KeyboardInterrupt passes through an `exec`, as in the definition of a dataclass, the
-    interpreter ends the process by SIGINT, even if the exception is caught later.
+    A plain KeyboardInterrupt may pass through an `exec`, as in the definition of a dataclass. The interpreter
+    then ends the process by SIGINT, even if the exception is caught.
     """
 
 

@@ -23,9 +23,7 @@ WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
 """Results that are printed without counts, at most. More results are also counted."""
 _MOST_SHOWN: Final = 20
-"""Results that are printed, at most. If there are more, the worst `_SHOWN` are printed, and the others
-counted.
-"""
+"""Results that are all printed, at most. If there are more, only the worst `_SHOWN` are printed."""
 _SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 _CHANGE_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "holds": "blue", "pending": "yellow"})

@@ -265,7 +265,7 @@ def _counting(listener: Listener, label: str, total: int | None) -> Advance:
 class _Bar:
     """A bar that appears after `PATIENCE_S`, even if no step has been done by then.
 
-    A timer shows it: the first step may take long, because kernels are compiled before it.
+    A timer shows the bar, because the first step may take long while kernels are compiled.
     """
 
     def __init__(self, label: str, total: int | None) -> None:

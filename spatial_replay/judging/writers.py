@@ -104,7 +104,7 @@ def ending_of_labels(file: Path) -> str:
     """Return the ending of a file for labels.
 
     Raises:
-        UsageError: it is not the ending of a table.
+        UsageError: the ending is not that of a table.
     """
     ending = file.suffix.lower()
     if ending not in (".parquet", ".csv"):

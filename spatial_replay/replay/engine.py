@@ -388,8 +388,8 @@ class Replay:
             advance: called with the number of samples of each block that is done.
 
         Raises:
-            LogError: no sample in the log.
-            UsageError: no sample in the window.
+            LogError: the log has no sample.
+            UsageError: the window has no sample.
             SpecificationError: names that the log never has, if names are strict.
         """
         self._is_beside = layer
@@ -687,7 +687,7 @@ def run_replay(
     Raises:
         UsageError: an option is invalid, the window has no sample, or the output is an input.
         SpecificationError: names that the log never has, if names are strict.
-        LogError: no sample in the log.
+        LogError: the log has no sample.
         OutputError: the output cannot be written.
     """
     if options.keep is None and output is not None and not layer:

@@ -610,7 +610,7 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             topics = {channel.topic for channel in walk.channels.values()} - {OBJECTS}
-            # a log of samples and derived messages only has no such messages
+            # a log of samples and derived messages has no latched messages
             if not any(map(source.is_wanted, topics)):
                 return
     for block in read_blocks(source, None, end_ns):
