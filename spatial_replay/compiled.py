@@ -399,6 +399,7 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
     }
     # a process forked during the start would keep open the pipe by which Popen notices the start
     with _process.fork_lock:
+        # -P keeps the current folder out of sys.path; in its own session, the child gets no Ctrl-C
         child = subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD, task, *sys.path],
             env=environment,
@@ -473,6 +474,7 @@ class _Kernel(Generic[_Arguments, _Result]):
             self._ready = compiled
             return result
         run = cast(Callable[..., _Result], self.interpreted_form())
+        # processor time of this thread, without the time that it waits for others
         begin = time.thread_time()
         # as in machine code, a division by zero or an overflow gives no error and no warning
         with np.errstate(all="ignore"):

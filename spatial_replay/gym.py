@@ -233,6 +233,7 @@ class _Episodes:
         self._stages = _stages(self._specification, rate_hz, is_needed=reward == "progress")
         self._objects, self._signals, self._log = objects, signals, log
         self._until, self._reward = until, reward
+        # exact for the written decimal: 29.97 is no binary fraction
         period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
         # multiplying an int takes a tenth of the time of a Fraction
         self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns
@@ -300,6 +301,7 @@ class _Episodes:
         for remark in update.remarks:
             if remark.message not in self._remarked:
                 self._remarked.add(remark.message)
+                # level 4 is the caller of `reset` or `step`
                 warnings.warn(f"{remark.message}; {remark.hint}", stacklevel=4)
         numbers = update.numbers[0]
         if numbers is None:

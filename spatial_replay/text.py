@@ -77,6 +77,7 @@ def clock_text(time_ns: int, *, with_date: bool = False) -> str:
     """Return a time as viewers show it: "19:25:04.500 UTC", or seconds on a clock of the log's own."""
     if time_ns < CALENDAR_NS:
         return f"{time_ns / 1e9:.3f} s on the log's clock"
+    # rounded before the split, so that a carry reaches the seconds
     milliseconds = round(time_ns / 10**6)
     moment = datetime.fromtimestamp(milliseconds // 1000, UTC)
     day = f"{moment:%Y-%m-%d} " if with_date else ""
@@ -261,6 +262,7 @@ TEXTS: Final = -(2.0**1000)
 def text_number(text: str) -> float:
     """Return the number that stands for a text in signals: 48 bits of its digest."""
     digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=6).digest()
+    # 48 bits are exact in a double, which has 52 after the first one
     return TEXTS * (1.0 + int.from_bytes(digest, "little") / 2**48)
 
 

@@ -281,6 +281,7 @@ def page_of(
     rows = list(document.get(rows_key) or ())
     others = {key: value for key, value in document.items() if key != rows_key}
     part = _fit(others, _OTHERS, left_off)
+    # lines and warnings are sent twice; 1,000 bytes are for the other fields
     spent = 2 * (_size(lines_here) + _size(warnings_here)) + _size(part) + 1_000
     fitting = [_fit(row, _ROW, left_off) for row in rows[first_row : first_row + 200]]
     rows_here = list(_prefix(fitting, MOST_BYTES - spent))

@@ -117,6 +117,7 @@ def _state(path: str, files: _LogFiles) -> str | None:
         states = [files.state(name) for name in names]
     except (OSError, ValueError, SpatialReplayError):
         return None
+    # with the time of change (ctime), because tools such as rsync restore the modification time
     text = json.dumps(
         [
             *([] if number is None else [number]),
@@ -126,6 +127,7 @@ def _state(path: str, files: _LogFiles) -> str | None:
             ),
         ]
     )
+    # file names that are not UTF-8 contain surrogates (PEP 383)
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 

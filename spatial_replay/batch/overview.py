@@ -286,6 +286,7 @@ def _label_cell(row: Values) -> Html:
 
 def _cell(row: Values | None) -> Html:
     if row is None:
+        # JavaScript reads 1e400 as infinity, which sorts last
         return element("td", "", **{"class": "number", "data-value": "1e400"})
     number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
     kind = f"number is-{verdict}{' fails' if fails else ''}"
@@ -296,6 +297,7 @@ def _cell(row: Values | None) -> Html:
             "td", f"{verdict}{before}", title=row["failure"] or "", **{"class": kind, "data-value": "-1e400"}
         )
     words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
+    # finite, so that errors and empty cells sort outside
     value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure'].rstrip('.')}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}."

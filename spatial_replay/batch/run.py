@@ -740,6 +740,7 @@ def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozens
     names = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
     judged = rows.select(_JUDGED).to_pylist()
+    # by identity, because the hash of a `SpecFile` covers its whole text
     lines = {id(request.file): dict(request.file.lines) for request in requests}
     meanings = {id(request.file): dict(request.file.meanings) for request in requests}
     requirements = zip(columns["requirement"].to_pylist(), requests, strict=True)

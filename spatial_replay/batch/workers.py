@@ -205,6 +205,7 @@ class DaskCluster:
         waiting: dict[Future[_Result], _Task] = {}
         is_reported = False
         with self._connection() as client:
+            # by default, Dask would give equal calls one shared result
             pool = client.get_executor(pure=False)
             try:
                 while self._hand_out(client, pool, work, rest, waiting):

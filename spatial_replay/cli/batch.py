@@ -362,6 +362,7 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     """
     from spatial_replay.batch.suite import Conditions, load_suite
 
+    # metadata.yaml belongs to a ROS 2 bag
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
     if not suites:
         return suite_of_logs(logs, given, semantics)

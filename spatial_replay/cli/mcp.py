@@ -85,6 +85,7 @@ def work(channel: Connection, call: Call) -> None:
     # plug-ins that the user allows elsewhere stay off: a specification of an agent runs no code
     os.environ.pop(PLUGINS_VARIABLE, None)
     os.chdir(call.folder)
+    # temporary files have to lie in a folder that the guard allows
     tempfile.tempdir = call.folder
     # installed before any code of the call runs
     sys.addaudithook(_guard(call.readable, is_online=call.is_online))

@@ -426,6 +426,7 @@ class _Run:
             for note in self._session.take_notes():
                 self._print(f"  {note}")
             self.show_remarks()
+            # smoothed, so that the shown rate is readable
             rate += 0.5 * ((status.samples - before.samples) / (now_s - then_s) - rate)
             before, then_s = status, now_s
             self._status.show(self._status_text(rate))

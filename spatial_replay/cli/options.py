@@ -1,4 +1,4 @@
-"""Options that several commands share, and the values that commands get from them."""
+"""Options that several commands share, and their values."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ _Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 @dataclass(frozen=True, slots=True)
 class ServingArguments:
-    """Where a server of viewers listens, and who may connect besides those of this machine."""
+    """Address of a server for viewers, and web pages that may connect."""
 
     host: str
     port: int
     origins: tuple[str, ...]
 
     def warn_of_access(self, what: str) -> None:
-        """Say what is open to whom, when other machines can reach the server."""
+        """Warn of the access that other machines have, if they can reach the server."""
         # imported here so that --help stays fast
         from spatial_replay.serve.relay import is_loopback
 
@@ -55,11 +55,11 @@ class ServingArguments:
 
 
 def serving_options(port: int, only_with: str = "") -> _Option:
-    """Add the options of a server of viewers; the command takes them as `serving`.
+    """Add the options of a server for viewers. The command receives them as `serving`.
 
     Args:
-        port: the default.
-        only_with: what the help of each begins with: "With --serve: ".
+        port: default port.
+        only_with: beginning of each help text: "With --serve: ".
     """
 
     def help_of(text: str) -> str:
@@ -94,7 +94,7 @@ def serving_options(port: int, only_with: str = "") -> _Option:
 
 
 class JsonCommand(click.Command):
-    """A command that prints JSON with `--json`, and with `--json -` as those that write it to a file."""
+    """A command that prints JSON with `--json`. Like commands that write a file, it accepts `--json -`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         pairs = pairwise(["", *args])
@@ -120,7 +120,7 @@ def _output_file(context: click.Context, parameter: click.Parameter, path: Path 
 
 
 def _log_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-    """Return a path to write a log to; the name of a file of another kind is refused."""
+    """Return the path of a log to write, and refuse endings of other kinds of files."""
     from spatial_replay.logs.output_file import refuse_ending
 
     if path is not None:
@@ -225,7 +225,7 @@ allow_option = click.option(
 
 
 def _allow_plugins(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> None:
-    """Allow plug-ins until the command ends, also to the processes that it starts."""
+    """Allow plug-ins until the command ends, also in the processes that it starts."""
     if not names:
         return
     # imported here so that --help stays fast
@@ -249,11 +249,11 @@ plugin_option = click.option(
 
 
 def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command that gets several options together, as one argument.
+    """Return a command that receives several options as one argument.
 
     Args:
-        name: of that argument.
-        values: a class whose annotated fields are the options' names.
+        name: name of the argument.
+        values: class of the argument; its annotated fields are the options' names.
     """
 
     @wraps(command)
@@ -319,7 +319,7 @@ _READING = (
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that say how to read a log; the command takes the given ones as `reading`."""
+    """Add the options of reading a log. The command receives the given ones as `reading`."""
 
     @wraps(command)
     def gathering(*, read: dict[str, object], mapping: LogFile | None, **arguments: Any) -> Any:
@@ -350,7 +350,7 @@ class EvaluationArguments(ConditionArguments):
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The files that are read."""
+        """The input files."""
         return input_files(self.log, *self.specs, reading=self.reading)
 
 
@@ -398,7 +398,7 @@ _CONDITIONS = (
 
 
 def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add LOG and the options that say what to evaluate; the command takes them as `request`."""
+    """Add LOG and the options of an evaluation. The command receives them as `request`."""
     log = click.argument("log", type=LogPath())
     specs = specs_option("Specification; repeat for several.  [default: those in the log]")
     gathering = reading_options(gather("request", EvaluationArguments, command))
@@ -406,7 +406,7 @@ def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that say what to evaluate over many logs; the command takes them as `conditions`."""
+    """Add the options of an evaluation of many logs. The command receives them as `conditions`."""
     specs = specs_option("Specification file; repeat for several.")
     gathering = reading_options(gather("conditions", ConditionArguments, command))
     return add_options((specs, *_CONDITIONS), gathering)
@@ -423,7 +423,7 @@ class EvaluationInputs:
     strict_names: bool
 
     def options(self, semantics: Semantics = "ltlf", keep: tuple[str, ...] = ()) -> ReplayOptions:
-        """Return how the specifications are evaluated over the log, and what a copy of it keeps."""
+        """Return the options of the evaluation, with the messages that a copy of the log keeps."""
         from spatial_replay.replay.selection import ReplayOptions
 
         return ReplayOptions(self.window, self.each, semantics, self.strict_names, keep or None)
@@ -436,10 +436,10 @@ def open_inputs(
 
     Args:
         known: the specifications, if they are loaded already.
-        can_do_without: whether a log without any specification will do.
+        can_do_without: whether a log without specifications is accepted.
 
     Raises:
-        UsageError: options that do not work.
+        UsageError: an option is invalid.
         LogError, SpecificationError: an input cannot be read.
     """
     # imported here so that --help stays fast
@@ -458,10 +458,10 @@ def open_inputs(
 
 
 def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
-    """Read `--each`: for each parameter of a template, the objects that it stands for.
+    """Return the objects for each parameter of a template, as given by `--each`.
 
     Raises:
-        UsageError: an incomplete choice, or two for one parameter.
+        UsageError: a choice is incomplete, or a parameter has two choices.
     """
     objects_by_name: dict[str, str] = {}
     for choice in choices:
@@ -496,14 +496,14 @@ def load_spec_options(
     constants: Mapping[str, float | str],
     default: Callable[[], Specification] | None = None,
 ) -> list[Specification]:
-    """Return the specifications that a command is given, with its values for their constants.
+    """Return the specifications of a command line, with its values of constants.
 
     Args:
-        default: returns what is evaluated without any, for values of its constants; None if that is nothing.
+        default: function that returns the specification for constants alone; None without one.
 
     Raises:
-        UsageError: values of constants that none of them has.
-        SpecificationError: one of them has errors.
+        UsageError: no specification has a given constant.
+        SpecificationError: a specification has errors.
     """
     # imported here so that --help stays fast
     from spatial_replay.spec.load import SpecificationText, load_specifications
@@ -520,10 +520,9 @@ def refuse_values(options: Mapping[str, object], why: str) -> None:
 
     Args:
         options: values by the names of options.
-        why: follows the name of one that is given.
+        why: rest of the message, after the name of the option.
 
-    Raises:
-        UsageError: one has a value.
+        Raises: UsageError: an option has a value.
     """
     for name, value in options.items():
         if value:
@@ -531,14 +530,14 @@ def refuse_values(options: Mapping[str, object], why: str) -> None:
 
 
 def refuse_options(context: click.Context, names: Collection[str], why: str) -> None:
-    """Refuse options that do not apply, if they stand on the command line.
+    """Refuse options that do not apply, if they are on the command line.
 
     Args:
         names: the parameters' names in Python, such as "max_gap".
         why: the rest of the message, after the name of the option.
 
     Raises:
-        UsageError: one is given.
+        UsageError: an option is given.
     """
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -547,13 +546,13 @@ def refuse_options(context: click.Context, names: Collection[str], why: str) -> 
 
 
 def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Path]) -> None:
-    """Refuse outputs that could not be written, before the work is done.
+    """Refuse outputs that cannot be written, before the work starts.
 
     Args:
         outputs: files by the names of options; None and "-" for none.
 
     Raises:
-        UsageError: one is an input, a folder, or in none; or several options name one file.
+        UsageError: an output is an input or a folder, its folder is missing, or two options name one file.
     """
     from spatial_replay.logs.output_file import refuse_inputs
 
@@ -566,10 +565,10 @@ def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Pat
 
 
 def require_choice(specification: Specification, of: str | None) -> None:
-    """Require `--result` where a specification has several results.
+    """Require `--result` if a specification has several results.
 
     Raises:
-        UsageError: it has several, and none was chosen.
+        UsageError: there are several results, and none is chosen.
     """
     if of is None and len(specification.results) > 1:
         names = ", ".join(spec.name for spec in specification.results)
@@ -577,7 +576,7 @@ def require_choice(specification: Specification, of: str | None) -> None:
 
 
 def warn_of_input(result: Replayed | Recorded) -> None:
-    """Warn of what was lost, remarkable or unreadable in a log, and of names that it never has."""
+    """Warn of losses, remarks, unreadable observations and missing names in a log."""
     warn(*result.faults, *result.remarks)
     show_diagnostics(replace(name, severity="warning") for name in result.missing)
     if result.unreadable:

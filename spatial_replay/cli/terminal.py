@@ -93,6 +93,7 @@ class StatusLine:
     def show(self, text: str) -> None:
         """Replace the line."""
         if sys.stderr.isatty():
+            # some terminals wrap a line that fills the last column
             width = shutil.get_terminal_size().columns - 1
             click.echo(f"\r\x1b[K{escape_text(text)[:width]}", nl=False, err=True)
             self._is_shown = True

@@ -152,6 +152,7 @@ def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
     try:
         with file.open("rb") as stream:
             data = stream.read(_LARGEST + 1)
+        # spreadsheets write CSV with a byte order mark
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UsageError(f"{file} is not UTF-8; save it as that") from None

@@ -104,6 +104,7 @@ def _power(count: int, won: int, lost: int, pairs: int) -> float:
 def _critical(differing: Integers) -> Integers:
     """Return the greatest number of wins of the losing side that still decides; -1 for none."""
     binom = _scipy().binom
+    # `ppf` is the least number whose cdf reaches the level, so it may be too large by 1
     limits = binom.ppf(SIGNIFICANCE / 2.0, differing, 0.5)
     is_above = binom.cdf(limits, differing, 0.5) > SIGNIFICANCE / 2.0
     return np.asarray(np.where(is_above, limits - 1, limits), int)

@@ -581,6 +581,7 @@ def dropped_samples(source: Source) -> Dropped:
     """Return the dropped samples of a recorder, and its interruption, from a log's metadata."""
     ending = dict(source.metadata()).get(ENDING, {})
     texts = [ending.get(name, "0") for name in ("samples", "dropped")]
+    # the metadata of a log may be any text; 18 digits fit into 64 bits
     written_count, count = (
         int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else 0
         for text in texts
@@ -706,6 +707,7 @@ def run_replay(
     from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
     from spatial_replay.logs.output_file import replacing
 
+    # long chunks are cheaper to write, and no one reads this log before it is complete
     with ExitStack() as stack:
         sink = stack.enter_context(
             LogWriter(stack.enter_context(replacing(output, inputs)), chunk_ns=WHOLE_CHUNK_NS)

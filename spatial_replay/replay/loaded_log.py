@@ -194,6 +194,7 @@ class MessageCursor:
 
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
     """Return the messages of each channel from a time on; if it has none, its last message before."""
+    # the first index of a channel in reversed order is its last message
     _, last = np.unique(messages.channel[::-1], return_index=True)
     is_shown = messages.log_time_ns >= time_ns
     is_shown[len(messages) - 1 - last] = True

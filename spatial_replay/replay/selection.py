@@ -584,6 +584,7 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
         kept_source = source_keeping(source, tuple(map(str, keep)))
     except (LookupError, TypeError, ValueError) as error:
         raise LogError(f"the metadata {CLIP_METADATA} of the clip cannot be read: {error}") from error
+    # the record has the time of the last sample, and a window ends before its end
     return _ClippedSource(kept_source, start_ns, end_ns + 1, _last_before(kept_source, start_ns), about)
 
 

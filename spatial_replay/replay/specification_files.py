@@ -17,6 +17,7 @@ from spatial_replay.spec.formula import Constant, Specification
 from spatial_replay.spec.load import load_specification, load_specifications
 
 _MARK: Final = b"\xef\xbb\xbf"
+"""Byte order mark of UTF-8, which some editors write."""
 _SETTLE_S: Final = 0.04
 """Time without a change of size and times after which a file counts as saved, seconds."""
 _ERROR_SETTLE_S: Final = 0.1
@@ -95,8 +96,10 @@ class SpecificationFiles:
         """
         with importing("--watch needs watchfiles", extra="live"):
             from watchfiles import watch
+        # a link and its target lie in different folders, and either may be saved
         places = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
         names = {path.name for path in places}
+        # folders are watched, because many editors replace a file instead of writing into it
         for _ in watch(
             *{path.parent for path in places},
             watch_filter=lambda change, path: Path(path).name in names,

@@ -273,6 +273,7 @@ def _csv_writer(
     try:
         yield write
     finally:
+        # otherwise the wrapper would close the stream when it is garbage-collected
         text.detach()
 
 

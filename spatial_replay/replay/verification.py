@@ -117,6 +117,7 @@ def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
     allowed_lines, names = [], {}
     for number, line in enumerate((line for line in lines if line and not line.startswith("#")), 1):
         if bare := _PUBLIC_KEY.match(line):
+            # a line of allowed_signers begins with a principal (man ssh-keygen), which bare keys lack
             names[f"key{number}"] = bare["comment"] or f"key {number} of {signers.name}"
             allowed_lines.append(f"key{number} {line}")
         else:
