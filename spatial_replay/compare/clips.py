@@ -95,8 +95,8 @@ class _Decision(NamedTuple):
     Attributes:
         verdict: verdict of the node.
         certain_ns: time of the sample that made the verdict certain, or None.
-        numbers: deciding end of the robustness, wide and nominal, for the node and for its cause. The other
-            end is left out: it may be unknown because of a sample that decides nothing.
+        numbers: deciding ends of the robustness interval and of the nominal interval, for the node and its
+            cause. The other ends are left out: a sample that decides nothing can make them unknown.
         cause: id of the part that failed first, or None.
         path: path to the deciding atom of the node over all samples.
         settled: path to the atom that settled the cause or the verdict, at that time.
@@ -181,7 +181,7 @@ class _Part:
         return self._decide(result, leaves)
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
-        """Return the leaves of a window as in its own log, in which nothing is known before its start."""
+        """Return the leaves that a log of the window alone has; nothing is known before its start."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin:end])
         samples, duration_ns, to_reports = self._reach
         if self._trace is None or not self._reach:
@@ -221,7 +221,7 @@ class _Part:
 
 
 def _deciding_numbers(done: OfflineNodes, node: int) -> tuple[float, ...]:
-    """Return the deciding end of a node's interval, wide and nominal; nothing if the verdict is open."""
+    """Return the deciding ends of a node's interval and nominal interval; none if the verdict is open."""
     end = End.of(final_verdict(*done.interval(node)))
     if end is End.OPEN:
         return ()

@@ -54,7 +54,7 @@ from spatial_replay.spec.walks import (
 def unify_regions(
     formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
 ) -> tuple[list[Formula], dict[str, Outline]]:
-    """Rename regions in formulas whose names have other shapes in `others`; texts of atoms do not change.
+    """Rename regions in formulas if `others` has other shapes under their names; texts do not change.
 
     Returns:
         The formulas, and the regions of both sides by name.
@@ -206,6 +206,7 @@ class TextVersions:
         one_words, other_words = (
             [tuple(line.place.text.partition("#")[0].split()) for line in lines] for lines in (old, new)
         )
+        # autojunk would ignore frequent lines of long texts (https://docs.python.org/3/library/difflib.html)
         codes = SequenceMatcher(None, one_words, other_words, autojunk=False).get_opcodes()
         blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
         return _edited_places(

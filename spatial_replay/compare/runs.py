@@ -277,7 +277,7 @@ def file_of(files: Sequence[Specification], result: SpecResult) -> Specification
     as_evaluated = [with_numbers(file, result.evidence.units) for file in files]
     pairs = [(file, spec.formula) for file in as_evaluated for spec in file.specs]
     same = (file for file, formula in pairs if formula is result.formula)
-    # a specification parsed by another profile is evaluated in its logged form, an equal but different object
+    # an equal formula counts, too: a specification of another profile is parsed again in its logged form
     equal = (file for file, formula in pairs if formula == result.formula)
     return next(same, None) or next(equal, None)
 

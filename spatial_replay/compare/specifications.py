@@ -67,6 +67,7 @@ class EditOutcome(NamedTuple):
         """Return whether two outcomes have the same verdict and, unless `verdict_only`, the same numbers."""
         if verdict_only:
             return self.verdict is other.verdict
+        # NaN, which is not equal to itself, counts as equal to NaN
         pairs = zip(self[1:], other[1:], strict=True)
         return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in pairs)
 
@@ -148,7 +149,7 @@ def find_cause(
 
 
 def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Return a subset of parts for which a condition holds; it must hold for all parts.
+    """Return a minimal subset of parts for which a condition holds; it must hold for the full set.
 
     No single part of the subset can be left out. The method is delta debugging, which removes larger pieces
     first (Zeller and Hildebrandt 2002, https://doi.org/10.1109/32.988498).
@@ -169,7 +170,7 @@ def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> li
 
 
 class FirstDifference(NamedTuple):
-    """First sample with different values of a result, and both values; NaN is not determined."""
+    """First sample with different values of a result, and both values; NaN if not determined."""
 
     time_ns: int
     old: float
@@ -600,7 +601,7 @@ def _spec_diff(
     units = find_cause(tree, outcomes, before, after)
 
     def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
-        """Return the outcome with only one edit, or with all others; None if no text has just these edits."""
+        """Return the outcome with only one edit, or with all other edits; None if no text has just these."""
         changes: Sequence[int] = range(len(versions.changes))
         if edit.change is not None:
             changes = (versions.changes.index(edit.change),)

@@ -646,7 +646,7 @@ class _Queue(Generic[_Result]):
         return self._waiting.popleft()
 
     def take(self, task: _Task, run: SearchedRun) -> None:
-        """Receive the run of a task; runs are written in the order of the tasks, not of their ends."""
+        """Receive the run of a task, and write finished runs in the order of their tasks."""
         self._arrived[task.number] = run
         while self._unwritten and self._unwritten[0].number in self._arrived:
             self._known.add(self._arrived.pop(self._unwritten.popleft().number))

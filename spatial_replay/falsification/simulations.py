@@ -40,7 +40,7 @@ Range: TypeAlias = tuple[float, float]
 TENTHS: Final = 10
 """Parts of a range, in each of which runs are counted."""
 _DIGITS: Final = 6
-"""Decimal digits of values relative to the width of the range, for ranges without their own resolution."""
+"""Digits of a value relative to the width of its range, if the range has no resolution of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class Space:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups in the order of reduction: mishaps, numbers, starts; no seed is smaller than another."""
+        """The groups in the order of reduction: mishaps, numbers, starts; seeds cannot be reduced."""
         places = sorted(self.ordered, key=lambda parameter: (parameter.unit != "s", parameter.rest is None))
         return tuple(dict.fromkeys(parameter.group for parameter in places))
 
@@ -437,7 +437,7 @@ class ScenarioRuns:
                     raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
                 span = duration_ns_from_text(begin) / 1e9, duration_ns_from_text(end) / 1e9
         except UsageError as error:
-            # the time of the trial, 1 s, would only confuse
+            # the message omits the time of the trial, 1 s, which the user did not write
             why = str(error).removeprefix(f"{kind}@1s: ")
             raise UsageError(f"--vary {kind}@{when}: {why}") from None
         if colon:

@@ -197,7 +197,7 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
-    """Return the constant of a measurement between regions, which never move; a quantity if it is unknown."""
+    """Return a measurement between regions as a constant, as they never move; as a quantity if unknown."""
     (value,) = _numbers_of([measurement], regions)
     return Linear(((measurement, Fraction(1)),)) if value is None else Linear((), value)
 
@@ -346,7 +346,7 @@ class Fact(NamedTuple):
     alone: bool | None = None
 
     def inequality(self, value: bool, label: int) -> Inequality:
-        """Return the inequality that holds where the fact has a value; conflicts identify it by its label."""
+        """Return the inequality of the fact (`value` is True) or of its negation, with a label."""
         rises = (self.side != "<=") == value
         is_strict = self.side == ">" or not value
         sign = -1 if rises else 1
@@ -497,7 +497,8 @@ def is_negated(text: str) -> bool:
 
 
 def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
-    """Return the condition `linear >= 0` as factors, a threshold, and whether that is a lower limit."""
+    """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether it is a lower limit."""
+    # divided by the first factor, so that 2 x >= 2 and x >= 1 are one fact
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
     return weights, -linear.constant / factor, factor > 0

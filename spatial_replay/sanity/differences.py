@@ -143,6 +143,7 @@ def distinguish(first: Specification, second: Specification, *, rate_hz: float |
         if distinction.relation not in ("same", "unknown"):
             return distinction
         distinctions.append(distinction)
+    # an undecided rate leaves the whole comparison undecided
     *_, last = sorted(distinctions, key=lambda distinction: distinction.relation == "unknown")
     return replace(last, rates_hz=tuple(rate for rate in rates if rate is not None))
 

@@ -364,6 +364,7 @@ class _Examiner:
     def _antecedents(self, part: NamedSpec) -> None:
         satisfying = self._reading(part).satisfying
         nodes = (node for _, _, node in iter_nodes(part.formula))
+        # by place, because expanded macros and quantifiers repeat an implication
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }

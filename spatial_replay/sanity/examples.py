@@ -188,6 +188,7 @@ def placements(
     unit = _unit(setting, facts)
     turns = [_turns(setting, sample_facts) for sample_facts in facts]
     places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
+    # margins and sizes in units: easy to see at first, then less so
     for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
         attempt = _Attempt(setting, unit, margin * unit, spread)
         required: list[Inequality] = list(attempt.sizes())
@@ -268,7 +269,7 @@ class _Attempt:
         if len(quantities) == 1:
             return self._relation(quantities[0], rises, bound, index)
         if len(quantities) == 2 and fact.weights[1][1] == -1:
-            # a difference of distances keeps a bound if a middle value separates the two distances
+            # d1 - d2 >= bound follows from d1 >= middle + bound and d2 <= middle
             return [
                 [*first_way, *second_way]
                 for middle in (0.0, self._unit, 3.0 * self._unit)

@@ -156,13 +156,13 @@ class _Runs:
         )
 
     def without(self, node: int, word: Sequence[Cube]) -> int:
-        """Return the runs of a diagram that contain a word nowhere."""
+        """Return the runs of a diagram without those that contain a word."""
         for first in range(self._length - len(word) + 1):
             node = self.diagrams.both(node, self.clause(word, first))
         return node
 
     def split(self, cube: Cube) -> tuple[Cube, ...]:
-        """Return the cubes of the samples from a cube over all samples."""
+        """Split a cube over all samples into the cubes of single samples."""
         word: tuple[Cube, ...] = tuple({} for _ in range(self._length))
         for variable, value in cube.items():
             fact, index = divmod(variable, self._length)
@@ -230,7 +230,7 @@ def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
 
 
 def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
-    """Return whether the facts of a cube make a condition true, whatever the values of other facts."""
+    """Return whether a condition is true for all values of the facts that are not in a cube."""
     waiting, visited = [node], {node}
     while waiting:
         current = waiting.pop()
@@ -280,7 +280,7 @@ MAX_SHORT: Final = 12
 """Longest run that is searched for without a product, samples."""
 
 _ON_ONE_LEVEL: Final = "no gap in height"
-"""Text of the condition under which an exclusion holds, if objects above each other are no exclusion."""
+"""Text that is added to an exclusion that does not hold for objects above each other."""
 
 MAX_PAIRS: Final = 200
 """Most pairs of automata that are tested for excluding each other."""
@@ -402,9 +402,9 @@ class WordSearch:
         return None
 
     def _refine(self, sides: Sequence[Side]) -> Answer:
-        """Return the answer for all sides from answers for few sides.
+        """Return the answer for all sides by questions about few of them.
 
-        A side that disagrees with the run of the few sides joins them.
+        A side that disagrees with the run of these few sides is added to them.
         """
         pairs = combinations(sides, 2) if len(sides) > 2 else ()
         for pair in islice(pairs, MAX_PAIRS):
@@ -447,7 +447,7 @@ class WordSearch:
         return [self._conditions.of(proposition.formula) for proposition in automaton.propositions]
 
     def _conflicts(self, cube: Cube) -> list[Cube]:
-        """Return a minimal combination of facts that geometry excludes, for each part of a cube with one."""
+        """Return minimal excluded combinations of facts, at most one for each independent part of a cube."""
         return list(filter(None, map(self._conflict, self._parts(cube))))
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
@@ -650,7 +650,7 @@ class WordSearch:
         return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
-        """Return the exclusions between facts of the automata; else those with at least one such fact."""
+        """Return the exclusions between facts of the automata or, without any, those with one such fact."""
         facts = self._read(sides)
         about = [(exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions]
         within = [exclusion for exclusion, read in about if facts >= read]
@@ -807,11 +807,11 @@ def _loosely(specification: Specification, name: str, formula: Formula, *, posit
 
 
 def loosen(formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, loose: bool = True) -> Formula:
-    """Return a formula without past operators and bounds that a formula implies.
+    """Return a looser formula, without past operators and bounds; the given formula implies it.
 
     Args:
         bounds: bounds to drop, those in seconds or all.
-        loose: whether the formula implies the result; if not, the result implies the formula.
+        loose: whether the result is looser; if not, it is stricter and implies the given formula.
     """
     if not any(_is_obstacle(part, bounds) for part in iter_formulas(formula)):
         return formula

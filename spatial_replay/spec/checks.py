@@ -232,6 +232,7 @@ def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterato
                 warned.add(atom.span)
                 message = f"`{atom.text}` hardly ever holds: its robustness is at most 0"
                 *names, _, limit = atom.parameters
+                # 12 digits, because 0.1 + 0.05 would be written as 0.15000000000000002
                 low, high = (float(f"{float(limit) + by:.12g}") for by in (-0.05, 0.05))
                 band = format_relation(atom.relation, atom.terms, (*names, low, "<=", "<=", high))
                 hint = f"write a band, such as {band}"
@@ -276,7 +277,7 @@ def object_names(specification: Specification) -> tuple[str, ...]:
 
 
 def group_classes(specification: Specification) -> tuple[str, ...]:
-    """Return the classes of open groups in text order; `ANY_CLASS` is the group of all objects."""
+    """Return the classes of open groups in text order; `ANY_CLASS` stands for all objects."""
     terms: list[Term] = []
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):

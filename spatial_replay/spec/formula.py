@@ -193,7 +193,7 @@ class Measurement(_Arithmetic):
     @property
     @abstractmethod
     def extrema(self) -> tuple[Side, ...]:
-        """Minimum or maximum over the members of each term, if it is a group; the first term is outermost."""
+        """Extreme over the members of each term, if it is a group; that of the first term is taken last."""
 
     @property
     def radius_effects(self) -> tuple[int, ...]:
@@ -644,7 +644,7 @@ _LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyTyp
         "R": ("with", "given"),
     }
 )
-"""Operators that skip samples or members without a rate, one for each operand."""
+"""Internal operators that skip samples or members without a rate, by operator: one for each operand."""
 
 
 def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
@@ -671,7 +671,7 @@ def judged_operator(formula: Temporal) -> Temporal:
 
 
 def rate_conditions(formula: Formula) -> list[Formula]:
-    """Return one condition for each rate in a formula: it has a value in the samples in which it is read.
+    """Return one condition for each rate in a formula: the rate has a value in the sample that is read.
 
     Rates inside an operator that skips samples itself have no condition. Conditions hold before the first
     and after the last sample, where there is no sample to skip.

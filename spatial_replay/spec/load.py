@@ -117,7 +117,7 @@ _AXES: tuple[str, ...] = get_args(Axis)
 
 
 def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...]:
-    """Return the parameters of a relation in square brackets: those after its terms.
+    """Return the parameters after the terms of a relation; a text has them in square brackets.
 
     Raises:
         UsageError: the function has too few parameters, or some that are not positional.
@@ -715,6 +715,7 @@ def parse_specification(
         text = _constant_writer(text, filename, names)(constants)
     faults = Faults(SourceText.of(text, filename))
     for name, place in used_modules(text).items():
+        # a name that is similar to a profile is reported as a misspelt profile later
         if name not in plugins and not nearest_hint(name, PROFILES):
             message = f"{name!r} is neither a profile ({', '.join(PROFILES)}) nor an allowed plug-in"
             hint = (

@@ -430,6 +430,7 @@ def _step(token: Token, before: Sequence[Token], brackets: list[tuple[Token, boo
         brackets.append((token, bool(before) and before[-1].type in ("PREFIX", "INFIX")))
         return True
     if token.type in ("RPAR", "RSQB") and brackets:
+        # after the window of a temporal operator, its operand may be on the next line
         opened, after_temporal = brackets.pop()
         return after_temporal and opened.type == "LSQB"
     return token.type in BINARY_TYPES or token.type in ("PREFIX", "NOT", "EQUAL", "COLON")

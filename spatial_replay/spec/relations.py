@@ -253,6 +253,7 @@ RELATION_NAMES: frozenset[str] = frozenset(_PAPER)
 
 PLUGINS_VARIABLE = "SPATIAL_REPLAY_PLUGINS"
 """Environment variable with the plug-ins of `--plugin`, separated as in PATH; child processes inherit it."""
+# a pattern instead of tokens, because tokens depend on the relations of plug-ins
 _USED = re.compile(r'^[ \t]*use[ \t]+"?([A-Za-z_][\w.]*)"?[ \t]*(?:#.*)?$', re.MULTILINE | re.ASCII)
 
 

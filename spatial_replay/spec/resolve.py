@@ -237,6 +237,7 @@ class Namespace:
 
     def _add_scale(self, statement: ScaleStatement) -> None:
         name, fault_count = statement.name, self.faults.count
+        # a signal with the name "lengths" is written in quotes
         signal = None if name.text == LENGTHS and not name.is_quoted else name.text
         divisor = self.plain_number(statement.value)
         defined = self.definitions.get(name.text)

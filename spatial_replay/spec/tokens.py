@@ -130,7 +130,7 @@ _AT_TIMES: Mapping[str, str] = MappingProxyType(
         **{"after": "G[{0}, inf]", "from": "G[{0}, inf]", "at": "F[{0}, {0}]"},
     }
 )
-"""Operator with its window by English preposition; {0} is the time."""
+"""Temporal operators by English preposition; {0} is the time after the preposition."""
 _ORDERING: Mapping[str, str] = MappingProxyType(
     {
         "at": "both in one sample: F (p and q); at the end of a log: F (p and WX false)",
@@ -140,13 +140,13 @@ _ORDERING: Mapping[str, str] = MappingProxyType(
         "by": "a margin is a part of an object: a leftof enlarge(b, 0.1)",
     }
 )
-"""Remedy by word between two formulas, for words without a single equivalent operator."""
+"""Remedies by word between two formulas, for words that no single operator replaces."""
 SAMPLES: Mapping[str, str] = MappingProxyType(
     {
         **{"tt": "true", "ff": "false", "last": "WX false", "ftp": "not Y true"},
     }
 )
-"""Formula by word of other tools, in lower case."""
+"""Formulas that are words in other tools, by the word in lower case."""
 _QUANTIFYING: Mapping[str, str] = MappingProxyType(
     {**dict.fromkeys(("for", "all", "every", "each"), "forall"), **dict.fromkeys(("any", "some"), "exists")}
 )
@@ -533,7 +533,7 @@ def _numbers(tokens: Sequence[Token]) -> list[str]:
 
 
 def _argument(tokens: Sequence[Token], start: int) -> str:
-    """Return the text from a position to the closing bracket, in brackets."""
+    """Return the text of arguments in brackets; `start` is the position after the opening bracket."""
     depth, end = 1, start
     while end < len(tokens) and depth:
         depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
@@ -620,6 +620,7 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
     }
 )
 
+# foreign signs come before the signs that they begin with, such as <=> before <=
 _TOKEN = re.compile(
     r"""
       (?P<line>\r\n|\r|\n)

@@ -254,7 +254,7 @@ def named_members(group: Group) -> tuple[str, ...]:
 
 
 def is_spatial(formula: Formula) -> bool:
-    """Return whether a formula depends on one sample: it has no temporal operator."""
+    """Return whether a formula has no temporal operator."""
     return not any(isinstance(part, Temporal) for part in iter_formulas(formula))
 
 
@@ -288,7 +288,7 @@ def other_names(formula: Formula) -> frozenset[str]:
 
 
 def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
-    """Return the signs with which an operand's robustness can be that of its node: 1, -1 or both.
+    """Return the possible signs of an operand's robustness in that of its node: 1, -1 or both.
 
     Args:
         operand: index of the operand.
@@ -320,6 +320,7 @@ def horizon_ns(formula: Formula) -> float:
     if not isinstance(formula, Temporal) or formula.operator not in FUTURE_OPERATORS:
         return longest_ns
     bound = formula.bound
+    # a window in samples has no fixed duration
     if bound is None or bound.upper is None or bound.unit != "ns":
         return inf
     return longest_ns + bound.upper

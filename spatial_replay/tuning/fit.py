@@ -259,6 +259,7 @@ class FittedLimits:
         """
         values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
         lowest = values.min(axis=-1)
+        # unknown values are infinite, and inf - inf is NaN, which `valid` excludes
         with np.errstate(invalid="ignore"):
             spread = values.max(axis=-1) - lowest
             margins = np.maximum(_MARGIN * spread / (len(good) - 1), _FINEST * np.abs(lowest))
@@ -322,7 +323,7 @@ class FittedLimits:
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """For each quantity, indices of the same quantity of members of its class; empty without a class."""
+        """Indices of quantities: for each quantity of a class, those of the class members; else empty."""
         classes = members_of(self.good[0].trace)
         numbers = {
             (quantity.relation, parties): index
@@ -414,7 +415,7 @@ class FittedLimits:
         return [self.fact(FINALLY, direction, index) for direction, index in where[order].tolist()]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
-        """Return the first sample in which each relation certainly holds, and may hold, (F, R) each."""
+        """Return the first samples in which relations certainly hold, and may hold, (F, R) each."""
         first_times = [
             [
                 [run.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for run in runs]

@@ -42,7 +42,7 @@ _LEAST_BITS_NEAR: Final = 1.5
 """Least information of a line, bits: in general, and for lines such as "always near" or "always inside"."""
 _ALIKE: Final = 1.25
 _ALIKE_ALWAYS: Final = 2.0
-"""Greatest ratio of members' limits for which one line of the class replaces theirs: at the end, with `G`."""
+"""Greatest ratio of similar limits of a class's members: in lines about the end, and in lines with `G`."""
 _NEXT_LINE: Final = 0.6
 """Factor of the weight of a line for each earlier line with the same object."""
 _LEAST_GAIN: Final = 0.25
@@ -136,7 +136,7 @@ def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
 
 
 def _goals(fit: FittedLimits) -> list[Line]:
-    """Return lines about the end of good runs: a distance for each object, and changed relations."""
+    """Return lines about the end of good runs: a distance for each object, and relations that changed."""
     scored: list[tuple[float, int, Line]] = []
     joined, placed = list[set[Party]](), Counter[Party]()
     pairs = set()
@@ -189,7 +189,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
 
 
 def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
-    """Return whether a relation at the end holds in the first sample of no good run."""
+    """Return whether no good run begins with a relation that holds at the end."""
     return bool(max(run.first[0, 1, index] for run in fit.good) < fit.limits[FINALLY, 0, index])
 
 
@@ -221,9 +221,9 @@ def _centre(fit: FittedLimits) -> Party | None:
 
 
 def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centre: Party | None) -> bool:
-    """Return whether a distance from a landmark adds to the place of a moved object; count it if so.
+    """Return whether a distance from a landmark helps to define the place of a moved object, and count it.
 
-    An object has at most `_DISTANCES` of them, and always the distance from the centre.
+    An object needs at most `_DISTANCES` of them. The distance from the centre is always used.
     """
     moved = [party for party in quantity.parties if party not in fit.landmarks]
     if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
@@ -269,7 +269,10 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 
 
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
-    """Yield weighted distances at the end; the weight is nearness with landmarks, else precision of place."""
+    """Yield distances at the end as weight and index.
+
+    With landmarks, the weight is nearness; otherwise it says how well a distance defines a place.
+    """
     for index, quantity in enumerate(fit.quantities):
         far, near = fit.limits[FINALLY, :, index]
         if quantity.relation != "dist" or not near < 0.0 or not fit.moves[index]:

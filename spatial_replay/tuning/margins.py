@@ -342,6 +342,7 @@ def _sign(difference: float) -> Direction:
 def _of_formula(before: Formula, after: Formula) -> Direction | None:
     if before == after:
         return 0
+    # these operators rise with an operand in some samples, and fall with it in others
     if isinstance(before, Boolean) and before.operator in ("xor", "<->"):
         return None
     match expand(before), expand(after):
@@ -598,7 +599,10 @@ class Margins:
         return robustness.lower if self.runs[run].is_good else -robustness.upper
 
     def holds(self, run: int, point: Point, least: float = 0.0, results: Iterable[str] | None = None) -> bool:
-        """Return whether a run has the right verdict and a margin of at least `least`; 0 satisfies."""
+        """Return whether a run has the right verdict and a margin of at least `least`.
+
+        A robustness of 0 satisfies.
+        """
         margin = self.margin(run, point, results)
         return margin >= least and (margin > 0.0 or self.runs[run].is_good or least < 0.0)
 
@@ -623,7 +627,7 @@ class Margins:
         return constant
 
     def _probe(self, constant: VariedConstant) -> dict[int, Specification]:
-        """Return the specification at five values of one constant by index; the others stay as written."""
+        """Return specifications with five values of one constant, by index of the value."""
         numbers = sorted({constant.steps * part // 4 for part in range(5)})
         return {number: self._parse({constant.name: constant.value(number)}) for number in numbers}
 

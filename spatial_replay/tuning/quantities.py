@@ -89,8 +89,8 @@ class Quantity:
 def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], list[str]]:
     """Return the quantities that all runs have, and phrases for the objects and signals that are left out.
 
-    Objects are compared by name. A class is compared as a whole, too, as in `forall a, b in class "block"`,
-    if every run has two of its objects, or if the runs do not have the same objects of the class.
+    Objects are compared by name. A class is compared as a whole, too, as in `forall a, b in class "block"`.
+    For this every run must have two of its objects, or the runs must have different objects of the class.
 
     Args:
         profile: profile of the relations.
@@ -292,7 +292,7 @@ class Observed:
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
-        """Return the first sample in which a quantity, or its negative, reaches a limit; T without one.
+        """Return the first sample in which a quantity, or its negative, reaches a limit; T if there is none.
 
         Args:
             direction: 0 for the quantity, 1 for its negative.

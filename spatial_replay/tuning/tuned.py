@@ -101,6 +101,7 @@ def evolve(
         init="sobol",
         popsize=_CANDIDATES,
         maxiter=_GENERATIONS,
+        # the cost is constant between grid points, so polishing by gradients finds nothing
         polish=False,
     )
 
@@ -108,7 +109,7 @@ def evolve(
 _MOST_EVALUATIONS: Final = 8_000
 """Most evaluations of runs for one decision or one widest margin; beyond them it is undecided."""
 _MOST_BOXES: Final = 2_000
-"""Most boxes for one margin; boxes near others cost no evaluations, which are cached."""
+"""Most boxes for one margin; neighbouring boxes share cached evaluations."""
 _LEVELS, _PRECISION = 40, 1e-3
 """Most margins that are tried for the widest one, and relative precision of the widest margin."""
 _CONTRACTION: Final = 4
@@ -154,7 +155,7 @@ class ExactSearch:
         )
 
     def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
-        """Return the point with the widest margin of some runs, if one point gives all the right verdict."""
+        """Return the point with the widest margin of the given runs, if some point fits all of them."""
         feasibility = self.decide(good, bad, 0.0)
         if feasibility.looseness is None:
             return feasibility
@@ -181,7 +182,7 @@ class ExactSearch:
         return Feasibility(best, is_proven)
 
     def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Feasibility:
-        """Return a point at which all of some runs have at least a margin, if there is one."""
+        """Return a point at which all given runs have a margin of at least `level`, if there is one."""
         numbers = list(self._steps)
         uncovered = list(bad)
         for part in self._single:
@@ -226,7 +227,7 @@ class ExactSearch:
     def _contract(
         self, runs: Sequence[int], corner: list[int], opposite: Sequence[int], level: float
     ) -> None:
-        """Move a corner of a box past numbers at which some run fails, even at the opposite corner."""
+        """Move a corner of a box past numbers that fail even with the opposite corner's other numbers."""
         for axis in self._joint.axes:
             end, limit = corner[axis], opposite[axis]
             if end == limit or self._may_fit(runs, _with(opposite, [axis], end), level):
@@ -254,7 +255,7 @@ class ExactSearch:
         return self._holds(run, _with(numbers, [axis], number), level, results)
 
     def _is_invalid(self, runs: Sequence[int], numbers: Sequence[int]) -> bool:
-        # such as a window with reversed ends; behind invalid values the verdict may be right again
+        # such as a window with reversed ends; beyond invalid values the verdict may be right again
         return self._margins.robustness(runs[0], self._point_of(numbers)) is None
 
     def _least(self, runs: Sequence[int], numbers: Sequence[int]) -> float:
@@ -295,7 +296,7 @@ class Found:
     Attributes:
         point: last point of the search.
         is_held: whether every run has the right verdict at the point.
-        conflict: runs that never all have the right verdict in the search; empty if `is_held`.
+        conflict: runs for which no common point was found; empty if `is_held`.
         is_proven: whether no point exists for the conflict; if `is_held`, whether no point is better.
         alone: runs of the conflict that have the right verdict at no point, even without the others.
     """
@@ -397,14 +398,14 @@ class Search:
         return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
 
     def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
-        """Return the runs that have the right verdict nowhere, by the loosest and the tightest point."""
+        """Return the runs that fit nowhere: good runs that fail at `loosest`, bad ones at `tightest`."""
         good = [run for run in self._good if not self._margins.holds(run, loosest)]
         return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
     def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
         """Return the least looseness at which good runs have the wider margin; `last` if there is none.
 
-        As the ends approach each other, runs without the least margin between them are dropped.
+        The interval is bisected. Runs that cannot have the least margin within it are dropped.
         """
         margin = self._margins.margin
         good, bad = self._good, self._bad
@@ -546,7 +547,7 @@ class Search:
         return best
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
-        """Return the least margins of some runs, of the good and of the bad ones; at most `_FAR` in size."""
+        """Return the least margin of all given runs, of the good and of the bad ones, limited to `_FAR`."""
         least = [_FAR, _FAR]
         for run in runs:
             side = int(not self._margins.runs[run].is_good)
