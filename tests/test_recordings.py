@@ -56,9 +56,10 @@ def test_the_decisions_of_the_planned_push_are_printed(capsys):
     assert run_in_process(["info", log, "--decisions"]) == 0
     printed = capsys.readouterr().out
     # all at once is given up; then two pushes
-    assert "3 decisions for 'push', 2 motions, 1 edge given up" in printed
+    assert "3 decisions for 'push', 2 motions" in printed
+    assert "given up: 0 -> 3: no object can do it" in printed
     assert printed.index("push red at") < printed.index("push green at")
-    assert "    green (map 0): rejected, nowhere would it hold" in printed
+    assert "    green (map 0): rejected, no place is good enough" in printed
 
 
 def test_the_script_reproduces_the_committed_files():

@@ -16,7 +16,6 @@ const SCENE = "/spatial/scene";
 const TREE = "/plan/behaviour_tree";
 /** Cells of all maps that are kept: 16 MiB. */
 const MOST_CELLS = 1 << 22;
-const MOST_GUARDS = 4;
 const OBJECT = "object/";
 /** A type of a field of cells. */
 const UINT16 = 3;
@@ -225,7 +224,7 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
     scale: values.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0),
     title: object + turned,
     chosen: Boolean(decision.target && isLast && candidate.chosen && target),
-    limits: conjuncts.map(({ text }) => printable(text)), blocks: causes.map(causeWords),
+    limits: conjuncts.map(({ text }) => printable(text)), blocks: causes.map(({ words }) => partsOf(words ?? "")),
     ...(limited && blocked ? { limited, blocked } : {}),
     ...(target ? { at_target: conjuncts.map((conjunct) => conjunct.at_target ?? null) } : {}),
     ...(room && around ? { room: around, wanted_room: room.wanted ?? 0 } : {}),
@@ -271,8 +270,8 @@ function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
       states: [...message.outcome.states],
     },
     edges: message.considered.map((edge) => ({
-      path: [...edge.path], aim: edge === last && !edge.pruned, progress: guards(edge.progress),
-      constraints: guards(edge.constraints), pruned: printable(edge.pruned),
+      path: [...edge.path], aim: edge === last && !edge.pruned, wanted: (edge.wanted ?? []).map(partsOf),
+      rules: (edge.rules ?? []).map(partsOf), pruned: printable(edge.pruned),
       later: (edge.motions ?? []).slice(1).map((motion) => `${printable(motion.object)} to ${drawnTarget(motion).words}`),
       once: edge.joint && (edge.motions?.length ?? 0) > 1 ? ` once all ${edge.motions!.length} motions are done` : "",
       candidates: edge.candidates.map((each) => ({
@@ -291,7 +290,7 @@ type Candidate = DecisionMessage["considered"][number]["candidates"][number];
 function barsOf({ conjuncts = [], causes = [], room, target }: Candidate): { cells: number; bars: DrawnBar[]; room: string } {
   const limits = conjuncts.filter((each) => each.limits).sort((a, b) => (b.limits ?? 0) - (a.limits ?? 0))
     .map((each) => ({ kind: "limited by", words: ["", printable(each.text)], cells: each.limits ?? 0 }));
-  const blocks = causes.map((each) => ({ kind: "blocked", words: causeWords(each), cells: each.cells ?? 0 }));
+  const blocks = causes.map((each) => ({ kind: "blocked", words: partsOf(each.words ?? ""), cells: each.cells ?? 0 }));
   return {
     cells: [...limits, ...blocks].reduce((sum, { cells }) => sum + cells, 0),
     bars: [...limits.slice(0, MOST_LISTED), ...blocks.slice(0, MOST_LISTED)],
@@ -300,31 +299,9 @@ function barsOf({ conjuncts = [], causes = [], room, target }: Candidate): { cel
   };
 }
 
-/** Why an object must not be in a cell: text and code, in turn; see cause_sentence in planning/decision_log.py. */
-function causeWords({ kind, text }: { readonly kind: number; readonly text: string }): string[] {
-  const words = printable(text);
-  const inner = deniedIn(words);
-  if (kind === 1) return inner ? ["", inner, " would fail"] : ["", words, " would hold"];
-  const sentences = ["", "", `${words} stands there`, "an obstacle of the workspace stands there", "the robot does not reach it",
-    "", "a motion to a place near it failed"];
-  return [sentences[kind] || "something that has to hold is unknown there"];
-}
-
-/** Returns what "not (…)" denies; nothing of a text of another form. */
-function deniedIn(text: string): string {
-  if (!text.startsWith("not (") || !text.endsWith(")")) return "";
-  const inner = text.slice(5, -1);
-  let depth = 0;
-  for (const letter of inner) {
-    depth += letter === "(" ? 1 : letter === ")" ? -1 : 0;
-    if (depth < 0) return "";
-  }
-  return inner;
-}
-
-function guards(found: readonly { readonly text: string }[]): string[] {
-  const more = found.length > MOST_GUARDS ? [`and ${found.length - MOST_GUARDS} more`] : [];
-  return [...found.slice(0, MOST_GUARDS).map((each) => printable(each.text)), ...more];
+/** Returns a sentence as text and code, in turn. */
+function partsOf(sentence: string): string[] {
+  return printable(sentence).split("`");
 }
 
 function drawnTarget(target: TargetMessage): DrawnTarget {

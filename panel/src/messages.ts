@@ -113,8 +113,9 @@ export interface DecisionMessage {
   readonly states: readonly number[];
   readonly considered: readonly {
     readonly path: readonly number[];
-    readonly progress: readonly { readonly text: string }[];
-    readonly constraints: readonly { readonly text: string }[];
+    /** Absent in logs of earlier versions, as are `words`. */
+    readonly wanted?: readonly string[];
+    readonly rules?: readonly string[];
     readonly candidates: readonly {
       readonly object: string;
       readonly best?: number;
@@ -123,7 +124,7 @@ export interface DecisionMessage {
       readonly chosen: boolean;
       readonly maps: readonly { readonly number?: number; readonly turn?: number }[];
       readonly conjuncts?: readonly { readonly text: string; readonly limits?: number; readonly at_target?: number }[];
-      readonly causes?: readonly { readonly kind: number; readonly text: string; readonly cells?: number }[];
+      readonly causes?: readonly { readonly words?: string; readonly cells?: number }[];
       readonly room?: { readonly wanted?: number; readonly possible?: number; readonly clearance?: number } | null;
     }[];
     readonly pruned: string;

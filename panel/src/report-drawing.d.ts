@@ -63,7 +63,7 @@ declare module "report-drawing" {
   }
   export interface DrawnBar { kind: string; words: string[]; cells: number }
   export interface DrawnEdge {
-    path: number[]; aim: boolean; progress: string[]; constraints: string[]; pruned: string; later: string[]; once: string;
+    path: number[]; aim: boolean; wanted: string[][]; rules: string[][]; pruned: string; later: string[]; once: string;
     candidates: {
       object: string; best: number | null; status: string; rejected: string; target: DrawnTarget | null;
       cells: number; bars: DrawnBar[]; room: string;

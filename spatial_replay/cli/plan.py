@@ -281,7 +281,7 @@ def _plan(
         )
     show(
         f"wrote {output}: {plural(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
-        f"{plural(planned.steps, 'motion')}, {plural(planned.pruned, 'edge')} given up"
+        f"{plural(planned.steps, 'motion')}"
     )
     for note in filter(None, (planned.bounds, planned.yaws)):
         show(note)

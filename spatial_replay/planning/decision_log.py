@@ -57,6 +57,7 @@ from spatial_replay.planning.decisions import (
     either,
     wait_outcome,
 )
+from spatial_replay.planning.demands import Ban, ban_of, rules_of, wanted_of
 from spatial_replay.planning.map_drawing import DEPTH, MapFrame, map_drawing, map_frame, path_message
 from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
@@ -173,8 +174,14 @@ def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
     }
 
 
-def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, settings: Settings) -> None:
-    """Add what a candidate's map is made of, what blocks its cells, and what room costs."""
+def explain(
+    message: PlanCandidate, candidate: Candidate, layers: MapLayers, settings: Settings, bans: Sequence[Ban]
+) -> None:
+    """Add to a candidate the relations of its map, the causes of blocked cells, and the cost of room.
+
+    Args:
+        bans: the constraint set of its edge.
+    """
     target = candidate.target
     free = layers.limiting[layers.blocked_by < 0]
     counts = np.bincount(free[free >= 0], minlength=len(layers.conjuncts)).tolist()
@@ -184,7 +191,8 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
         message.conjuncts.append(PlanConjunct(text=text, limits=counts[number], at_target=at_target))
     for cause in layers.causes:
         kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")
-        message.causes.append(PlanCause(kind=kind, text=cause.name, cells=cause.cells))
+        words = cause_sentence(kind, cause.name, bans)
+        message.causes.append(PlanCause(kind=kind, text=cause.name, cells=cause.cells, words=words))
     if target is not None and (cost := room_cost(candidate, target, settings)) is not None:
         room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.room)
         message.room.CopyFrom(room)
@@ -192,7 +200,7 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
 
 # -------------------------------------------------------------------------------------------------- decisions
 
-PLAN_VERSION: Final = 3
+PLAN_VERSION: Final = 4
 """Version of the messages; a log of another version cannot be recomputed."""
 
 MOST_LISTED: Final = 3
@@ -408,8 +416,11 @@ def explained_decision(
     message = decision_message(step, planner.automaton.name, first_map)
     message.margin = planner.settings.margin
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
+        bans = planner.bans(edge, step.pruned)
+        of_edge.wanted[:] = wanted_of(edge.progress.texts, bans)
+        of_edge.rules[:] = rules_of(bans)
         for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, candidate, layers[candidate], planner.settings)
+            explain(of_candidate, candidate, layers[candidate], planner.settings, bans)
     return message
 
 
@@ -493,20 +504,23 @@ def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
     is_cut = last.HasField("target") and not last.HasField("outcome")
     yield (
         f"{name}: {plural(len(decisions), 'decision')} for {last.specification!r}, "
-        f"{plural(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
-        f"{plural(len(last.pruned), 'edge')} given up"
+        f"{plural(motions, 'motion')}{' and one cut short' if is_cut else ''}"
     )
     for decision in before:
         yield from decision_lines(decision)
     yield from decision_lines(last)
     if is_cut:
         yield "  the log ends during this motion"
+    edges: dict[str, list[str]] = {}
+    for edge in last.pruned:
+        edges.setdefault(Reason.from_text(edge.reason).kind, []).append(f"{edge.source} -> {edge.target}")
+    for kind, names in edges.items():
+        yield f"given up: {', '.join(names)}: {kind}"
 
 
 def decision_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield lines about one decision."""
-    states = ", ".join(map(str, decision.states))
-    yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
+    yield _heading(decision)
     yield f"  {decision.reason}"
     if decision.considered:
         yield f"  {effort_text(decision)}"
@@ -525,29 +539,67 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
 
 def brief_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield at most five lines about one decision."""
-    states = ", ".join(map(str, decision.states))
-    head = f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
-    yield f"{head} ({effort_text(decision)}): {decision.reason}"
+    yield f"{_heading(decision)}: {decision.reason}"
     if decision.considered:
-        edge = decision.considered[-1]
-        yield f"  wanted   {_some([guard.text for guard in edge.progress])}{_ban_text(edge)}"
+        *before, edge = decision.considered
+        yield f"  wanted   {'; '.join([_either(edge.wanted), *map(plain, edge.rules)])}"
         for candidate in edge.candidates:
             if candidate.chosen:
-                rows = [f"{key} {text}" for key, text in candidate_lines(candidate)]
-                yield f"  chosen   {'; '.join([_target_text(candidate.target), *rows[:2]])}"
-        rivals = [_rival_text(candidate) for candidate in edge.candidates if not candidate.chosen]
+                yield f"  there    {_place_facts(candidate, edge, decision.margin)}"
+        rivals = [
+            *(f"path {_path(given)}: {Reason.from_text(given.pruned).kind}" for given in before),
+            *_rival_texts([candidate for candidate in edge.candidates if not candidate.chosen]),
+        ]
         if rivals:
             yield f"  instead  {'; '.join(rivals)}"
-    yield f"  {_outcome_text(decision)}" if decision.HasField("outcome") else "  no outcome"
+    if decision.HasField("outcome"):
+        yield f"  {_outcome_text(decision)}"
 
 
-def _ban_text(edge: PlanEdge) -> str:
-    """Return what must never hold on the way, and what always has to."""
-    texts = [guard.text for guard in edge.constraints]
-    always = [operand for text in texts if (operand := _operand_of_not(text))]
-    never = [text for text in texts if not _operand_of_not(text)]
-    both = " and ".join(always if len(always) == 1 else (f"({text})" for text in always))
-    return (f"; always {both}" if always else "") + (f"; never {_some(never)}" if never else "")
+def plain(sentence: str) -> str:
+    """Return a sentence for a terminal, without the backquotes around formulas."""
+    return sentence.replace("`", "")
+
+
+def _either(sentences: Sequence[str]) -> str:
+    """Return alternatives for a terminal."""
+    return _some([plain(sentence) for sentence in sentences])
+
+
+def _heading(decision: PlanDecision) -> str:
+    edge = aim_of(decision)
+    attempt = f" (attempt {edge.failed + 1})" if edge is not None and edge.failed else ""
+    states = ", ".join(map(str, decision.states))
+    return f"decision {decision.number}{attempt} at {time_text(decision.time_ns)}, state {states}"
+
+
+def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str:
+    """Return the robustness of a target, the relations that limit it, and the length of its path."""
+    target = candidate.target
+    # a negation is often one of several alternatives, and then limits nothing
+    relations = [conjunct for conjunct in candidate.conjuncts if not conjunct.text.startswith("not (")]
+    tight = sorted(
+        (conjunct for conjunct in relations if conjunct.at_target > 0.0),
+        key=lambda conjunct: conjunct.at_target,
+    )
+    facts = [f"robustness {target.robustness:.4g}{joint_suffix(edge)} ({margin:.4g} needed)"]
+    if tight:
+        second = "".join(f", then {conjunct.text} ({conjunct.at_target:.4g})" for conjunct in tight[1:2])
+        facts.append(f"tightest: {tight[0].text}{second}")
+    return "; ".join(filter(None, [*facts, f"path length {_length(target):.4g}", room_sentence(candidate)]))
+
+
+def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
+    """Yield why other objects are not moved, with those of equal reasons together."""
+    names: dict[str, list[str]] = {}
+    for candidate in candidates:
+        if candidate.rejected:
+            limits = limiting_conjuncts(candidate)[:1]
+            because = "".join(f", mostly because of {conjunct.text}" for conjunct in limits)
+            names.setdefault(f"{candidate.rejected}{because}", []).append(candidate.object)
+        else:
+            yield f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
+    yield from (f"{', '.join(objects)}: {reason}" for reason, objects in names.items())
 
 
 def effort_text(decision: PlanDecision) -> str:
@@ -557,12 +609,6 @@ def effort_text(decision: PlanDecision) -> str:
     counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
     searched = [f"{search.maps:.4g} maps", *(plural(*count) for count in counts if count[0])]
     return ", ".join([*filter(None, [attempt]), *searched])
-
-
-def _rival_text(candidate: PlanCandidate) -> str:
-    if candidate.rejected:
-        return f"{candidate.object}: {candidate.rejected}"
-    return f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
 
 
 def _outcome_text(decision: PlanDecision) -> str:
@@ -579,11 +625,11 @@ def joint_suffix(edge: PlanEdge) -> str:
 
 def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
     """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
-    path = " -> ".join(map(str, edge.path)) + (edge.order and f"; {edge.order}")
+    path = _path(edge) + (edge.order and f"; {edge.order}")
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
-    yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
-    if edge.constraints:
-        yield f"    never     {_some([guard.text for guard in edge.constraints])}"
+    yield f"    wanted      {_either(edge.wanted)}"
+    for number, rule in enumerate(edge.rules):
+        yield f"    {'' if number else 'on the way':<12}{plain(rule)}"
     for candidate in edge.candidates:
         rows = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
         # maps have numbers of their own, and may say the same
@@ -598,6 +644,10 @@ def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: b
         yield f"    planned   {', then '.join(place_text(motion) for motion in edge.motions)}"
     if edge.pruned:
         yield f"    given up: {Reason.from_text(edge.pruned).kind}"
+
+
+def _path(edge: PlanEdge) -> str:
+    return " -> ".join(map(str, edge.path))
 
 
 def _candidate_text(candidate: PlanCandidate) -> str:
@@ -662,7 +712,7 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
         )
         yield "limited by", f"{conjunct.text} in {plural(conjunct.limits, 'cell')}{at_target}"
     for cause in candidate.causes[:MOST_LISTED]:
-        yield "blocked by", f"{cause_text(cause)} in {plural(cause.cells, 'cell')}"
+        yield "blocked", f"{plural(cause.cells, 'cell')}: {plain(cause.words)}"
     if candidate.HasField("room"):
         yield "room", room_sentence(candidate)
 
@@ -678,39 +728,22 @@ def room_sentence(candidate: PlanCandidate) -> str:
     )
 
 
-def _operand_of_not(text: str) -> str:
-    """Return what `not (…)` denies; nothing of a text of another form."""
-    if not text.startswith("not (") or not text.endswith(")"):
-        return ""
-    inner = text.removeprefix("not (")[:-1]
-    depths = accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in inner)
-    return inner if min(depths, default=0) >= 0 else ""
+def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban]) -> str:
+    """Return why an object must not be in a cell, with formulas between backquotes.
 
-
-def cause_text(cause: PlanCause) -> str:
-    """Return what keeps an object out of cells."""
+    Args:
+        text: the guard that would hold, or the object that stands there.
+        bans: the constraint set that the guard is of.
+    """
+    if kind == PlanCause.KIND_CONSTRAINT:
+        return ban_of(text, bans).breach
     texts = {
-        cause.KIND_OBSTACLE: "an obstacle of the workspace",
-        cause.KIND_REACH: "the robot's reach",
-        cause.KIND_FAILED: "a motion that failed there",
+        PlanCause.KIND_OBJECT: f"{text} stands there",
+        PlanCause.KIND_OBSTACLE: "an obstacle of the workspace stands there",
+        PlanCause.KIND_REACH: "the robot does not reach it",
+        PlanCause.KIND_FAILED: "a motion to a place near it failed",
     }
-    if (operand := _operand_of_not(cause.text)) and cause.kind == cause.KIND_CONSTRAINT:
-        return f"{operand}, which would fail,"
-    return cause.text or texts.get(cause.kind, "something unknown")
-
-
-def cause_sentence(cause: PlanCause) -> str:
-    """Return why an object must not be in a cell, with formulas between backquotes."""
-    texts = {
-        cause.KIND_OBJECT: f"{cause.text} stands there",
-        cause.KIND_OBSTACLE: "an obstacle of the workspace stands there",
-        cause.KIND_REACH: "the robot does not reach it",
-        cause.KIND_FAILED: "a motion to a place near it failed",
-    }
-    if cause.kind == cause.KIND_CONSTRAINT:
-        operand = _operand_of_not(cause.text)
-        return f"`{operand}` would fail" if operand else f"`{cause.text}` would hold"
-    return texts.get(cause.kind, "something that has to hold is unknown there")
+    return texts.get(kind, "something that has to hold is unknown there")
 
 
 def kind_text(decision: PlanDecision) -> str:

@@ -339,7 +339,7 @@ def consideration_of(
         (path[0].source, path[0].target),
     )
     others = _other_edges(automaton, edge, pruned, symbol)
-    return Consideration(states, edge, _guards(automaton, path[:1]), _guards(automaton, others), ())
+    return Consideration(states, edge, guards_of(automaton, path[:1]), guards_of(automaton, others), ())
 
 
 def order_text(automaton: Automaton, path: Sequence[Transition], without: Collection[Edge]) -> str:
@@ -397,7 +397,8 @@ def _other_edges(
             yield transition
 
 
-def _guards(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
+def guards_of(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
+    """Return the guards of transitions together."""
     cubes = tuple(cube for transition in transitions for cube in transition.guard)
     texts = tuple(
         " and ".join(automaton.propositions[number].literal(value) for number, value in cube) or "true"

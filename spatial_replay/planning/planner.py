@@ -24,6 +24,7 @@ from spatial_replay.planning.decisions import (
     Step,
     Target,
 )
+from spatial_replay.planning.demands import Ban, bans_of
 from spatial_replay.planning.edges import (
     LATER,
     Attempts,
@@ -35,6 +36,7 @@ from spatial_replay.planning.edges import (
     consideration_of,
     equivalent_edges,
     groups_without_members,
+    guards_of,
     idle_transitions,
     loss_text,
     moved_later,
@@ -514,6 +516,20 @@ class Planner:
         what = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
         reason = f"{self._why(aim, target)}. {what}"
         return replace(self._decision("execute", considered, reason), target=target)
+
+    def bans(self, consideration: Consideration, pruned: Iterable[tuple[Edge, Reason]]) -> tuple[Ban, ...]:
+        """Return what must not be on the way to an edge, in few words.
+
+        Args:
+            pruned: the edges given up; what takes one of them is not told apart from what must not be.
+        """
+        source = consideration.edge[0]
+        given_up: list[str] = []
+        for edge, _ in pruned:
+            transition = self._words.transition(*edge) if edge[0] == source else None
+            if transition is not None and edge != consideration.edge and not transition.is_cut:
+                given_up += guards_of(self._words, [transition]).texts
+        return bans_of(consideration.constraints.texts, given_up)
 
     def _why(self, aim: Consideration, target: Target) -> str:
         """Return the reason why an object is moved, and why it is preferred to other objects."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from os import PathLike
@@ -47,9 +47,11 @@ from spatial_replay.planning.decision_log import (
     explained_decision,
     latest_decisions,
     maps_of,
+    plain,
     plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
+from spatial_replay.planning.demands import Ban, ban_of
 from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, changed_settings, changes_text, settings_from_text
@@ -277,7 +279,8 @@ def why_not_there(
             f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
         )
     cell = gradient.cell_of(*place, 0.0 if target is None else target.turn)
-    settings = planner_of(open_source(log)).settings
+    planner = planner_of(open_source(log))
+    settings = planner.settings
     yield (
         f"{name} at ({place[0]:g}, {place[1]:g}) for the edge {edge.edge[0]} -> {edge.edge[1]}: robustness "
         f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed "
@@ -289,24 +292,30 @@ def why_not_there(
         judgement = f"fails by {-value:.4g}" if value < 0.0 else f"holds by {value:.4g}"
         note = ", less than the margin" if 0.0 <= value < settings.margin else ""
         yield f"  {layers.conjuncts[layer]} {judgement}{note}"
+    bans = planner.bans(edge, step.pruned)
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
-    yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, settings))
+    yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, bans, settings))
     if target is not None:
         judgement = "chosen" if candidate.is_chosen else "possible"
         yield f"  {judgement} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
 
 
 def _blocking_texts(
-    gradient: GradientMap, cell: tuple[int, int, int], cause: BlockedBy | None, settings: Settings
+    gradient: GradientMap,
+    cell: tuple[int, int, int],
+    cause: BlockedBy | None,
+    bans: Sequence[Ban],
+    settings: Settings,
 ) -> Iterator[str]:
     """Yield what keeps an object out of a cell, and by how much."""
     kind = "" if cause is None else cause.kind
     if cause is not None and kind == "constraint":
         danger = danger_of(gradient.made_of.now, gradient.made_of.constraints)[cell]
-        how = (
-            f"would hold by {danger:.4g}" if danger >= 0.0 else f"would nearly hold, {-danger:.4g} is missing"
-        )
-        yield f"never allowed on the way: {cause.name} {how}"
+        breach = plain(ban_of(cause.name, bans).breach)
+        if danger >= 0.0:
+            yield f"not allowed on the way: {breach}, by {danger:.4g}"
+        else:
+            yield f"too near on the way: {breach} after {-danger:.4g} more"
     maps = gradient.made_of.now
     apart = maps.distances[(slice(None), *cell)]
     if apart.size and apart.min() <= settings.workspace.clearance:

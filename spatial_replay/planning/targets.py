@@ -340,7 +340,7 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
             return why
         about = gradient.made_of.then.about
         formulas = [about.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
-        nowhere = f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
+        nowhere = f"no place is good enough: {best:.4g} at best, {settings.margin:.4g} needed"
         return "; ".join([nowhere, *seam_texts(formulas, about.regions)])
     counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
     if counts[FREE] and has_failed:

@@ -46,7 +46,6 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
     PlanDecision,
     PlanEdge,
-    PlanGuard,
     PlanTarget,
 )
 from spatial_replay.logs.source import Source
@@ -60,7 +59,6 @@ from spatial_replay.planning.decision_log import (
     MOST_LISTED,
     aim_of,
     best_robustness,
-    cause_sentence,
     decision_from_payload,
     joint_suffix,
     kind_text,
@@ -653,7 +651,6 @@ def _entity_value(
 
 MOST_CELLS: Final = 1_500_000
 """Cells of all maps of a page together, at most; maps of chosen targets come first."""
-_MOST_GUARDS: Final = 4
 _MOST_LAYERED: Final = 50_000
 """Cells of a map of which a page says what limits and blocks them."""
 
@@ -916,7 +913,7 @@ def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, A
         "limited": packing.add(drawn.fields["limited_by"], "u2"),
         "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
         "limits": [conjunct.text for conjunct in candidate.conjuncts],
-        "blocks": [sentence_parts(cause_sentence(cause)) for cause in candidate.causes],
+        "blocks": [sentence_parts(cause.words) for cause in candidate.causes],
         "layers": layers,
     }
     if owner.target is not None:
@@ -962,8 +959,8 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
     return {
         "path": list(edge.path),
         "aim": is_aim,
-        "progress": _guard_texts(edge.progress),
-        "constraints": _guard_texts(edge.constraints),
+        "wanted": [sentence_parts(sentence) for sentence in edge.wanted],
+        "rules": [sentence_parts(sentence) for sentence in edge.rules],
         "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
         "later": [f"{motion.object} to {_target_value(motion)['words']}" for motion in edge.motions[1:]],
         "once": joint_suffix(edge),
@@ -971,15 +968,10 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
     }
 
 
-def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
-    more = [f"and {len(guards) - _MOST_GUARDS} more"] if len(guards) > _MOST_GUARDS else []
-    return [guard.text for guard in guards[:_MOST_GUARDS]] + more
-
-
 def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
     best = best_robustness(candidate)
     limits = [(conjunct.limits, ["", conjunct.text]) for conjunct in limiting_conjuncts(candidate)]
-    blocks = [(cause.cells, sentence_parts(cause_sentence(cause))) for cause in candidate.causes]
+    blocks = [(cause.cells, sentence_parts(cause.words)) for cause in candidate.causes]
     return {
         **json_fields(candidate, "object", "rejected"),
         "best": best if math.isfinite(best) else None,

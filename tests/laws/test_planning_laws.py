@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import count, pairwise
+from itertools import count, pairwise, product
 
 import numpy as np
 from hypothesis import given
@@ -15,6 +15,7 @@ from examples import examples
 from spatial_replay import Planner, Settings
 from spatial_replay.geometry.footprint import centre_of
 from spatial_replay.planning import Grid, Outcome, Workspace, moved_object
+from spatial_replay.planning.demands import bans_of
 from spatial_replay.planning.edges import MOST_MOTIONS
 from spatial_replay.planning.maps import proposition_maps
 
@@ -293,3 +294,30 @@ def test_a_pushed_object_touches_nothing_whatever_the_deadline(seed, when, goal)
     for time_ns, place in enumerate(cells):
         there = sr.Sample(time_ns, {**scene, "a": moved_object(shape, *place)})
         assert clear.update(there).node("spec").now > 0.0
+
+
+CUBES = st.lists(st.dictionaries(st.sampled_from("abcde"), st.booleans(), min_size=1), max_size=6)
+
+
+def text_of(cube: dict[str, bool]) -> str:
+    return " and ".join(name if value else f"not {name}" for name, value in cube.items())
+
+
+ROWS = [dict(zip("abcde", values, strict=True)) for values in product([False, True], repeat=5)]
+
+
+@given(CUBES, CUBES)
+@examples(40)
+def test_bans_forbid_the_constraint_set_and_at_most_guards_that_were_given_up(guards, given_up):
+    def is_any(cubes, row):
+        return any(all(row[name] is value for name, value in cube.items()) for cube in cubes)
+
+    bans = bans_of([text_of(cube) for cube in guards], [text_of(cube) for cube in given_up])
+    cubes = [dict.fromkeys(ban.holding, True) | dict.fromkeys(ban.failing, False) for ban in bans]
+    for row in ROWS:
+        assert is_any(guards, row) <= is_any(cubes, row) <= is_any([*guards, *given_up], row)
+    for cube in cubes:
+        for name in cube:
+            # without the literal it would forbid more
+            shorter = {rest: value for rest, value in cube.items() if rest != name}
+            assert any(is_any([shorter], row) > is_any([*guards, *given_up], row) for row in ROWS)

@@ -108,7 +108,7 @@ def test_a_step_draws_a_map_for_each_object_and_edge():
 def test_a_page_of_a_step_shows_the_decision():
     (step, *_), _ = run(Planner(sr.parse_specification(PUSHING), PUSH), BLOCKS)
     text = shown(step)
-    for word in ("step 0 at ", step.target.name, "given up: no object can do it", "chosen"):
+    for word in ("decision 0 at ", step.target.name, "given up: no object can do it", "chosen"):
         assert word in text
 
 

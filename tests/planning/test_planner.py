@@ -219,7 +219,7 @@ def test_an_impossible_task_ends_with_the_reasons_for_pruned_edges():
     assert steps[0].reason.startswith("no path left")
     ((edge, reason),) = steps[0].pruned
     assert edge == (0, 1)
-    assert "cup: nowhere would it hold" in reason.detail
+    assert "cup: no place is good enough" in reason.detail
 
 
 def test_a_violated_specification_has_no_path():

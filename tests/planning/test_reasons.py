@@ -18,6 +18,7 @@ from spatial_replay.planning import (
     read_decisions,
     read_steps,
 )
+from spatial_replay.planning.demands import ban_of, bans_of, rules_of, wanted_of
 
 AREA = Workspace(Grid.over(0, 0, 1, 1, 0.02))
 
@@ -96,7 +97,8 @@ def test_a_decision_reports_its_attempts_and_what_it_searched(tmp_path):
     first, second = read_decisions(log).decisions
     assert [decision.considered[-1].failed for decision in (first, second)] == [0, 1]
     effort = f"attempt 2, {step.search.maps:.4g} maps, "
-    assert effort in call("info", log, "--decisions", 1)[0]
+    assert any(effort in line for line in call("info", log, "--decisions"))
+    assert call("info", log, "--decisions", 1)[0].startswith("decision 1 (attempt 2) at ")
     assert effort in call("plan", "--why", log, "--step", 1, "--object", "a", "--at", "0.5,0.5")[0]
     assert read_steps(log)[1].step.search == step.search
 
@@ -130,11 +132,26 @@ def call(*arguments):
 
 def test_one_decision_is_shown_in_five_lines(tmp_path):
     steps = write_usual_run(tmp_path / "run.mcap")
-    lines = call("info", tmp_path / "run.mcap", "--decisions", 0)
-    assert len(lines) == 5
-    assert lines[0].startswith(f"step 0 at {steps[0].time_ns / 1e9:.3f} s") and steps[0].reason in lines[0]
-    assert [line.split()[0] for line in lines[1:]] == ["wanted", "chosen", "instead", "done"]
-    assert lines[3].startswith("  instead  blue to (")
+    log = tmp_path / "run.mcap"
+    lines = call("info", log, "--decisions", 0)
+    assert lines[0] == f"decision 0 at {steps[0].time_ns / 1e9:.3f} s, state 0: {steps[0].reason}"
+    gaps = " and ".join(
+        f"({pair} >= 0.03)" for pair in ("green dist red", "green dist blue", "red dist blue")
+    )
+    right = "(green rightof red) and (green rightof blue)"
+    assert lines[1] == f"  wanted   red above blue; keep {gaps}; avoid {right}"
+    assert lines[2].startswith(
+        "  there    robustness 0.03 (0.01 needed); tightest: red above blue, then red dist"
+    )
+    first, second, third = lines[3].split("; ")
+    assert first == "  instead  path 0 -> 3: no object can do it"
+    assert second.startswith("blue to (")
+    assert third.startswith("green: no place is good enough: ")
+    assert third.endswith(" needed, mostly because of red above blue")
+    assert lines[4].startswith("  done at ")
+    whole = call("info", log, "--decisions")
+    assert whole[0] == "run.mcap: 3 decisions for 'push', 2 motions"
+    assert whole[-1] == "given up: 0 -> 3: no object can do it"
     with pytest.raises(sr.UsageError, match="has no decision 9; it has 0 to"):
         call("info", tmp_path / "run.mcap", "--decisions", 9)
     with pytest.raises(sr.UsageError, match="takes the number of a decision"):
@@ -178,3 +195,18 @@ def test_detours_after_failures_do_not_end_a_run_that_goes_on(tmp_path):
         planner.observe(sr.Sample(time_ns, objects))
         planner.conclude(Outcome(not slips, "it slipped" if slips else ""))
     assert step.kind == "hold", step.reason
+
+
+def test_constraints_are_said_as_what_to_keep_and_what_to_avoid():
+    bans = bans_of(["not (a dist b >= 1)", "(x and y) and not c", "d", "not e", "f and g", "not h and not i"])
+    assert rules_of(bans) == (
+        "keep `a dist b >= 1` and `e`",
+        "avoid `d`",
+        "`x and y` not before `c`",
+        "avoid `f` together with `g`",
+        "keep `h` or `i`",
+    )
+    breaches = [ban_of(guard, bans).breach for guard in ("d and not z", "f and g", "(x and y) and not c")]
+    assert breaches == ["`d` would hold", "`f` and `g` would hold", "`x and y` would hold before `c`"]
+    wanted = wanted_of(["k and e and not c and not d", "not k and e and not m"], bans)
+    assert wanted == ("`k` and `c` no longer", "`k` no longer and `m` no longer")

@@ -210,6 +210,8 @@ class PlanEdge(google.protobuf.message.Message):
     JOINT_FIELD_NUMBER: builtins.int
     FAILED_FIELD_NUMBER: builtins.int
     ORDER_FIELD_NUMBER: builtins.int
+    WANTED_FIELD_NUMBER: builtins.int
+    RULES_FIELD_NUMBER: builtins.int
     source: builtins.int
     target: builtins.int
     pruned: builtins.str
@@ -244,6 +246,14 @@ class PlanEdge(google.protobuf.message.Message):
         does not look ahead.
         """
 
+    @property
+    def wanted(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """The progress set in words, one sentence for each alternative; formulas stand between backquotes."""
+
+    @property
+    def rules(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """The constraint set in words: what to keep and to avoid on the way; formulas stand between backquotes."""
+
     def __init__(
         self,
         *,
@@ -258,9 +268,11 @@ class PlanEdge(google.protobuf.message.Message):
         joint: builtins.bool = ...,
         failed: builtins.int | None = ...,
         order: builtins.str = ...,
+        wanted: collections.abc.Iterable[builtins.str] | None = ...,
+        rules: collections.abc.Iterable[builtins.str] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_failed", b"_failed", "_source", b"_source", "_target", b"_target", "failed", b"failed", "source", b"source", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_failed", b"_failed", "_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "failed", b"failed", "joint", b"joint", "motions", b"motions", "order", b"order", "path", b"path", "progress", b"progress", "pruned", b"pruned", "source", b"source", "target", b"target"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_failed", b"_failed", "_source", b"_source", "_target", b"_target", "candidates", b"candidates", "constraints", b"constraints", "failed", b"failed", "joint", b"joint", "motions", b"motions", "order", b"order", "path", b"path", "progress", b"progress", "pruned", b"pruned", "rules", b"rules", "source", b"source", "target", b"target", "wanted", b"wanted"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_failed", b"_failed"]) -> typing.Literal["failed"] | None: ...
     @typing.overload
@@ -438,20 +450,24 @@ class PlanCause(google.protobuf.message.Message):
     KIND_FIELD_NUMBER: builtins.int
     TEXT_FIELD_NUMBER: builtins.int
     CELLS_FIELD_NUMBER: builtins.int
+    WORDS_FIELD_NUMBER: builtins.int
     kind: global___PlanCause.Kind.ValueType
     text: builtins.str
     """What would hold, or the object; else empty."""
     cells: builtins.int
     """How many cells, over all turns."""
+    words: builtins.str
+    """The cause as a sentence; formulas stand between backquotes."""
     def __init__(
         self,
         *,
         kind: global___PlanCause.Kind.ValueType = ...,
         text: builtins.str = ...,
         cells: builtins.int | None = ...,
+        words: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_cells", b"_cells", "cells", b"cells"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_cells", b"_cells", "cells", b"cells", "kind", b"kind", "text", b"text"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_cells", b"_cells", "cells", b"cells", "kind", b"kind", "text", b"text", "words", b"words"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_cells", b"_cells"]) -> typing.Literal["cells"] | None: ...
 
 global___PlanCause = PlanCause

@@ -81,15 +81,15 @@ function sentence(text) {
 }
 
 function makeEdge(clock, decision, edge, number) {
-  const guards = (texts) => element("ul", {}, ...texts.map((text) => element("li", {}, element("code", {}, text))));
+  const sentences = (texts) => element("ul", {}, ...texts.map((words) => element("li", {}, ...withCode(words))));
   const mapsOf = (place) => decision.maps.filter((map) => map.edge === number && map.candidate === place);
   return element("section", {class: "edge"},
     element("h3", {}, `${edge.aim ? "Aimed at" : "Looked into"} ${edge.path.slice(0, 2).join(" → ")}`,
       element("span", {class: "quiet"}, ` on the path ${edge.path.join(" → ")}`)),
-    element("p", {class: "quiet"}, edge.progress.length > 1 ? "To reach one of" : "To reach"),
-    guards(edge.progress),
-    edge.constraints.length ? element("p", {class: "quiet"}, "Never on the way") : null,
-    edge.constraints.length ? guards(edge.constraints) : null,
+    element("p", {class: "quiet"}, edge.wanted.length > 1 ? "Wanted, one of" : "Wanted"),
+    sentences(edge.wanted),
+    edge.rules.length ? element("p", {class: "quiet"}, "On the way") : null,
+    edge.rules.length ? sentences(edge.rules) : null,
     element("div", {class: "candidates"},
       ...edge.candidates.map((candidate, place) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);

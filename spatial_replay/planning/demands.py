@@ -1,0 +1,166 @@
+"""Demands of an edge in words: what is wanted, and what must hold or be avoided on the way.
+
+A guard is given as text: literals joined by "and", a negative one as "not …". In sentences, formulas stand
+between backquotes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import accumulate
+from typing import Final, NamedTuple
+
+import numpy as np
+
+_MOST_PROPOSITIONS: Final = 12
+"""Guards over more propositions are not simplified, since the truth table doubles with each of them."""
+_LONGEST: Final = 100
+"""Characters of a formula."""
+_MOST_RULES: Final = 4
+"""Bans of several literals that are listed."""
+
+
+class Ban(NamedTuple):
+    """Literals that must not all be true together.
+
+    Attributes:
+        holding: propositions that would hold.
+        failing: propositions that would not.
+    """
+
+    holding: tuple[str, ...]
+    failing: tuple[str, ...]
+
+    @property
+    def rule(self) -> str:
+        """What to keep or to avoid, as a sentence."""
+        if not self.holding:
+            return f"keep {_listing(self.failing, 'or')}"
+        if not self.failing:
+            return f"avoid {_listing(self.holding, 'together with')}"
+        return f"{_listing(self.holding, 'and')} not before {_listing(self.failing, 'or')}"
+
+    @property
+    def breach(self) -> str:
+        """What would be the case, as a sentence."""
+        if not self.holding:
+            return f"{_listing(self.failing, 'and')} would fail"
+        before = f" before {_listing(self.failing, 'or')}" if self.failing else ""
+        return f"{_listing(self.holding, 'and')} would hold{before}"
+
+
+def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, ...]:
+    """Return the shortest bans that together forbid the same as guards, in their order.
+
+    Args:
+        given_up: guards of edges that were given up; bans may forbid these, too, to be shorter.
+    """
+    return tuple(
+        Ban(
+            tuple(text for text, value in cube.items() if value),
+            tuple(text for text, value in cube.items() if not value),
+        )
+        for cube in _simplified(
+            [_literals_of(guard) for guard in guards], [_literals_of(guard) for guard in given_up]
+        )
+    )
+
+
+def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
+    """Return the first of some bans that forbids a guard; without any, the guard itself as a ban."""
+    literals = _literals_of(guard).items()
+    for ban in bans:
+        if {(text, True) for text in ban.holding} | {(text, False) for text in ban.failing} <= literals:
+            return ban
+    return bans_of([guard])[0]
+
+
+def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
+    """Return what to keep and to avoid on the way, with bans of one literal put together."""
+    kept = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
+    avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
+    others = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
+    more = [f"{len(others) - _MOST_RULES} more rules"] if len(others) > _MOST_RULES else []
+    return (
+        *([f"keep {_listing(kept, 'and')}"] if kept else []),
+        *([f"avoid {_listing(avoided, 'and')}"] if avoided else []),
+        *others[:_MOST_RULES],
+        *more,
+    )
+
+
+def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:
+    """Return what each alternative of a progress set wants, without literals that bans already name."""
+    kept = {text for ban in bans if not ban.holding and len(ban.failing) == 1 for text in ban.failing}
+    avoided = {text for ban in bans for text in ban.holding}
+    alternatives = []
+    for cube in _simplified([_literals_of(guard) for guard in guards]):
+        wanted = [text for text, value in cube.items() if text not in (kept if value else avoided)]
+        texts = [f"`{text}`" if cube[text] else f"`{text}` no longer" for text in wanted or cube]
+        alternatives.append(" and ".join(texts))
+    return tuple(dict.fromkeys(alternatives))
+
+
+def _literals_of(guard: str) -> dict[str, bool]:
+    """Return the propositions of a guard, and whether each is to hold; none of "true"."""
+    literals = {}
+    for literal in _operands_of_and(guard):
+        text = literal.removeprefix("not ")
+        literals[_unbracketed(text)] = text == literal
+    literals.pop("true", None)
+    return literals
+
+
+def _operands_of_and(text: str) -> list[str]:
+    depths = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
+    operands, start = [], 0
+    for place, depth in enumerate(depths):
+        if depth == 0 and text.startswith(" and ", place):
+            operands.append(text[start:place])
+            start = place + len(" and ")
+    return [*operands, text[start:]]
+
+
+def _unbracketed(text: str) -> str:
+    """Return a text without the brackets around all of it."""
+    depths = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
+    is_bracketed = text.startswith("(") and text.endswith(")") and min(depths[:-1], default=0) > 0
+    return text[1:-1] if is_bracketed else text
+
+
+def _simplified(
+    cubes: Sequence[Mapping[str, bool]], ignored: Sequence[Mapping[str, bool]] = ()
+) -> list[dict[str, bool]]:
+    """Return cubes without literals that make no difference to their union, each once.
+
+    Args:
+        ignored: cubes of which it does not matter whether they belong to the union.
+    """
+    names = tuple(dict.fromkeys(name for cube in (*cubes, *ignored) for name in cube))
+    simplified = [dict(cube) for cube in cubes]
+    if len(names) <= _MOST_PROPOSITIONS:
+        union = np.zeros((2,) * len(names), bool)
+        for cube in (*cubes, *ignored):
+            union[_part_of_table(cube, names)] = True
+        for cube in simplified:
+            for name in tuple(cube):
+                value = cube.pop(name)
+                if not union[_part_of_table(cube, names)].all():
+                    cube[name] = value
+    return list({frozenset(cube.items()): cube for cube in simplified}.values())
+
+
+def _part_of_table(cube: Mapping[str, bool], names: Sequence[str]) -> tuple[int | slice, ...]:
+    return tuple(int(cube[name]) if name in cube else slice(None) for name in names)
+
+
+def _listing(texts: Sequence[str], conjunction: str) -> str:
+    """Return formulas between backquotes, the last two joined by a conjunction."""
+    *first, last = [f"`{_shortened(text)}`" for text in texts] or ["anything"]
+    return f"{', '.join(first)} {conjunction} {last}" if first else last
+
+
+def _shortened(text: str) -> str:
+    """Return a formula, of a long one the first operand of its "and"."""
+    first, *others = _operands_of_and(text)
+    return f"{first} and {len(others)} more" if others and len(text) > _LONGEST else text
