@@ -195,11 +195,11 @@ class _Walk:
             values += field_values
             least += field_least
         if values > MOST_VALUES:
-            raise LogError(f"{name!r} asks for {values} values in a message; at most {MOST_VALUES} are read")
+            raise LogError(f"{name!r} requires {values} values in a message; at most {MOST_VALUES} are read")
         self._in_all += values
         if self._in_all > MOST_VALUES_IN_ALL:
             raise LogError(
-                f"{name!r} and the types beside it ask for {self._in_all} values; at most"
+                f"{name!r} and the other used types require {self._in_all} values; at most"
                 f" {MOST_VALUES_IN_ALL} are read"
             )
         self._measured[name] = values, least if fields else self._empty_bytes

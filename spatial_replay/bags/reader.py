@@ -76,7 +76,7 @@ class MessageColumns(Messages):
         return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
 
     def raw(self, channels: Mapping[int, Channel]) -> Messages:
-        """Return the messages of a copy of the log, on these channels."""
+        """Return the messages as `Messages` on the given channels, for a copy of the log."""
         columns = self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.payloads
         return Messages(channels, *columns)
 
@@ -216,7 +216,7 @@ def without_jumps(
 
 
 class _Recorded:
-    """The furthest place of recording at each message within the last `disorder_ns`."""
+    """Stores the greatest place of recording up to each message of the last `disorder_ns`."""
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
@@ -255,7 +255,7 @@ class MessageReader(ABC):
     kind: str
 
     def __init__(self, path: LogFile) -> None:
-        # only a name for a remote file, because readers that open `_path` get local files only
+        # readers that open `_path` get local files only; for a remote file, it is a name
         self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults, self._remarks = FaultList(), FaultList()
         self._parts: Sequence[MessageReader] = ()
@@ -301,7 +301,7 @@ class MessageReader(ABC):
         return {rank: self._declared[number] for rank, number in enumerate(self._numbers.tolist())}
 
     def _channel_numbers(self, topics: Collection[str]) -> list[int]:
-        """Return the numbers in the log of the channels of some topics."""
+        """Return the channel numbers that the log has for some topics."""
         return [number for number, channel in self._declared.items() if channel.topic in topics]
 
     def _make_columns(
@@ -312,7 +312,7 @@ class MessageReader(ABC):
         payloads: Sequence[bytes],
         place: Integers,
     ) -> MessageColumns:
-        """Return messages, given the numbers of their channels in the log, and log and publish times."""
+        """Build columns; `numbers` are channel numbers of the log, `times_ns` log and publish times."""
         channel = np.searchsorted(self._numbers, numbers)
         return MessageColumns(self._channels, channel, sequence, *times_ns, payloads, place)
 

@@ -570,7 +570,7 @@ class Ros1Bag(MessageReader):
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
         payloads = [content[begin:end] for begin, end in bounds]
         numbers = table.connection[rows].tolist()
-        # a header begins with a number that its publisher counts; numbers of two publishers have no order
+        # a header begins with the sequence number of its publisher; several publishers have no common order
         publishers = Counter(connection.topic for connection in wanted.values())
         headed = {
             number

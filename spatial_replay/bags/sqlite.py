@@ -50,7 +50,7 @@ class BagMetadata:
         files: names of its files, without folders, in order.
         types: type of each topic.
         counts: number of messages of each topic.
-        compression: "file" or "message" for what is compressed; "" for nothing.
+        compression: unit of compression, "file" or "message"; "" without compression.
         distribution: ROS release that wrote it; None if it is not named.
     """
 
@@ -154,7 +154,7 @@ _PIECE = 2**20
 _PACKED_PIECE = 2**12
 """Compressed bytes that are read at a time; few, because one may decompress to 32,000 bytes."""
 _LEFT_FREE = 2**26
-"""Free space that stays free, bytes; at most a tenth of the free space."""
+"""Space of a disk that is left free, bytes; at most a tenth of its free space."""
 
 
 def temporary_folder(owner: object) -> Path:

@@ -148,7 +148,7 @@ class SessionStatus:
         messages_dropped: number of messages that were dropped before they became samples.
         late: number of messages that arrived after the samples of their time.
         overdue: number of observations whose transforms did not arrive within `max_delay_s`.
-        delay_s: time from the arrival of the newest sample's message to its verdict, seconds; NaN before.
+        delay_s: time from the arrival of the newest sample's message to its verdict, seconds; NaN before it.
         time_ns: time of the newest sample; None before the first sample.
     """
 
@@ -222,7 +222,7 @@ MAX_DELAY_S: Final = 0.2
 """Default time that a sample waits for transforms and for lagging topics, seconds."""
 
 LATE_S: Final = 1.0
-"""Wait for evaluation after which a sample is dropped if there is a newer one, seconds."""
+"""Longest wait of a sample for its evaluation, seconds; then it is dropped if there is a newer sample."""
 
 _OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3

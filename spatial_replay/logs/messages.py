@@ -175,8 +175,8 @@ class Block:
 def merge(streams: Sequence[Messages]) -> Messages:
     """Merge messages by log time, channel and sequence.
 
-    Channel numbers are local to a log, so channels are ordered by their content. So the order of messages
-    does not depend on the numbering of their log.
+    Channel numbers are local to a log. Channels are ordered by their content, so the order of messages does
+    not depend on these numbers.
     """
     joined = join(streams)
     return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))

@@ -33,7 +33,7 @@ from spatial_replay.trace.observations import Observations, trace_from_observati
 from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
 
 UNKNOWN, ZERO = -2, -1
-"""Slots of missing numbers: two columns after the last slot, NaN and 0."""
+"""Indices of two extra columns, NaN and 0, for numbers that are missing in a message."""
 
 
 OBJECTS_CHANNEL: Final = protobuf_channel(OBJECTS, ObjectStates)
@@ -268,7 +268,7 @@ def _first_group(
 
 
 def _fields(payload: bytes) -> list[bytes] | None:
-    """Split a message into its fields, each a valid message; None for an unknown field or a second time."""
+    """Split a message into fields, each a valid message; None if a field is unknown or time is repeated."""
     pieces: list[bytes] = []
     begin, end, times = 0, len(payload), 0
     while begin < end:

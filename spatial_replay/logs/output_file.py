@@ -188,7 +188,7 @@ def refuse_ending(output: Path) -> None:
     command = commands.get(output.suffix.lower())
     if command is not None:
         remedy = f"; {output} is written by spatial-replay {command}" if command else ""
-        raise UsageError(f"{output}: what is written is a log (MCAP); name it {output.stem}.mcap{remedy}")
+        raise UsageError(f"{output}: the output is a log (MCAP); name it {output.stem}.mcap{remedy}")
 
 
 def refuse_existing(output: Path) -> None:

@@ -146,7 +146,7 @@ def each_ahead(
         while waiting:
             yield waiting.popleft()[1].result()
     finally:
-        # garbage collection may close this generator while a thread starts, which must not wait for threads
+        # no wait: garbage collection may close this generator in the middle of the start of a thread
         threads.shutdown(wait=False, cancel_futures=True)
 
 
@@ -470,7 +470,7 @@ class RemoteFile(PathLike[str]):
         return version
 
     def _range(self, requested: Range) -> bytes:
-        """Read a range of the version of the first read."""
+        """Read a range; a change of the file since the first read is an error."""
         version_before = self._version
         # If-Match refuses weak tags, so the tag of the answer is compared too:
         # https://www.rfc-editor.org/rfc/rfc9110#section-13.1.1
@@ -675,7 +675,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
         return folder / below
     if size > limit:
         raise LogError(
-            f"{address} has {size / _GIGABYTE:.2f} GB, and downloads may have {limit / _GIGABYTE:g} GB;"
+            f"{address} has {size / _GIGABYTE:.2f} GB, but downloads are limited to {limit / _GIGABYTE:g} GB;"
             f" set {_LIMIT} to more gigabytes, or copy the log to this machine"
         )
     if reason:

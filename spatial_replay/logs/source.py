@@ -25,9 +25,9 @@ BLOCK_SAMPLES = 12_288
 
 
 SAMPLES_A_GAP: Final = 10
-"""Number of samples inserted in a gap, per `max_gap_ns`."""
+"""Number of samples that are inserted in a gap, per longest allowed pause."""
 _MOST_IN_GAP = 10_000
-"""Number of samples inserted in one gap, about at most."""
+"""Approximate limit of the samples that are inserted in one gap."""
 
 IterBlocks = Callable[..., Iterator[Block]]
 

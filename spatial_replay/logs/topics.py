@@ -59,7 +59,7 @@ ORIGINAL_PREFIX = "/original"
 
 
 def copied_channel(channel: Channel) -> Channel:
-    """Return the channel of another program's messages in a copy: our topics get `ORIGINAL_PREFIX`."""
+    """Return the channel in a copy for messages of another program; our topics get `ORIGINAL_PREFIX`."""
     is_ours = channel.topic == OBJECTS or channel.topic in DERIVED
     return replace(channel, topic=ORIGINAL_PREFIX + channel.topic) if is_ours else channel
 
@@ -96,7 +96,7 @@ CAMERA_FRAMES = "/tf"
 
 
 def topic_of_camera(topic: str, number: int) -> str:
-    """Return a topic for the number of a camera, from 1: `/camera/video`, `/camera2/video`."""
+    """Return the topic of a camera by its number, from 1: `/camera/video`, `/camera2/video`."""
     return topic if number == 1 else topic.replace("/camera/", f"/camera{number}/", 1)
 
 
@@ -143,13 +143,13 @@ LAYOUT = "layout.json"
 """The attachment that arranges a viewer's panels; a replay replaces it."""
 
 RECORDED_PREFIX = "recorded/"
-"""Inputs of a recording as attachments; they stay in every copy."""
+"""Prefix of attachments with inputs of a recording, which stay in every copy."""
 
 CAMERA_PREFIX = "camera/"
-"""The tags file of a camera's run as an attachment; it stays in every copy."""
+"""Prefix of the attachment with the tags file of a camera's run, which stays in every copy."""
 
 REPLAYED_PREFIX = "replayed/"
-"""Inputs of a replay as attachments; the next replay replaces them."""
+"""Prefix of attachments with inputs of a replay, which the next replay replaces."""
 
 
 _IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})

@@ -198,7 +198,7 @@ class Payloads(Sequence[bytes]):
         return int(self.size.sum())
 
     def select(self, places: Integers | slice) -> Payloads:
-        """Return the messages at some places, in their order."""
+        """Return the messages at the given places."""
         return Payloads(self.buffers, self.buffer[places], self.start[places], self.size[places])
 
     def without(self, is_empty: Booleans) -> Payloads:
@@ -253,7 +253,7 @@ def words_of(columns: Sequence[NDArray[Any]]) -> Words:
 
 
 def join_in_order(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
-    """Join groups of messages, sorted by the places that each group gives for its messages."""
+    """Join groups of places and messages; the messages are sorted by their places."""
     places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
     return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
 
@@ -263,7 +263,10 @@ _POWERS.flags.writeable = False
 
 
 def round_numbers(numbers: Floats) -> Floats:
-    """Round numbers to four digits, which viewers print short; below 1e-15 and from 1e15 on, they stay."""
+    """Round numbers to four digits, which viewers print short.
+
+    Numbers below 1e-15, and from 1e15 on, stay unchanged.
+    """
     size = np.abs(numbers)
     is_usual = (size >= 1e-15) & (size < 1e15)
     usual = np.where(is_usual, numbers, 1.0)

@@ -34,7 +34,7 @@ _LOOSE: Final = 0.02
 """Largest relative standard deviation of the focal length; above it, the views were too much alike."""
 
 _WRONG: Final = 8.0
-"""Error of corners from which the sheet is not the stated one, pixels; a bent sheet stays far below."""
+"""Error of corners that shows another sheet than the stated one, pixels; a bent sheet stays far below."""
 
 _WIDE: Final = 0.6
 """Least share of the image's width and height that the tags of all views should cover."""
@@ -44,7 +44,7 @@ class Calibrated(NamedTuple):
     """A calibration with remarks on its quality.
 
     Attributes:
-        views: number of frames that it is from.
+        views: number of frames behind the calibration.
         remarks: advice for a better calibration.
     """
 
@@ -96,9 +96,9 @@ def calibrate_camera(
         raise LogError(f"{name} has no frame that can be read")
     if len(views) < _LEAST_VIEWS:
         raise UsageError(
-            f"{name}: {plural(len(views), 'frame')} of different views with {_LEAST_TAGS} or more of the"
-            f" tags ({plural(seen, 'frame')} with so many in all); {_LEAST_VIEWS} are needed: tilt it,"
-            " or move the camera around the table, near and far"
+            f"{name}: {plural(seen, 'frame')} with {_LEAST_TAGS} or more of the tags, in"
+            f" {plural(len(views), 'different view')}; {_LEAST_VIEWS} views are needed: tilt the sheet, or"
+            " move the camera around the table, near and far"
         )
     found_calibration = calibrate(points, pixels, size)
     if not found_calibration.rms < _WRONG or not np.isfinite(found_calibration.deviations).all():

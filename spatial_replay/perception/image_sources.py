@@ -140,7 +140,7 @@ class ImageTopic:
             yield from map(_frame, decoder.rest())
 
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
-        """Yield the last frame with a stamp up to each of some increasing times.
+        """Yield the frame that is shown at each of some increasing times: the last one with an earlier stamp.
 
         Each frame is yielded once, and only the needed frames are decoded. Damaged frames are left out.
 
@@ -282,7 +282,7 @@ def _detections(listed: Any) -> tuple[Detection, ...]:
     for tag in listed:
         corners = np.array([(corner.x, corner.y) for corner in tag.corners], np.float64)
         if corners.shape != (4, 2) or not np.isfinite(corners).all():
-            raise LogError(f"tag {tag.id} has not four corners that are numbers")
+            raise LogError(f"tag {tag.id} does not have four corners that are finite")
         family = str(tag.family).removeprefix("tag")
         known_family = family if family in FAMILIES else ""
         detections.append(Detection(int(tag.id), corners_from_apriltag(corners), known_family))

@@ -641,7 +641,7 @@ class TagObserver:
         """
         if len(frames) != len(self._cameras) or all(frame is None for frame in frames):
             raise UsageError(
-                f"{plural(len(self._cameras), 'camera')}: give a frame or None of each, not only None"
+                f"{plural(len(self._cameras), 'camera')}: give a frame or None for each, at least one frame"
             )
         time_ns = next(frame.time_ns for frame in frames if frame is not None)
         if self.frames and time_ns <= self._last_ns:

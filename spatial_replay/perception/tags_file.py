@@ -152,8 +152,8 @@ class TagsFile:
             )
         if count > 1 and self.pose is not None:
             raise UsageError(
-                f"{self.name} gives one pose for {count} cameras; write cameras, one for each by the"
-                " name of its video, or leave out the pose, which the reference tags give"
+                f"{self.name} gives one pose for {count} cameras; write cameras, with an entry for each"
+                " video, or leave out the pose, which follows from the reference tags"
             )
         return self
 

@@ -126,10 +126,10 @@ HOSTILE = {
     "itself": ("Evil evil", "contains itself"),
     "itself, round a corner": (f"Other o\n{SEPARATOR}\nMSG: a/Other\na/Evil[] e", "contains itself"),
     "a type that is missing": ("a/Gone gone", "'a/msg/Gone' is missing; it is used by 'a/msg/Evil'"),
-    "a huge array of texts": ("string[1000000000] x", "asks for 1000000000 values"),
+    "a huge array of texts": ("string[1000000000] x", "requires 1000000000 values"),
     "arrays of arrays": (
         f"A[1000] a\n{SEPARATOR}\nMSG: a/A\nB[1000] b\n{SEPARATOR}\nMSG: a/B\nint8 x",
-        "asks for 1000000 values",
+        "requires 1000000 values",
     ),
     "a sequence of nothing": (
         f"A[] a\n{SEPARATOR}\nMSG: a/A\nint8 X=1",

@@ -192,7 +192,7 @@ TEN_FAULTS = "\n".join(
             "specifications come after --spec: spatial-replay replay LOG --spec FILE; batch takes many logs",
         ),
         (("replay", "run.jsonl"), "run.jsonl holds no specification of its own; give one with --spec"),
-        ((*REPLAY, "-o", "run.jsonl"), "run.jsonl: what is written is a log (MCAP); name it run.mcap"),
+        ((*REPLAY, "-o", "run.jsonl"), "run.jsonl: the output is a log (MCAP); name it run.mcap"),
         ((*REPLAY, "-o", "./blocks.spatial"), "blocks.spatial is an input too"),
         ((*REPLAY, "--json", "run.jsonl"), "run.jsonl is an input too"),
         ((*REPLAY, "-o", "out", "--json", "./out"), "-o and --json both name ./out"),

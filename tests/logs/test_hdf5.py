@@ -405,7 +405,7 @@ def test_a_soft_link_within_an_episode_is_followed(tmp_path: Path) -> None:
     ("content", "reason"),
     [
         (b"\x89HDF\r\n\x1a\n" + b"\0" * 100, "set.hdf5 cannot be read"),
-        (None, "set.hdf5 is an HDF5 file with images, no layout that is read"),
+        (None, "set.hdf5 is an HDF5 file with images, which is no known layout"),
     ],
 )
 def test_files_of_no_known_layout_are_named(tmp_path: Path, content: bytes | None, reason: str) -> None:

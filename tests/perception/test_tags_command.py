@@ -145,4 +145,4 @@ def test_too_few_views_are_refused(
 ) -> None:
     (tmp_path / "tags.yaml").write_text(TABLE)
     assert run(["tags", "calibrate", str(sheet_video[0]), "--tags", f"{tmp_path}/tags.yaml"]) == 2
-    assert "6 are needed: tilt it" in capsys.readouterr().err
+    assert "6 views are needed: tilt the sheet" in capsys.readouterr().err

@@ -186,7 +186,7 @@ def test_a_second_recorder_of_a_log_is_refused(tmp_path: Path) -> None:
     assert read_trace(path) == run(2)
     Recorder(path, overwrite=True).close()
     assert len(open_source(path).metadata()) > 1
-    with pytest.raises(UsageError, match=r"run\.jsonl: what is written is a log .*name it run\.mcap"):
+    with pytest.raises(UsageError, match=r"run\.jsonl: the output is a log .*name it run\.mcap"):
         Recorder(tmp_path / "run.jsonl")
 
 

@@ -550,7 +550,7 @@ def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[
     try:
         steps = _steps(_required_child(occupancy, "time"))
         parts = _parts_of(_required_child(occupancy, "shape"))
-        # the true outline is inside the region, so it is at most the region's diameter from any of its points
+        # the true outline is inside the region, so every point of the region is within a diameter of it
         region = _hull(parts)
         _, _, reach = _around([region])
         state = ObstacleState(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN

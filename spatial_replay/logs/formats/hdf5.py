@@ -55,9 +55,9 @@ def open_hdf5(path: Path) -> DataSet | None:
             if layout.is_layout(file):
                 return layout(path, file)
         raise UsageError(
-            f"{path.name} is an HDF5 file with {listing(file.names) or 'nothing in it'}, no layout that is"
-            " read: ManiSkill (traj_0), Isaac Lab, robosuite, robomimic or LIBERO (data/demo_0), D4RL"
-            " (terminals)"
+            f"{path.name} is an HDF5 file with {listing(file.names) or 'nothing in it'}, which is no known"
+            " layout; known are ManiSkill (traj_0), Isaac Lab, robosuite, robomimic and LIBERO (data/demo_0),"
+            " D4RL (terminals)"
         )
 
 
@@ -144,7 +144,7 @@ class _Demonstrations(InGroups):
 
 
 def _first_group(group: Group | None, prefix: str) -> Group | None:
-    """Return the first group with a name of a prefix and a number; None if there is none."""
+    """Return the first group whose name is the prefix and a number; None if there is none."""
     keys = [] if group is None else [key for key in group.names if _NUMBERED.fullmatch(key)]
     keys = [key for key in keys if key.startswith(prefix)]
     return group.group(min(keys, key=natural_key)) if group is not None and keys else None

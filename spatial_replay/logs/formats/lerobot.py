@@ -48,7 +48,7 @@ class _Rows(NamedTuple):
 
 
 def open_lerobot(path: Path) -> DataSet | None:
-    """Open a data set of LeRobot; None if the folder is none.
+    """Open a data set of LeRobot; None for another folder.
 
     Raises:
         UsageError: its version is unknown, or pyarrow is not installed.
@@ -82,7 +82,7 @@ class _LeRobot(DataSet):
             end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
         }
         self._rows: dict[Path, Mapping[int, _Rows]] = {}
-        # some third-party copies have metadata of versions 2 and 3, and files named as in neither
+        # some third-party copies have the metadata of versions 2 and 3, and file names of neither
         is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
         lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
         if lost and not is_third_party:
@@ -100,7 +100,7 @@ class _LeRobot(DataSet):
                 " of numbers; use the original"
             )
         self.remarks = tuple(remarks)
-        # the last file with its time, the requested columns, and the columns among them that it has
+        # the last file and its time, the names of requested columns, and the columns with these names
         self._loaded: tuple[object, AbstractSet[str], Mapping[str, Floats]] = (None, frozenset(), {})
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[list[_Rows]]:

@@ -460,7 +460,7 @@ def _element(text: str, place: str) -> ElementTree.Element:
     while level:
         level, depth = [child for element in level for child in element], depth + 1
     if depth > DEEPEST:
-        raise LogError(f"{place} has elements inside each other more than {DEEPEST} deep; MuJoCo has fewer")
+        raise LogError(f"{place} has elements nested more than {DEEPEST} deep; give a model of MuJoCo")
     if root.tag != "mujoco":
         raise LogError(f"{place} is not a model of MuJoCo: its root is <{root.tag}>; give one with <mujoco>")
     return root

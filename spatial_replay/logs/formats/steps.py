@@ -38,7 +38,7 @@ class _Steps(DataSet):
     qpos = "qpos"
 
     def divide(self, is_end: Booleans, missing: str) -> None:
-        """Divide the steps into episodes; `missing` is the remark on a last episode without an end."""
+        """Divide the steps into episodes; `missing` says in a remark what a last episode lacks at its end."""
         ends = np.flatnonzero(is_end)
         if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
             last = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)

@@ -420,7 +420,7 @@ class _Scan:
             after, length = RECORD_HEAD.unpack(head)
             is_followed = is_followed or (after != 0 and following + RECORD_HEAD.size + length <= self._size)
         with suppress(DamageError):
-            # a consistent head of a chunk: only the opcode is damaged
+            # the head fits a chunk, so only its opcode is damaged
             chunk_place(0, beginning, RECORD_HEAD.size + RECORD_HEAD.unpack_from(beginning)[1])
             is_followed = False
         if not is_followed:

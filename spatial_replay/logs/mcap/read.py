@@ -71,9 +71,9 @@ from spatial_replay.trace.units import Axes
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 """Limits of a decompressed chunk or message: bytes that are always allowed, and compression ratio."""
 _ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
-"""Limits of messages that wait for earlier chunks: bytes, and multiple of the log; the larger counts."""
+"""Limits of messages that wait for earlier chunks: bytes, and multiple of the log; the larger one counts."""
 _AHEAD_BYTES: Final = 2**24
-"""Most decompressed bytes of chunks that are read ahead; at least one chunk per core is."""
+"""Most decompressed bytes of chunks that are read ahead, if these are more than one chunk per core."""
 BLOCK_BYTES = 64 * 2**20
 """Size of messages at which a block is closed, bytes."""
 AFTER_ALL_NS = 2**64
@@ -111,7 +111,7 @@ def _content(place: ChunkPlace, record: bytes) -> bytes:
     chunk_place(place.offset, record[:_LONGEST_HEAD], len(record))
     _, _, size, checksum, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
     if size > max(place.size, _LEAST_BOUND):
-        raise DamageError(f"the chunk claims to hold {size} bytes, and the index {place.size}")
+        raise DamageError(f"the chunk claims to hold {size} bytes, but the index says {place.size}")
     begin = RECORD_HEAD.size + CHUNK_HEAD.size
     data = begin + name_length + 8
     content = _decompress(record[begin : begin + name_length], memoryview(record)[data:], size)
@@ -239,7 +239,7 @@ class ChunkWalk:
         """Begin with the channels that the directory declares.
 
         Args:
-            renamed: returns the channel that messages get in place of their channel in the log.
+            renamed: function from a channel of the log to the channel of its messages in the output.
         """
         self._renamed = renamed
         self.stream = stream
@@ -355,7 +355,7 @@ class McapSource(FileSource):
 
     @property
     def _given(self) -> Mapping[str, object]:
-        # our logs store the read options of their source in their metadata
+        # the metadata of our logs have the read options of the recording
         return {}
 
     @noting_pauses
@@ -371,7 +371,7 @@ class McapSource(FileSource):
             for messages in _blocks(walk, window, self.is_wanted):
                 yield decoder.block(messages)
             if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
-                # a window of a remote log is read without the attachments, which would be downloaded whole
+                # a window of a remote log is not worth downloading all attachments
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             rest = walk.faults.take(last=True)
             fault = decoder.first_fault or next(iter(rest), None)
@@ -574,7 +574,7 @@ def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
 
 
 class _BlockDecoder:
-    """Decodes messages to blocks; stores the latest sample time, because later samples must be later."""
+    """Decodes messages to blocks, and checks that the times of samples increase."""
 
     def __init__(self, source: McapSource, walk: ChunkWalk) -> None:
         self._source = source

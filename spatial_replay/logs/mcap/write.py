@@ -36,11 +36,11 @@ from spatial_replay.trace.trace import FOREVER
 CHUNK_BYTES = 512 * 2**10
 """Uncompressed size at which a chunk is closed, bytes."""
 CHUNK_NS = 10**9
-"""Longest time between the messages of a chunk, nanoseconds."""
+"""Longest time from the first to the last message of a chunk, nanoseconds."""
 WHOLE_CHUNK_NS = 10 * CHUNK_NS
 """`CHUNK_NS` for a log that appears only when it is complete: fewer chunks are faster and smaller."""
 REPEAT_NS = 5 * 10**9
-"""Interval of the declarations of a channel, from the second chunk with its messages on, nanoseconds.
+"""Time after which a channel is declared again, nanoseconds. Its first two chunks declare it, too.
 
 Declarations in every chunk would add 15 % to an annotated log; these add up to 5 %.
 """
@@ -98,7 +98,7 @@ class _Lane:
         records: records of its messages.
         first_ns: time of the first message.
         size: size of all records, bytes.
-        began_s: clock time of its begin, seconds.
+        began_s: clock time of its beginning, seconds.
     """
 
     is_own: bool
@@ -275,7 +275,7 @@ class LogWriter:
 
         Args:
             stream: binary stream, which need not seek. It is flushed after each chunk, and left open.
-            chunk_ns: longest time between the messages of a chunk.
+            chunk_ns: longest time from the first to the last message of a chunk.
             clock: clock in seconds, for a log of samples in real time.
         """
         self._stream = stream
@@ -354,7 +354,7 @@ class LogWriter:
             begin = end
 
     def _fill(self, number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
-        """Add messages of one lane with times that do not decrease, as many at once as chunks hold."""
+        """Add messages of one lane with times that do not decrease; each step fills the open chunk."""
         times_ns = part.times_ns
         while begin < end:
             time_ns = int(times_ns[begin])
