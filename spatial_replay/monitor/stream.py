@@ -280,7 +280,7 @@ class InstanceStream:
             no_series = np.empty((len(program.reports), 4, 0))
             return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
-        # no term looks back beyond the scene, or it starts with the log: positions in the scene suffice
+        # positions in the scene suffice: it starts with the log, or as far back as any term looks
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)

@@ -98,7 +98,7 @@ CHANNELS = 4
 """Number of channels: nominal low and high, wide low and high."""
 
 _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
-"""For each number of stored channels, the stored channel that each of the four channels equals."""
+"""Stored channel that each of the four channels equals, by the number of stored channels."""
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:
