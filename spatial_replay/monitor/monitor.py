@@ -109,7 +109,9 @@ class SpecUpdate:
     def node(self, identifier: int) -> NodeUpdate:
         """Return the node with an id, once the monitor has started."""
         if self.numbers is None:
-            raise UsageError(f"{self.spec.name!r} has no numbers yet; the monitor's start is still to come")
+            raise UsageError(
+                f"{self.spec.name!r} has no numbers before the monitor's start; add more samples"
+            )
         return NodeUpdate(identifier, self.names[identifier], *self.numbers[identifier].tolist())
 
     @property

@@ -616,7 +616,7 @@ class PaperRun:
         if pairs > self._max_pairs:
             raise UsageError(
                 f"over {samples:,} samples, an until of two temporal operands below a temporal operator "
-                "compares too many pairs of them; bound it, evaluate fewer samples, or use the semantics "
+                "compares too many pairs of samples; bound it, evaluate fewer samples, or use the semantics "
                 "'ltlf'"
             )
 
@@ -691,7 +691,7 @@ def check_operators(specification: Specification) -> None:
                 fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
                 remedy = "write it with X, F, G and U"
                 raise UsageError(
-                    f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "
+                    f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, which {spec.name} uses; "
                     f"{remedy}, or evaluate with the semantics 'ltlf'"
                 )
 

@@ -53,7 +53,7 @@ class Verdict(StrEnum):
         Raises:
             UsageError: always.
         """
-        raise UsageError(f'a verdict is no truth value; write verdict == "satisfied" (it is {self.value!r})')
+        raise UsageError(f'a verdict has no truth value; write verdict == "satisfied" (it is {self.value!r})')
 
 
 def final_verdict(lower: float, upper: float) -> Verdict:

@@ -140,7 +140,7 @@ def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B"))
     if ratios and (min(ratios) >= OTHER_UNITS or max(ratios) <= 1.0 / OTHER_UNITS):
         runs = "the runs" if called == ("A", "B") else " and ".join(called)
         raise UsageError(
-            f"{runs} seem to be in other units: {example}. Read both in one unit, by a mapping with `scale`"
+            f"{runs} seem to have different units: {example}. Read both in one unit by `scale` in a mapping"
         )
 
 

@@ -209,11 +209,11 @@ def test_runs_in_other_units_are_refused(capsys: pytest.CaptureFixture[str]) -> 
     Path("mm.jsonl").write_text("\n".join(map(json.dumps, lines)))
     code, _, err = said(capsys, "diff", "table.jsonl", "mm.jsonl")
     assert code == 2
-    assert "in other units" in err
+    assert "different units" in err
     runs = "--good", "table.jsonl", "--bad", "mm.jsonl"
     code, _, err = said(capsys, "tune", "--spec", "table.spatial", *runs, "--vary", "near=0.05:0.2")
     assert code == 2
-    assert "table.jsonl and mm.jsonl seem to be in other units" in err
+    assert "table.jsonl and mm.jsonl seem to have different units" in err
 
 
 @pytest.mark.usefixtures("folder")

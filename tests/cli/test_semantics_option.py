@@ -82,7 +82,8 @@ def test_an_operator_outside_the_paper_is_wrong_usage(folder: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     fault = done.stderr.splitlines()[-1]
     assert (
-        "past.spatial:2:15: the paper's semantics has no O, as past has; write it with X, F, G and U" in fault
+        "past.spatial:2:15: the paper's semantics has no O, which past uses; write it with X, F, G and U"
+        in fault
     )
 
 

@@ -83,7 +83,7 @@ def test_a_monitor_refuses_invalid_arguments_and_samples():
     with pytest.raises(UsageError, match="no semantics 'stl'"):
         Monitor(parse_specification("p >= 0"), semantics="stl")
     monitor = Monitor(parse_specification("spec low = p >= 0"), start_ns=SECOND)
-    with pytest.raises(UsageError, match=r"'low' has no numbers yet; the monitor's start"):
+    with pytest.raises(UsageError, match=r"'low' has no numbers before the monitor's start"):
         monitor.update(at(0, p=1)).node("low")
     monitor.update(at(2, p=1))
     with pytest.raises(UsageError, match=r"no node is named 'high'; there are low"):

@@ -465,7 +465,7 @@ class LeafCode:
         self._bindings += perm(member_count, len(formula.variables))
         if self._bindings > MAX_BINDINGS:
             raise UsageError(
-                f"{formula.quantifier} {', '.join(formula.variables)} over {member_count} objects brings a "
-                f"formula to {self._bindings} bindings; {MAX_BINDINGS} is the limit: use a smaller group or "
+                f"{formula.quantifier} {', '.join(formula.variables)} over {member_count} objects gives a "
+                f"formula {self._bindings} bindings; {MAX_BINDINGS} is the limit: use a smaller group or "
                 "fewer variables"
             )

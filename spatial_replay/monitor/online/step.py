@@ -398,7 +398,7 @@ class OnlineRun:
         """
         shape = len(self._program.leaves), len(times_ns)
         if leaves.shape[1:] != shape or len(leaves) not in (1, 2, 4):
-            raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{shape})")
+            raise ValueError(f"leaves have the shape {leaves.shape}; the program needs (1, 2 or 4, *{shape})")
         self.widen(len(leaves))
         # a copy: kernels are compiled for writable arrays in C order
         leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")

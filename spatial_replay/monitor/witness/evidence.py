@@ -93,7 +93,7 @@ class Evidence:
                 time_ns = pending.pop()
                 begin, end = window_of(trace.times_ns, time_ns, time_ns + 1)
                 if begin == end:
-                    raise LookupError(f"there is no sample at {time_ns} ns any more")
+                    raise LookupError(f"the log has no sample at {time_ns} ns any more")
                 earlier_samples = (
                     tail(trace.slice(0, begin), self._reach) if begin and self._reach else trace.slice(0, 0)
                 )
@@ -101,7 +101,7 @@ class Evidence:
                 scenes[time_ns] = TraceScene(sample, self._regions, len(earlier_samples))
             if not pending:
                 return scenes
-        raise LookupError(f"there is no sample at {pending[-1]} ns any more")
+        raise LookupError(f"the log has no sample at {pending[-1]} ns any more")
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
         """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
