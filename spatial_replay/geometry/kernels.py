@@ -528,6 +528,7 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
         ax, ay = ax / length, ay / length
         height, low, high = _deepest(vertices, b_start, b_stop, x, y, ay, -ax)
         if height > best[4]:
+            # the middle of the contact, as far as it lies on the edge
             place = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
             best = (x + ax * place, y + ay * place, ay, -ax, height)
         if a_stop - a_start == 2:  # normals of a segment see no gap to a part beyond its ends

@@ -226,6 +226,7 @@ def closest_rows(
         present, size, widest = 0, 0.0, 0.0
         for m in range(width):
             row = members[t, m]
+            # absent footprints have empty boxes, which sort last
             left, right, lower, upper = np.inf, -np.inf, np.inf, -np.inf
             if row >= 0:
                 present += 1

@@ -536,6 +536,7 @@ class _SampleTimes:
             UsageError: the step is too short for the rate of the messages.
         """
         if self._step_ns is None:
+            # np.unique is slow for the single message of a running system
             times = times_ns if len(times_ns) == 1 else np.unique(times_ns)
             times = times[times > self._last_ns]
         else:
@@ -634,6 +635,7 @@ class _Silences:
         is_filled = self._silences(times_ns, known_ns, is_last=is_last)
         if is_last:
             if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
+                # reading ended later than any limit of a silence, so that this one is too long
                 is_filled[-2] = self.goes_on()
         elif len(times_ns):
             # until the silence after the last message is decided, samples end at that message
@@ -904,6 +906,7 @@ class LiveAssembler(_Assembling):
         # lost topics send nothing more, so that samples up to their last message are final
         gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in newly_lost))
         so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
+        # one nanosecond later, so that the loss is a sample of its own
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return so_far
@@ -945,6 +948,7 @@ class LiveAssembler(_Assembling):
         back_ns = newest_ns[:-1] - times_ns
         # a message that steps back farther is too late anyway
         back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
+        # one more, because samples are final only before the earliest time that may still come
         self._back_ns[name] = max(self._back_ns[name], int(back_ns.max(initial=-1)) + 1)
         if name in self._moving:
             self._are_transforms_new = True

@@ -138,6 +138,7 @@ _FIRST_YEAR, _LAST_YEAR = 2005, 2100
 
 def _year(time_ns: int) -> int | None:
     """Return the year of a time; None outside the years in which robots are recorded."""
+    # a time in another unit may be beyond datetime's last year
     if time_ns > 2**62:
         return None
     year = datetime.fromtimestamp(time_ns / 1e9, UTC).year
@@ -406,6 +407,7 @@ def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
     most = max(abs(evidence.low[0]), abs(evidence.high[0]))
     if not most > 90:
         return None
+    # degrees times 10^7 are at most 9e8
     hint = f"; times 1e-7 it is {number_text(most * 1e-7)}" if 1e6 < most <= 9e8 else ""
     if most == _NO_LATITUDE:
         hint = ", and AIS sends 91 and 181 for not available"

@@ -290,6 +290,7 @@ _Resolved = TypeVar("_Resolved")
 _Alternative = TypeVar("_Alternative", str, tuple[str, ...], str | tuple[str, ...])
 
 _SECOND_NS = 10**9
+# names in ROS 2, in ROS 1, in Python and JSON of ROS 1, and in protobuf
 _TIME_FIELDS = (
     ("sec", "nanosec"),
     ("sec", "nsec"),

@@ -268,6 +268,7 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
             size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
                 # both scales are 0 if a protobuf sender leaves them unset, which means 1
+                # the cylinder around a cone
                 scale = (
                     max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale"))) or 1.0
                 )

@@ -28,6 +28,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     An object that is thrown or pushed moves for several frames. An object that jumps is at rest, or much
     slower, before and after the jump. Causes are exchanged ranges of frames, and frames from before a reset.
     """
+    # a jump needs a step next to it, with which it is compared
     if len(trace) < 3 or not len(trace.footprints.radius):
         return None
     shapes, rows = trace.footprints, trace.rows.T

@@ -386,6 +386,7 @@ class Motions:
             least = np.minimum(least, leap[before + 1])
             apart = place[after] - place[before]
             is_same = (name[before] == name[after]) & (after >= steps)
+            # within a quarter of the shortest leap on the way
             is_back |= is_same & (np.hypot(apart[:, 0], apart[:, 1]) < least / 4)
         is_slow = is_back & (step_s[after] >= 1.0) & (leap[after] < _FAST * step_s[after])
         self.returns += int(np.count_nonzero(is_back))

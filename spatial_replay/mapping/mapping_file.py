@@ -521,6 +521,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
 def _angle(value: Any) -> Angle | None:
     if not isinstance(value, dict):
         return None if value is None else Angle(value)
+    # MAVLink sends hundredths of a degree
     scale = {"rad": 1.0, "deg": pi / 180, "cdeg": pi / 18_000}[value.get("unit", "rad")]
     return Angle(
         value["field"],

@@ -154,6 +154,7 @@ _MARKER = MessageLayout(
 GEODETIC: Alternatives = ("latitude", "longitude")
 """Fields of a fix, in degrees."""
 # no frame: that of the receiver does not affect latitude and longitude
+# the status is negative without a fix (sensor_msgs/NavSatStatus)
 _FIX = MessageLayout(position=((*GEODETIC, "status.status"), GEODETIC), frame=())
 
 BUILT_IN: Table[str, MessageLayout] = MappingProxyType(
