@@ -265,6 +265,7 @@ def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str],
         names, members, _ = scene.members(visitors)
         return names, members
     trace = scene.trace
+    # empty until the object appears
     names = tuple(name for name in trace.names if name == visitors.name)
     columns = [trace.names.index(name) for name in names]
     return names, (trace.rows[:, columns] != ABSENT).astype(np.int8)

@@ -175,6 +175,7 @@ class RunEnds:
             # the sample after the last sample in which the topic could be judged
             next_sample = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
             since_ns = int(times_ns[next_sample]) if next_sample < len(times_ns) else None
+            # the topic was missing at the end of the previous trace already
             if next_sample == 0 and earlier_span is not None and self._since_ns[span.topic] is not None:
                 since_ns = self._since_ns[span.topic]
             self._since_ns[span.topic] = since_ns
@@ -203,6 +204,7 @@ class RunEnds:
         ]
         self.late = tuple(span.topic for span, delay in delays if delay > self._limit_ns(span))
         in_time = [span for span, delay in delays if delay <= self._limit_ns(span)]
+        # the latest topic decides
         self.begin_ns = max((span.first_ns or 0 for span in in_time), default=self.log_begin_ns)
         latest_span = max(in_time, key=lambda span: span.first_ns or 0, default=None)
         if latest_span is not None and self.begin_ns > self.log_begin_ns:
@@ -212,6 +214,7 @@ class RunEnds:
         times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
         left_out = times_ns[times_ns < begin_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} before"]
+        # else the topic had messages, but no transform
         if span.begun_ns is not None and span.begun_ns > int(left_out[-1]):
             reason = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
         self._remark("beginning", left_out, reason)
@@ -251,6 +254,7 @@ class RunEnds:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
             since_ns = self._since_ns[span.topic]
+            # released samples are evaluated, so they cannot be left out any more
             before_ns = max(self._released_ns, -1 if self._is_rest else self.begin_ns or 0)
             if since_ns is not None and since_ns > before_ns and self._log_end_ns - since_ns <= span.limit_ns:
                 yield span

@@ -638,14 +638,17 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if _has_factor(atom.atom):
         signed = []
+    # only a single distance or signal is too small or too great
     if len(signed) == 1 and len(atom.measured) == 1:
         (sign, part), *_ = signed
         (measurement,) = atom.measured
+        # an atom that fails (high end) has to rise; one that must not hold has to fall
         needs_more = (sign > 0) == (atom.end is End.HIGH)
         if measurement.quantity == "signed_distance":
             first, second = measurement.names
             misplacement = f"too close to {second}" if needs_more else f"too far from {second}"
             return f"{first} is {amount} {misplacement}"
+        # an equality is infinite, so it has no amount
         if measurement.quantity == "signal" and not isfinite(_settling_number(atom)):
             return measurement_clause(atom, {}, 0)
         if isinstance(part, Signal):

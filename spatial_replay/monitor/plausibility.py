@@ -160,6 +160,7 @@ class LogNumbers:
             return
         vertices = trace.footprints.vertices
         if len(vertices):
+            # an upper bound: the radius of one part enlarges its own vertices only
             margin = float(trace.footprints.radius.max(initial=0.0))
             (left, low), (right, high) = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
             lower = (min(self.box[0], left - margin), min(self.box[1], low - margin))
@@ -184,6 +185,7 @@ class LogNumbers:
         self._past = extended_trace
         scene = TraceScene(extended_trace, self._regions, len(extended_trace) - len(trace))
         for key, threshold_range in self._ranges.items():
+            # the number of this atom is the quantity itself
             quantity_atom = replace(
                 threshold_range.atom,
                 expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,

@@ -495,6 +495,7 @@ class SpecResult(Displayed):
             return cause_reason(self.causes[0], first_ns)
         if self.worst is None or self.leaves is None:
             return Sentence("")
+        # a settled witness explains an earlier robustness than that of the whole log
         is_settled = self.worst.is_settled
         whole_witness = (
             find_witness(self.evidence, self.leaves, self.times_ns, flips=False) if is_settled else self.worst

@@ -258,8 +258,10 @@ def step_paper(
     nodes = rows.shape[0]
     for k in range(t, t + count):
         last = position + k - t
+        # without columns, only the first time is stored
         if last < memory.stamps.shape[0]:
             memory.stamps[last] = times_ns[k]
+        # operands have greater ids than their parents
         for n in range(nodes - 1, -1, -1):
             code, is_plain = rows[n, CODE], rows[n, IS_PLAIN] != 0
             if code == LEAF_NODE:
@@ -291,6 +293,7 @@ def step_paper(
             # adding zero turns -0.0 into 0.0, so that equal numbers have equal bits
             series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
             series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
+            # Def. 16 has no continuations, so both bounds are the value
             series[n, 2, k] = series[n, 3, k] = series[n, 0, k]
 
 

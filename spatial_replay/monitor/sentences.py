@@ -140,6 +140,7 @@ def find_causes(
     failing = [conjunct for conjunct in conjuncts if _verdict(final, conjunct.node) is not Verdict.SATISFIED]
     first: dict[str, Conjunct] = {}
     for conjunct in sorted(failing, key=lambda conjunct: _order(conjunct.node, values, final, settled_ns)):
+        # the first conjunct of each spec, in this order, is its cause
         first.setdefault(conjunct.spec, conjunct)
     causes = []
     for conjunct in first.values():

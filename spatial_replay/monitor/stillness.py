@@ -85,6 +85,7 @@ class Stillness:
         """Yield a sentence on each object that never changed while all others of its class mostly changed."""
         by_class: dict[str | None, dict[str, _Reports]] = defaultdict(dict)
         for name, reports in self._reports.items():
+            # a lasting object, such as a latched map, may have a single report
             if name not in self._lasting:
                 by_class[reports.class_name][name] = reports
         for class_name, objects in by_class.items():

@@ -587,6 +587,7 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
     while waiting:
         node = waiting.pop()
         if isinstance(node, Boolean) and node.operator in ("and", "spec"):
+            # reversed on the stack, so that goals come in the order of the text
             waiting += reversed(node.operands)
         elif (
             isinstance(node, Temporal)
@@ -746,6 +747,7 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
         # positions in ns or in samples: one calculation serves both units
         place, last = (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
         missing_length = place + bound.upper - last
+        # a window in samples includes both ends
         length = bound.upper - bound.lower + (not is_time)
         seen_length = max(length - missing_length, 0)
         left_text, whole_text = (
@@ -767,6 +769,7 @@ def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violate
 
     Minima, maxima and negations preserve the order of ranks, so their deciding path ends at a cut window.
     """
+    # 0 satisfies, so only a violation needs a strict comparison
     holds = np.greater if is_violated else np.greater_equal
     end_pairs = [
         nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole)

@@ -125,6 +125,7 @@ def _sort_observations(observed: Observations) -> Observations:
     rank = np.zeros(len(order), np.int64)
     rank[order] = np.arange(len(order))
     name = rank[observed.name]
+    # one integer sorts by both
     key = observed.sample * max(1, len(names)) + name
     # readers mostly yield sorted rows, which need no copies
     if (key[1:] >= key[:-1]).all():
@@ -227,6 +228,7 @@ def _with_pieces(shapes: FootprintBatch, pieces: Mapping[int, Footprint]) -> Foo
     vertices = np.concatenate([shapes.vertices, *added])
     begins = starts_from_counts(vertex_counts)[:-1]
     first = np.arange(len(shapes.radius), dtype=np.int64)
+    # pieces are behind all parts, and `order` brings them to their places
     first[list(pieces)] = len(shapes.radius) + starts_from_counts(counts[list(pieces)])[:-1]
     order = flat_index(first, counts)
     return replace(

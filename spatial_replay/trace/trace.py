@@ -314,6 +314,7 @@ def _ns_from_calendar(match: re.Match[str], text: str) -> int:
     except ValueError as error:
         raise UsageError(f"{text!r} is not a calendar time: {error}") from error
     fraction_ns = int((match["fraction"] or "").ljust(9, "0"))
+    # in integers: a timestamp as float would lose nanoseconds
     return (whole_seconds - _EPOCH) // timedelta(seconds=1) * 10**9 + fraction_ns
 
 
@@ -649,6 +650,7 @@ class Trace(Displayed):
         unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
         codes = (np.array([code[n] for n in trace.classes], np.int64)[trace.class_code] for trace in traces)
         return cls(
+            # the empty arrays are for no traces at all
             times_ns=np.concatenate([np.empty(0, np.int64), *(trace.times_ns for trace in traces)]),
             names=names,
             rows=rows,
@@ -758,6 +760,7 @@ def _check_shapes(trace: Trace) -> None:
         if (shape := getattr(trace, column).shape) != (observations,):
             needed = f"{observations} footprints need ({observations},)"
             raise TraceError(f"{column} has the shape {shape}; {needed}")
+    # -2 - (observations - 1) is the least row of an unreadable observation
     if trace.rows.size and (trace.rows.max() >= observations or trace.rows.min() < -1 - observations):
         raise TraceError(f"a row number lies outside the {observations} observations")
     for name, values in trace.signals.items():

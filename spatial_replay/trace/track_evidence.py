@@ -49,6 +49,7 @@ class TrackEvidence:
     def _add_steps(self, trace: Trace) -> None:
         """Update whether angles count turns: they begin within one turn, and step by less than half of it."""
         yaw = np.where(trace.rows >= 0, trace.yaw[np.maximum(trace.rows, 0)], np.nan)
+        # whether this is the first block
         begins = self._samples == len(trace)
         steps, seconds = np.abs(np.diff(yaw, axis=0)), np.diff(trace.times_ns)[:, None] / 1e9
         self._counts_turns &= not (steps >= pi).any() and not (begins and (np.abs(yaw[0]) > 2 * pi).any())

@@ -53,6 +53,7 @@ class Axes:
             y: Literal["up", "down"] = "down" if axes.get("y") == "down" else "up"
             declared = {name: unit for name, unit in signals.items() if name and isinstance(unit, str)}
             return cls(y, float(axes.get("scale", 1.0)), str(axes.get("unit", "")), declared)
+        # other programs may write anything under these keys
         except (ValueError, TypeError, AttributeError, RecursionError):
             return cls()
 

@@ -1004,6 +1004,7 @@ class SampleLeaves:
             plan = self._plan_for(counts)
         stands_for: dict[str, str] = {}
         for classes, names in unnamed.items():
+            # spare placeholders stand for a name that no sample has
             stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
         return plan, stands_for
 
@@ -1017,12 +1018,14 @@ class SampleLeaves:
             codes = [code_of(tracked.class_name) for tracked in objects.values()]
             codes += map(code_of, sample.unknown.values())
             for name, code in zip(chain(objects, sample.unknown), codes, strict=True):
+                # the object fits no open group
                 if not (code or takes_any):
                     continue
                 if name in spec_names:
                     spec_members.append(Member(name, code))
                 elif name not in classes_by_name:
                     classes_by_name[name] = (code,)
+                # an object may have changed its class since an earlier sample
                 elif code not in classes_by_name[name]:
                     classes_by_name[name] = tuple(sorted((*classes_by_name[name], code)))
         if not self._spec_members.issuperset(spec_members):

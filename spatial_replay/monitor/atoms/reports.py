@@ -67,6 +67,7 @@ class Reports(NamedTuple):
 
     @classmethod
     def of(cls, is_known: Booleans, reported_ns: Integers) -> Reports:
+        # the sample before the begin of a report shows the previous report
         begins = np.where(_begins(is_known, reported_ns), np.arange(len(is_known)), -1)
         before = np.where(is_known, np.maximum.accumulate(begins) - 1, -1)
         before = np.where((before >= 0) & is_known[before], before, -1)

@@ -380,6 +380,7 @@ class TraceScene:
         before, seconds = self._reports_of(TrackedName(name))
         is_there, stands = current >= 0, np.isnan(seconds) & (name in self.trace.lasting)
         before_rows = np.where(before < 0, ABSENT, self._rows_of(name)[before])
+        # without an earlier report, the object is unknown
         rows = np.where(is_there & ~stands, _NO_REPORT, current)
         # row -1, for samples without the object, reads the appended 0
         uncertainty = np.append(self.trace.uncertainty, 0.0)
@@ -394,6 +395,7 @@ class TraceScene:
         if len(between):
             newer, older = current[between], before_rows[between]
             rows[between] = self._add_moved_rows(newer, older, shortest[between] / seconds[between])
+            # between two reports, the greater uncertainty counts
             spread[between] = np.maximum(uncertainty[newer], uncertainty[older])
         return rows, spread
 

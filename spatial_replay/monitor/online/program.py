@@ -390,6 +390,7 @@ class PartRows:
         if high is not None:
             after_end = self._infinity_after(unit, high, sign)
             left = after_end if left == NOTHING else self._join(left, after_end, is_both=is_until)
+            # `high` + 1 has to fit 64 bits
             if high < LAST:
                 right = self._join(right, self._infinity_after(unit, high + 1, sign), is_both=is_until)
         code = codes.UNTIL if is_until else codes.RELEASE
@@ -581,6 +582,7 @@ def _join_rows(
     parts_at = 1 + len(signals)
     reports_at = parts_at + len(parts)
     operands_at = reports_at + len(reports)
+    # ceiling division: operand ids fill rows of this width
     first = operands_at + -(-len(operands) // width)
     # one array: each array argument of a kernel costs time at every sample
     rows = np.zeros((first + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)

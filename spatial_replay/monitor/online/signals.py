@@ -236,6 +236,7 @@ def _run_simple(
     is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
     for k in range(count):
         right = work[top + b, k]
+        # the value of the root if its next value is -inf, and if it is +inf
         if is_until:
             least, most = right, max(right, work[top + a, k]) if has_left else np.inf
         else:

@@ -41,6 +41,7 @@ SERIES = 4
 def _mirror(row: int, channels: int) -> int:
     if channels > 1:
         return row ^ 1
+    # value and now are their own mirrors; lower and upper swap
     return row if row < 2 else 5 - row
 
 
@@ -49,6 +50,7 @@ def _channel(row: int, channels: int) -> int:
     """Return the channel of a row."""
     if channels == 1:
         return 0
+    # value and now are nominal, the other two numbers have uncertainty
     return row & 1 if row < 4 or channels == 2 else 2 + (row & 1)
 
 
@@ -490,6 +492,7 @@ class OnlineRun:
     def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
         """Run a part in one channel, and store its results."""
         channels, is_high = self._channels, channel & 1
+        # bounds include uncertainty, so they come from the last two channels
         bounds = 3 if channels == 1 else 1 << is_high if channel >= channels - 2 else 0
         run_windows(
             part.rows, self._channel_history[channel], self._stamps, part.columns, part.state, part.tables,

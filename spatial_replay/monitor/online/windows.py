@@ -29,6 +29,7 @@ BLOCK = 64
 STRIDE = 16
 """Number of positions that `_run_open` fills at once."""
 _NEVER = 1 << 62
+"""Position beyond all samples."""
 
 SETS = 3
 """Sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""

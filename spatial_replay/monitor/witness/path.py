@@ -336,6 +336,7 @@ class _Walk:
             [PathNode(left.index, left_samples[int(np.argmin(left_key))])] if len(left_samples) else []
         )
         least = float(left_key.min()) if len(left_samples) else np.inf
+        # a tie goes to the earlier sample
         if right_key == least:
             return min([*left_steps, PathNode(right.index, best_sample)], key=lambda step: step.sample)
         return left_steps[0] if least < right_key else PathNode(right.index, best_sample)
@@ -615,6 +616,7 @@ def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
     if not rate_conditions(formula.body):
         return bodies
     ends = _intervals(scene, [Boolean("and", tuple(rate_conditions(body))) for body in bodies])
+    # -inf: a rate of the body has no value
     return [body for body, (_, high) in zip(bodies, ends, strict=True) if high > -np.inf]
 
 

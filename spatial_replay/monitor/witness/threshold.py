@@ -326,6 +326,7 @@ class _Search:
             for slope in slopes[atom.expression]
             if slope
         }
+        # a violated formula has to rise, a satisfied one to fall
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
         low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
         end = abs(high if verdict is Verdict.VIOLATED else low)
@@ -416,6 +417,7 @@ class _Search:
 
         begin, stop = 0, len(candidates)
         step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
+        # the first candidate that flips the verdict ends an interval, which is bisected
         for end in (0, *range(step, stop, step), stop - 1):
             if flips(candidates[end]):
                 return float(candidates[bisect_left(candidates, True, begin, end, key=flips)])

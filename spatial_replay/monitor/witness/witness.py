@@ -196,6 +196,7 @@ def find_witness(
     gaps: tuple[Gap, ...] = ()
     if deciding is not None and deciding.unknown:
         gaps = evidence.gaps(deciding.atom, at_ns)
+        # everything is missing in a pause, so the pause is the reason
         if any(gap.name is None and gap.longest_ns[0] <= at_ns < gap.longest_ns[1] for gap in gaps):
             deciding = replace(deciding, unknown=("the samples pause there",))
     while_present = None
@@ -203,6 +204,7 @@ def find_witness(
         while_present = _while_present(evidence, leaves, times_ns, node, path)
 
     def flip(atom: DecidingAtom) -> Threshold | Obstacle | None:
+        # no samples follow a whole log
         samples, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
         return threshold_of(evidence, *samples, node, verdict, atom, goes_on=open_ended)
 
