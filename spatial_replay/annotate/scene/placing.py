@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 
 LETTER: Final = 0.5
 """Width of a letter by the height of a line."""
@@ -79,67 +79,114 @@ def _first_free(middle: Floats, reach: Floats, half: Floats, boxes: Sequence[Box
 
 def _above_all(middle: Floats, half: Floats, boxes: Sequence[Box], line: Floats) -> Floats:
     """Return the places (2, K) above all boxes."""
-    top = np.nanmax([high[1] for _, high in boxes], axis=0, initial=-np.inf)
+    top = np.fmax.reduce([high[1] for _, high in boxes], axis=0)
     return np.stack([middle[0], top + half[1] + _GAP * line])
 
 
-_FAR: Final = (0.0, 1.0, 3.0, 6.0)
+_FAR: Final = (0.0, 1.5, 4.0)
 """Distances of labels from what they belong to, by the height of a line."""
 
 
-def place_labels(
-    half: Floats, arrow: Box, blocked: Sequence[Box], others: Box, scene: Box, margin: Floats, line: Floats
-) -> Floats:
-    """Return the middles (K, 2) of one label in each of K scenes.
+class LabelRoom(NamedTuple):
+    """The room for one label in each of K scenes.
 
-    A label is at the first free place: beside the arrow, beside all blocked boxes, above or below the scene.
-    It covers other objects only if every place in the view does, and leaves the view only if every place in
-    it covers a blocked box.
-
-    Args:
-        half: (2, K), half the widths and heights of labels.
-        arrow: its box.
-        blocked: boxes that no label may cover.
-        others: (2, K, N) each, boxes that a label avoids.
+    Attributes:
+        half: (2, K), half the width and height of the label.
+        arrow: the box of its arrow.
+        around: the box around all blocked boxes.
+        blocked: (B, 2, K) each, boxes that it may not cover.
+        others: (N, 2, K) each, boxes that it avoids.
         scene: the box of all objects.
         margin: (K,), how far the view reaches beyond the middle of the scene.
         line: (K,), the height of a line.
     """
-    around = (
-        np.nanmin([low for low, _ in blocked], axis=0),
-        np.nanmax([high for _, high in blocked], axis=0),
-    )
-    middle, centre = (arrow[0] + arrow[1]) / 2.0, (scene[0] + scene[1]) / 2.0
-    room = np.maximum(margin - half, 0.0)
-    left, best = np.arange(half.shape[1]), np.full(half.shape[1], 8)
-    labels = _above_all(middle, half, blocked, line)
-    for candidate in _label_places(middle, half, arrow, around, scene, line):
-        places = candidate[:, left]
-        places[0] = np.clip(places[0], (centre - room)[0, left], (centre + room)[0, left])
-        begin, end = places - half[:, left], places + half[:, left]
-        is_outside = np.abs(places[1] - centre[1, left]) > room[1, left]
-        low, high = others[0][:, left], others[1][:, left]
-        covers = np.all((begin[..., None] < high) & (low < end[..., None]), axis=0)
-        rank = 2 * is_outside + np.any(covers, axis=1)
-        for low, high in blocked:
-            rank[np.all((begin < high[:, left]) & (low[:, left] < end), axis=0)] = 8
-        is_better = rank < best[left]
-        labels[:, left[is_better]], best[left[is_better]] = places[:, is_better], rank[is_better]
-        left = left[best[left] > 0]
-        if not len(left):
+
+    half: Floats
+    arrow: Box
+    around: Box
+    blocked: Box
+    others: Box
+    scene: Box
+    margin: Floats
+    line: Floats
+
+    def of_scenes(self, places: Booleans) -> LabelRoom:
+        """Return the room in some of the scenes."""
+        boxes = [
+            (low[..., places], high[..., places])
+            for low, high in (self.arrow, self.around, self.blocked, self.others, self.scene)
+        ]
+        return LabelRoom(self.half[:, places], *boxes, self.margin[places], self.line[places])
+
+
+def place_labels(room: LabelRoom) -> Floats:
+    """Return the middles (K, 2) of one label in each of K scenes.
+
+    A label is at the first free place: beside all blocked boxes, beside the arrow, above or below the scene.
+    It covers other objects only if every place in the view does, and leaves the view only if every place in
+    it covers a blocked box.
+    """
+    middle = (room.arrow[0] + room.arrow[1]) / 2.0
+    labels, ranks = _above_all(middle, room.half, [room.around], room.line), np.full(len(room.line), _NOWHERE)
+    left, rest = np.arange(len(room.line)), room
+    for number in range(_CANDIDATES):
+        places, is_possible = _candidate(number, rest)
+        if not is_possible.any():
+            continue
+        rank = np.where(is_possible, _rank(places, rest), _NOWHERE)
+        is_better = rank < ranks[left]
+        better = left[is_better]
+        labels[:, better], ranks[better] = places[:, is_better], rank[is_better]
+        is_left = ranks[left] > 0
+        if not is_left.any():
             break
+        # copies of half of the scenes cost more than another look at them
+        if is_left.mean() < _FEW:
+            left, rest = left[is_left], rest.of_scenes(is_left)
     return labels.T
 
 
-def _label_places(
-    middle: Floats, half: Floats, arrow: Box, around: Box, scene: Box, line: Floats
-) -> Iterator[Floats]:
-    """Yield the places (2, K) that a label may have, the best first."""
-    for far in _FAR:
-        for low, high in (arrow, around):
-            reach = (high - low) / 2.0 + half + (_GAP + far) * line
-            yield from ((low + high) / 2.0 + side[:, None] * reach for side in _SIDES)
-    for far in _FAR:
-        distance = half[1] + (_GAP + far) * line
-        yield np.stack([middle[0], scene[1][1] + distance])
-        yield np.stack([middle[0], scene[0][1] - distance])
+_FEW: Final = 0.7
+_NOWHERE: Final = 4
+"""The rank of a place that covers a blocked box; 2 is outside the view, 1 is on another object."""
+
+_CANDIDATES: Final = 2 * len(_SIDES) + 4 * len(_FAR) - 2
+
+
+def _rank(places: Floats, room: LabelRoom) -> Integers:
+    """Return how bad places (2, K) are, 0 for a free one."""
+    begin, end = places - room.half, places + room.half
+    (low, high), centre = room.others, (room.scene[0][1] + room.scene[1][1]) / 2.0
+    rank = _is_covered(begin, end, low, high) + 2 * (np.abs(places[1] - centre) > room.margin - room.half[1])
+    rank[_is_covered(begin, end, *room.blocked)] = _NOWHERE
+    return np.asarray(rank)
+
+
+def _is_covered(begin: Floats, end: Floats, low: Floats, high: Floats) -> Booleans:
+    """Return (K,), whether texts from `begin` to `end` (2, K) cover any of the boxes (B, 2, K)."""
+    # the heights first: most boxes are above or below
+    covers = (begin[1] < high[:, 1]) & (low[:, 1] < end[1])
+    covers &= (begin[0] < high[:, 0]) & (low[:, 0] < end[0])
+    return np.asarray(covers.any(axis=0))
+
+
+def _candidate(number: int, room: LabelRoom) -> tuple[Floats, Booleans]:
+    """Return one place for each label (2, K), the best first, and where it is possible (K,)."""
+    middle, half, gap = (room.arrow[0] + room.arrow[1]) / 2.0, room.half, _GAP * room.line
+    centre = (room.scene[0][0] + room.scene[1][0]) / 2.0
+    reach = np.maximum(room.margin - half[0], 0.0)
+    if number < 2 * len(_SIDES):
+        low, high = room.around if number < len(_SIDES) else room.arrow
+        side = _SIDES[number % len(_SIDES)]
+        places = (low + high) / 2.0 + side[:, None] * ((high - low) / 2.0 + half + gap)
+        if side[0]:
+            return places, np.abs(places[0] - centre) <= reach
+    else:
+        number -= 2 * len(_SIDES)
+        far, is_below = divmod(number, 2)
+        is_of_scene = far >= len(_FAR) - 1
+        low, high = room.scene if is_of_scene else room.around
+        distance = half[1] + gap + _FAR[far - len(_FAR) + 1 if is_of_scene else far + 1] * room.line
+        places = np.stack([middle[0], low[1] - distance if is_below else high[1] + distance])
+    places[0] = np.clip(places[0], centre - reach, centre + reach)
+    return places, np.ones(len(reach), np.bool_)

@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.scene.extent import VIEW, SceneExtent
-from spatial_replay.annotate.scene.placing import Box, columns_of, half_sizes, place_labels, place_names
+from spatial_replay.annotate.scene.placing import (
+    Box,
+    LabelRoom,
+    columns_of,
+    half_sizes,
+    place_labels,
+    place_names,
+)
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -287,20 +294,23 @@ class SceneEncoder:
         these outlines; and the state after the samples."""
         last, outline_numbers = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
         outlines, rows_of = list[tuple[Floats, ...]](), list[Floats]()
+        line_heights, line = np.unique(lines, return_inverse=True)
         for name in sorted(self.named & {*trace.names, *last}):
             column = trace.names.index(name) if name in trace.names else None
             rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
             seen = np.maximum.accumulate(np.where(rows >= 0, np.arange(len(rows)), -1))
             last_seen = np.where(rows[written] < 0, seen[written], len(rows))
-            for at, line in np.unique([last_seen, lines], axis=1).T.tolist() if len(lines) else []:
+            keys = last_seen * len(line_heights) + line
+            for key in np.unique(keys).tolist():
+                at, height = divmod(key, len(line_heights))
                 if at < len(rows) and (at >= 0 or name in last):
-                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[int(at)]))
-                    outline_numbers[(last_seen == at) & (lines == line), names.index(name)] = len(outlines)
+                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[at]))
+                    outline_numbers[keys == key, names.index(name)] = len(outlines)
                     rings = rings_of(batch.select(np.array([row])), _POINT * (state.scale or _UNSCALED))
                     outlines.append(rings.rings_of(0))
                     places = np.concatenate(outlines[-1])
                     middle = (places[:, 0].min() + places[:, 0].max()) / 2.0
-                    under = [[middle, places[:, 1].min() - 0.75 * line]]
+                    under = [[middle, places[:, 1].min() - 0.75 * line_heights[height]]]
                     rows_of.append(np.concatenate([dashes_of(outlines[-1]), under]))
             if len(seen) and seen[-1] >= 0:
                 last[name] = trace.footprints, int(rows[seen[-1]])
@@ -516,12 +526,13 @@ def _box(points: Floats) -> Floats:
 
 
 def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
-    """Return the boxes (2, K, N) of the objects of K messages; NaN where one is absent."""
+    """Return the boxes (N, 2, K) of the objects of K messages; NaN where one is absent."""
+    places = observations.T
     if not len(low):
-        return np.full((2, *observations.shape), np.nan), np.full((2, *observations.shape), np.nan)
-    is_absent = observations < 0
-    corners = [np.where(is_absent, np.nan, corner[observations]) for corner in (*low.T, *high.T)]
-    return np.stack(corners[:2]), np.stack(corners[2:])
+        nowhere = np.full((len(places), 2, places.shape[1]), np.nan)
+        return nowhere, nowhere
+    columns = [np.where(places < 0, np.nan, column[places]) for column in (*low.T, *high.T)]
+    return np.stack(columns[:2], axis=1), np.stack(columns[2:], axis=1)
 
 
 def _label_letters(arrows: ArrowTexts, messages: Integers) -> Floats:
@@ -547,7 +558,10 @@ def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View)
     scene = view.corners[:, 0].T, view.corners[:, 1].T
     margin = VIEW / 2.0 * (scene[1] - scene[0]).max(axis=0)
     half = half_sizes(letters, view.line)
-    return spots, place_labels(half, arrow, blocked, others, scene, margin, view.line)
+    lows, highs = (np.stack(corners) for corners in zip(*blocked, strict=True))
+    around = np.fmin.reduce(lows, axis=0), np.fmax.reduce(highs, axis=0)
+    room = LabelRoom(half, arrow, around, (lows, highs), others, scene, margin, view.line)
+    return spots, place_labels(room)
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
