@@ -120,6 +120,9 @@ class Annotator:
     """Encodes the results of an evaluation as messages, sample after sample.
 
     Cutting the samples into blocks changes no message.
+
+    Attributes:
+        first_event_ns: the time of the first event; None before it.
     """
 
     def __init__(
@@ -167,6 +170,7 @@ class Annotator:
         requirements = [requirement for result in self._results for requirement in result.requirements]
         named = frozenset(name for requirement in requirements for name in requirement.objects)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
+        self.first_event_ns: int | None = None
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self.standing.zero_ns = self._scene.zero_ns
@@ -336,6 +340,8 @@ class Annotator:
 
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
         times_ns = np.array([event.time_ns for event in events], np.int64)
+        if len(events) and self.first_event_ns is None:
+            self.first_event_ns = events[0].time_ns
         logs = [event.log.SerializeToString(deterministic=True) for event in events]
         by_time = groupby(events, attrgetter("time_ns"))
         recent = {time_ns: self._recent(list(same_time)) for time_ns, same_time in by_time}

@@ -177,7 +177,12 @@ class AnnotatedEvaluation:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
         zero = TextZero(self.annotator.scene.zero_ns or 0, *start)
         return layout_attachment(
-            contents._replace(outcomes=standing.outcomes, order=standing.order, zero=zero)
+            contents._replace(
+                outcomes=standing.outcomes,
+                order=standing.order,
+                zero=zero,
+                first_event_ns=self.annotator.first_event_ns,
+            )
         )
 
     @cached_property

@@ -347,6 +347,10 @@ class TextZero(NamedTuple):
         return f"0 s = {clock}{', ' if self.offset else ''}{self.offset}"
 
 
+_OPENING_NS: Final = 99_000_000
+"""The time that a viewer plays by itself when it opens a log."""
+
+
 class LayoutContents(NamedTuple):
     """Content of a layout for a log.
 
@@ -363,6 +367,7 @@ class LayoutContents(NamedTuple):
         planned_for: the file that the planner's decisions were made for, if these results are of another one.
         zero: the time that texts count from; None before it is known.
         planned: the name of the result that a planner worked for; "" without any.
+        first_event_ns: the time of the first event; None without any, or before it is known.
     """
 
     trees: Sequence[ReportedTree]
@@ -377,6 +382,18 @@ class LayoutContents(NamedTuple):
     planned_for: str = ""
     zero: TextZero | None = None
     planned: str = ""
+    first_event_ns: int | None = None
+
+    @property
+    def first_tab(self) -> str:
+        """The title of the tab that is open at first: it shows something at once."""
+        if self.planned and PLAN_DECISION in self.topics:
+            return "decision"
+        if not self.outcomes or any(outcome.standing == VIOLATED for outcome in self.outcomes):
+            return "violated"
+        start_ns = 0 if self.zero is None else self.zero.start_ns
+        is_at_once = self.first_event_ns is not None and self.first_event_ns <= start_ns + _OPENING_NS
+        return "events" if is_at_once else "specification"
 
     def worst_first(self) -> LayoutContents:
         """Return the same with the worst results first, which then have lights and curves if not all can.
@@ -466,7 +483,7 @@ _Details = list[tuple[str, Panel]]
 
 
 def _details(contents: LayoutContents) -> _Details:
-    """Return the panels that are in tabs, that of violations first; in a log without any, that of events."""
+    """Return the panels that are in tabs, first the one that opens."""
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
     # the seconds in both tables are not those of the axes
     clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
@@ -474,9 +491,7 @@ def _details(contents: LayoutContents) -> _Details:
     if trees:
         rows.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
     if trees and RECENT_EVENTS in contents.topics:
-        events = ("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events")
-        is_empty = contents.outcomes and all(outcome.standing != VIOLATED for outcome in contents.outcomes)
-        rows.insert(0 if is_empty else 1, events)
+        rows.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
     if trees:
         # a list of texts is shown centred, one text is not
         which = "0" if all(tree.file == 0 for tree in trees) else ":"
@@ -490,9 +505,8 @@ def _details(contents: LayoutContents) -> _Details:
     if PLAN_DECISION in contents.topics:
         of = f", for {planned_for} as recorded" if planned_for else ""
         why = f"Why the planner decided so{of}"
-        decision = ("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason")
-        # the first tab is open
-        rows.insert(0 if contents.planned else len(rows), decision)
+        rows.append(("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason"))
+    rows.sort(key=lambda row: row[0] != contents.first_tab)
     details = [(tab, _title_panel(panel, title, {"topicPath": path})) for tab, panel, title, path in rows]
     cameras = image_panels(contents.images, contents.topics)
     return details + [(camera.config["foxglovePanelTitle"].lower(), camera) for camera in cameras]

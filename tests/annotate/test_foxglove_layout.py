@@ -108,6 +108,9 @@ def test_the_scene_has_half_of_the_window_and_details_are_in_tabs(tmp_path):
     titles = [tab["title"] for tab in layout_of(run(tmp_path, mixed))["configById"]["Tab!curves"]["tabs"]]
     assert "results [mixed]" in titles and {"specs", "specs [no unit]"} <= {*titles}
     held = layout_of(run(tmp_path, "spec apart = G a farfrom[0] b"))
+    # a viewer shows nothing of events before the first one
+    assert held["configById"]["Tab!details"]["tabs"][0]["title"] == "specification"
+    held = layout_of(run(tmp_path, "spec apart = a farfrom[0] b"))
     assert held["configById"]["Tab!details"]["tabs"][0]["title"] == "events"
 
 
