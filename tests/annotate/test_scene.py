@@ -417,6 +417,15 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
     assert begin[1] == end[1]
 
 
+def test_names_and_labels_of_an_arrow_cover_no_other_object_where_a_side_is_free():
+    objects = {"a": box_at(0.0), "b": box_at(9.0), "c": Footprint.box(-1.0, 1.1, 11.0, 3.0)}
+    [message] = pointed("spec s = G (a dist b >= 99)", objects)
+    line = 12.0 / 20.0
+    for text in entity(message, "witness").texts:
+        y = text.pose.position.y
+        assert y + line / 2.0 <= 1.1 or y - line / 2.0 >= 3.0, text.text
+
+
 def test_a_name_stands_below_an_object_that_is_too_small_for_it():
     [message] = pointed(
         "spec s = G (a dist big >= 0)",

@@ -16,8 +16,8 @@ from spatial_replay.trace.trace import Trace
 VIEW: Final = 1.5
 """The height of the picture by the longer side of the scene; a panel may be narrower than it is high."""
 
-_STEP: Final = 1.25
-"""Ratio of the sizes that texts are placed by: smaller steps would move all names of a growing scene."""
+_STEP: Final = 1.5
+"""Ratio of the sizes that texts are placed by: a scene that grows goes on growing, and names seldom move."""
 
 
 class SceneBounds(NamedTuple):

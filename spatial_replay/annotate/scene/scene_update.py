@@ -17,14 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.scene.extent import VIEW, SceneExtent
-from spatial_replay.annotate.scene.placing import (
-    Box,
-    LabelRoom,
-    columns_of,
-    half_sizes,
-    place_labels,
-    place_names,
-)
+from spatial_replay.annotate.scene.placing import Box, Surroundings, place_labels, place_names
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -435,13 +428,13 @@ def _content(
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
     messages = np.flatnonzero(found.is_shown)
-    deciding = _deciding_boxes(names, found, arrows, observations, (low, high), missing, regions)
+    boxes_of_objects = _boxes_of(observations[messages], low, high)
+    deciding = _deciding_boxes(names, found, arrows, boxes_of_objects, missing, regions)
     spots, label = np.zeros((len(rows), 2, 2)), np.full((len(rows), 2), np.nan)
     of_messages = _View(view.corners[messages], view.line[messages])
-    others = _boxes_of(observations[messages], low, high)
-    spots[messages], label[messages] = _places(
-        deciding, _label_letters(arrows, messages), others, of_messages
-    )
+    letters_of_label = np.array([len(cause.text) + cause.length for cause in arrows.causes], np.float64)
+    letters_of_label = letters_of_label[arrows.cause[messages]] if len(messages) else np.empty(0)
+    spots[messages], label[messages] = _places(deciding, letters_of_label, boxes_of_objects, of_messages)
     return SceneContent(
         names,
         rows,
@@ -461,8 +454,9 @@ def _content(
     )
 
 
-_ARROW_BOX: Final = 2
-"""The place of the arrow's box among those that no name may cover."""
+_ARROW_BOX, _THEN_BOX, _BLOCKED = 2, 3, 6
+"""Places of the boxes of the arrow and of earlier outlines among those that no text may cover: those of the
+objects come first, those of names last."""
 
 
 class _DecidingBoxes(NamedTuple):
@@ -471,53 +465,55 @@ class _DecidingBoxes(NamedTuple):
     low: Floats
     high: Floats
     letters: Floats
-    blocked: Floats
+    blocked: Box
 
 
 def _deciding_boxes(
     names: Sequence[str],
     found: Violations,
     arrows: ArrowTexts,
-    observations: Integers,
-    boxes_of_objects: tuple[Floats, Floats],
+    boxes_of_objects: Box,
     missing: tuple[Integers, Dashes],
     regions: Mapping[str, Floats],
 ) -> _DecidingBoxes:
-    """Return the boxes of what decides violations, and the boxes that the names must not cover."""
+    """Return the boxes of what decides violations, and the boxes that texts must not cover.
+
+    Args:
+        boxes_of_objects: of the messages with an arrow, in the order of `names`.
+    """
     messages = np.flatnonzero(found.is_shown)
-    boxes_of = np.full((len(messages), 2, 2, 2), np.nan)
-    blocked = np.full((len(messages), 4, 2, 2), np.nan)
-    letters = np.zeros((len(messages), 2))
+    ends = found.points[messages].transpose(1, 2, 0)
+    named = np.full((2, 2, 2, len(messages)), np.nan)
+    blocked = np.full((2, _BLOCKED, 2, len(messages)), np.nan)
+    letters = np.zeros((2, len(messages)))
     lasts = [_box(np.concatenate(rings)) for rings in missing[1].rings]
     for cause in np.unique(arrows.cause[messages]).tolist():
-        places = np.flatnonzero(arrows.cause[messages] == cause)
+        is_cause = arrows.cause[messages] == cause
+        places = slice(None) if is_cause.all() else np.flatnonzero(is_cause)
         text = arrows.causes[cause]
         if text.dashes:
-            blocked[places, 3] = _box(np.reshape(text.dashes, (-1, 2)))
+            blocked[:, _THEN_BOX][..., places] = _box(np.reshape(text.dashes, (-1, 2)))[..., None]
         for side, name in enumerate(text.names):
-            letters[places, side] = len(name.name) + 2
+            letters[side, places] = len(name.name) + 2
             if isinstance(name, RegionName):
                 if name.name in regions:
-                    boxes_of[places, side] = _box(regions[name.name])
+                    named[:, side][..., places] = _box(regions[name.name])[..., None]
                 continue
             if name.name not in names:
                 continue
             column = names.index(name.name)
-            rows, last = (table[messages[places], column] for table in (observations, missing[0]))
-            seen, gone = np.flatnonzero(rows >= 0), np.flatnonzero(last >= 0)
-            corners = np.stack([corner[rows[seen]] for corner in boxes_of_objects], axis=1)
-            boxes_of[places[seen], side] = corners
-            for place in gone.tolist():
-                boxes_of[places[place], side] = lasts[last[place]]
-                letters[places[place], side] = len(missing_words(name.name))
-            blocked[places, side] = boxes_of[places, side]
-    ends = found.points[messages]
-    # reductions over two ends are slow
-    blocked[:, _ARROW_BOX, 0] = np.minimum(ends[:, 0], ends[:, 1])
-    blocked[:, _ARROW_BOX, 1] = np.maximum(ends[:, 0], ends[:, 1])
+            for corner, of_objects in zip(blocked, boxes_of_objects, strict=True):
+                corner[side][:, places] = of_objects[column][:, places]
+            last = missing[0][messages, column]
+            for place in np.flatnonzero(is_cause & (last >= 0)).tolist():
+                blocked[:, side][..., place] = lasts[last[place]]
+                letters[side, place] = len(missing_words(name.name))
+            named[:, side][..., places] = blocked[:, side][..., places]
+    blocked[0, _ARROW_BOX] = np.minimum(ends[0], ends[1])
+    blocked[1, _ARROW_BOX] = np.maximum(ends[0], ends[1])
     # an object that is gone has its name at the arrow
-    boxes_of = np.where(np.isnan(boxes_of), ends[:, :, None], boxes_of)
-    return _DecidingBoxes(boxes_of[:, :, 0], boxes_of[:, :, 1], letters, blocked)
+    low, high = np.where(np.isnan(named), ends, named)
+    return _DecidingBoxes(low, high, letters, (blocked[0], blocked[1]))
 
 
 def _box(points: Floats) -> Floats:
@@ -535,12 +531,6 @@ def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
     return np.stack(columns[:2], axis=1), np.stack(columns[2:], axis=1)
 
 
-def _label_letters(arrows: ArrowTexts, messages: Integers) -> Floats:
-    """Return the lengths (K,) of the labels of some messages."""
-    lengths = np.array([len(cause.text) + cause.length for cause in arrows.causes], np.float64)
-    return lengths[arrows.cause[messages]] if len(lengths) else np.empty(0)
-
-
 def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View) -> tuple[Floats, Floats]:
     """Return the middles of names (K, 2, 2) and of the label (K, 2) of an arrow.
 
@@ -549,19 +539,12 @@ def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View)
         others: boxes of all objects.
         view: that of these messages.
     """
-    blocked = columns_of(deciding.blocked)
-    spots = place_names(deciding.low, deciding.high, deciding.letters, blocked, view.line)
-    arrow = blocked[_ARROW_BOX]
-    for place in range(spots.shape[1]):
-        half, middle = half_sizes(deciding.letters[:, place], view.line), spots[:, place].T
-        blocked.append((middle - half, middle + half))
-    scene = view.corners[:, 0].T, view.corners[:, 1].T
-    margin = VIEW / 2.0 * (scene[1] - scene[0]).max(axis=0)
-    half = half_sizes(letters, view.line)
-    lows, highs = (np.stack(corners) for corners in zip(*blocked, strict=True))
-    around = np.fmin.reduce(lows, axis=0), np.fmax.reduce(highs, axis=0)
-    room = LabelRoom(half, arrow, around, (lows, highs), others, scene, margin, view.line)
-    return spots, place_labels(room)
+    low, high = view.corners.transpose(1, 2, 0)
+    margin = VIEW / 2.0 * (high - low).max(axis=0)
+    around = Surroundings(deciding.blocked, others, (low, high), margin, view.line)
+    spots = place_names(deciding.low, deciding.high, deciding.letters, around)
+    arrow = deciding.blocked[0][_ARROW_BOX], deciding.blocked[1][_ARROW_BOX]
+    return spots.transpose(2, 0, 1), place_labels(letters, arrow, around).T
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
