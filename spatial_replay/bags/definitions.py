@@ -180,6 +180,7 @@ class _Walk:
             return self._measured[name]
         if name not in self._definitions:
             raise LogError(f"the definition of {name!r:.100} is missing" + _used_by(above))
+        # the depth is limited, because this function calls itself
         if name in above or len(above) >= 64:
             raise LogError(f"the type {name!r} contains itself" + _used_by(above))
         if len(self.used) >= MOST_TYPES:

@@ -110,6 +110,7 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
             case b"none":
                 content = data
             case b"bz2":
+                # one byte more shows a chunk that is larger than it says
                 content = bz2.BZ2Decompressor().decompress(data, size + 1)
             case b"lz4":
                 content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))

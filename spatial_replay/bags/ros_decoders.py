@@ -47,6 +47,7 @@ _IDL_ASIDE = re.compile(r'"(?:\\"|[^"])*"|\'(?:[^\'\\\n]|\\.)*\'|//[^\n]*|/\*.*?
 _IDL_ANNOTATION = re.compile(r"@[A-Za-z_][\w:]*\s*\(")
 _IDL_ENUM = re.compile(r"\benum\s+([A-Za-z]\w*)\s*\{", re.ASCII)
 _IDL_NESTED_TYPE = re.compile(r"<[^<>]*<[^<>]*<")
+# values of `Nodetype` in rosbags
 _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 
 

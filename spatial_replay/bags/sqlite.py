@@ -446,7 +446,9 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         # one thread reads, but garbage collection in another may close it
         connected = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
         with closing(connected) as database:
+            # no value is longer than its file
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, size))
+            # texts of a damaged file may hold any bytes
             database.text_factory = lambda text: text.decode("utf-8", "replace")
             # without this, SQLite refuses a truncated file; nothing is ever written
             database.execute("PRAGMA writable_schema=ON")

@@ -61,6 +61,7 @@ def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
     while branches:
         parent, behaviour = branches.pop()
         kind = type(behaviour).__name__ if behaviour.children else "Action"
+        # reversed, because the last branch of the stack comes first
         branches += [(len(nodes), child) for child in reversed(behaviour.children)]
         nodes.append(TreeNode(behaviour.name, kind, parent, behaviour.status.name))
     return tuple(nodes)
@@ -86,5 +87,6 @@ class Nav2Tree:
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"
             self._nodes[key] = TreeNode(change.node_name, "", None, status)
+        # a stable sort: names, in old versions, stay in the order of their first change
         keys = sorted(self._nodes, key=lambda key: key if isinstance(key, int) else 0)
         return tuple(self._nodes[key] for key in keys)

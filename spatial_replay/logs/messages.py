@@ -133,6 +133,7 @@ class Messages:
     def within(self, start_ns: int, end_ns: int) -> Self:
         """Return the messages with log times in [start_ns, end_ns), in the same order."""
         times_ns = self.log_time_ns
+        # `end_ns` may exceed int64
         inside = (times_ns >= start_ns) & (times_ns <= min(end_ns - 1, LATEST_NS))
         return self if inside.all() else select(self, np.flatnonzero(inside))
 
@@ -184,6 +185,7 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
+    # by identity, because a rank holds the whole schema and is computed once for each object
     distinct = {id(channel): channel for stream in streams for channel in stream.channels.values()}
     by_rank = {_rank(channel): channel for channel in distinct.values()}
     number = {rank: place for place, rank in enumerate(sorted(by_rank))}

@@ -349,6 +349,7 @@ class RemoteFile(PathLike[str]):
         self._obstore = obstore_library()
         self._store = open_store(self._scheme, bucket)
         self._held = HeldBytes()
+        # two locks, because the first read holds `_opening` and may take `_lock` in `fetch`
         self._lock, self._opening = Lock(), Lock()
         self._version: FileVersion | None = None
 
@@ -402,6 +403,7 @@ class RemoteFile(PathLike[str]):
             MissingFileError, RemoteError: it cannot be read, or has changed.
         """
         end = min(end, self.version.size)
+        # a read of more than half of the cache is not cached, because it would evict its own beginning
         if end - begin > MOST_HELD_BYTES // 2:
             bounds = range(begin, end, _PIECE_BYTES)
             return b"".join(self.iter_pieces([(start, min(start + _PIECE_BYTES, end)) for start in bounds]))
@@ -671,6 +673,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
         _has(folder / below / _name(file), file.version.size) for file in files
     ):
         with suppress(OSError):
+            # the time of the last use, see `_make_room`
             os.utime(folder)
         return folder / below
     if size > limit:
@@ -684,6 +687,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
     try:
         parent.mkdir(parents=True, exist_ok=True)
         _make_room(parent, limit - size)
+        # renamed when it is complete, so that no process reads a partial copy
         partial = Path(tempfile.mkdtemp(".partial", "", parent))
         try:
             (partial / below).mkdir(exist_ok=True)
@@ -691,6 +695,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
                 for file in files:
                     _write(file, partial / below / _name(file), advance)
             shutil.rmtree(folder, ignore_errors=True)
+            # another process has made the same copy
             with suppress(FileExistsError):
                 partial.rename(folder)
         finally:

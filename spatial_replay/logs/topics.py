@@ -157,6 +157,7 @@ _IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})
 
 def is_image_type(name: str) -> bool:
     """Return whether messages of a type are images or frames of a video: of ROS or of Foxglove."""
+    # ROS writes sensor_msgs/msg/Image, Foxglove foxglove.RawImage
     package, _, short = name.replace(".", "/").rpartition("/")
     return short in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
 

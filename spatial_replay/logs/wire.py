@@ -110,6 +110,7 @@ class WireTemplate:
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
+        # XOR is 0 where bytes are equal; `fixed` leaves out the slots
         return np.asarray(~((rows ^ self.payload) & self.fixed).any(axis=1))
 
     def words(self, rows: Bytes) -> Words:
@@ -224,6 +225,7 @@ class Payloads(Sequence[bytes]):
                 step = max(1, _CACHED_BYTES // size)
                 for begin in range(0, len(places), step):
                     some = places[begin : begin + step]
+                    # void elements copy whole messages, without an index for each byte
                     stretches(target, size)[starts[some]] = stretches(source, size)[self.start[some]]
 
 

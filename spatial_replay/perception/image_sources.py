@@ -365,6 +365,7 @@ class CameraFrames:
                         f"{self.name} gives no more pictures after {last_ns / 1e9:.3f} s; is it unplugged?"
                     )
                     return
+                # the wall clock may be set while the camera runs
                 now = time.monotonic_ns()
                 first = now if first is None else first
                 last_ns = max(now - first, last_ns + 1)

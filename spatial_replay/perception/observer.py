@@ -96,6 +96,7 @@ def poses_on_plane(
         axis=-1,
     )
     position = centre - shift
+    # unwrapped, so that a step across 180 degrees is no large derivative
     numbers = np.concatenate([position, np.unwrap(yaw, axis=1)[..., None], edge[..., None]], axis=-1)
     derivative = (numbers[:, 1:9] - numbers[:, 9:]) / (2 * _STEP)
     variance = plane.corner_error**2
@@ -221,9 +222,11 @@ def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     if len(poses) == 1:
         return poses[0]
     first = poses[0].yaw
+    # yaws within half a turn of the first one, so that their mean is between them
     states = np.array(
         [[*pose.place, first + math.remainder(pose.yaw - first, 2 * math.pi)] for pose in poses]
     )
+    # pseudo-inverses, because poses on the plane have no variance of z
     weights = [np.linalg.pinv(pose.spread, hermitian=True, rcond=1e-12) for pose in poses]
     spread = np.linalg.pinv(sum(weights, np.zeros((4, 4))), hermitian=True, rcond=1e-12)
     mean = spread @ sum((w @ x for w, x in zip(weights, states, strict=True)), np.zeros(4))

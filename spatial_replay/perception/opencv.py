@@ -87,6 +87,7 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
     """
     try:
         if data.startswith(_PNG):
+            # the first chunk is IHDR: https://www.w3.org/TR/png/#11IHDR
             width, height = struct.unpack_from(">II", data, 16)
             return width, height
         if data.startswith(b"\xff\xd8"):
@@ -107,6 +108,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             at += 1
             continue
         if marker in _JPEG_FRAMES:
+            # after marker, length and precision: https://www.w3.org/Graphics/JPEG/itu-t81.pdf, B.2.2
             height, width = struct.unpack_from(">HH", data, at + 5)
             return width, height
         at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])

@@ -97,6 +97,7 @@ class Decoder:
         av = load_av()
         context.thread_type, context.thread_count = "NONE", 1
         context.options = dict(_OPTIONS)
+        # a frame gets the `opaque` of its packet
         context.flags |= av.codec.context.Flags.copy_opaque
         self._context = context
         self._losses = 0
@@ -122,6 +123,7 @@ class Decoder:
             packet.opaque = sent
             sent.pts, sent.time_base = packet.pts, packet.time_base
         with _TURN, av.logging.Capture() as said:
+            # FFmpeg reports missing frames at this level only
             av.logging.set_level(av.logging.DEBUG)
             try:
                 frames = self._context.decode(packet)
@@ -552,6 +554,7 @@ class H264Encoder:
             "preset": "ultrafast",
             "tune": "zerolatency",
             "crf": "23",
+            # parameter sets before each key frame, as `foxglove.CompressedVideo` demands
             "x264-params": "repeat-headers=1",
         }
         self._context = context

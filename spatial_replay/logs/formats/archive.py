@@ -19,6 +19,7 @@ from spatial_replay.errors import LogError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.formats.episodes import MOST_BYTES
 
+# https://www.zlib.net/zlib_tech.html
 _BEST_RATIO: Final = 1100
 """Largest compression ratio; deflate reaches 1,032."""
 _SMALL: Final = 2**26
@@ -122,6 +123,7 @@ class Group:
             links, key = getattr(getattr(group, "id", None), "links", None), name.encode()
             if not isinstance(group, h5py.Group) or links is None or not links.exists(key):
                 return None
+            # the type of a link is checked before h5py follows the link
             kind = links.get_info(key).type
             if kind == h5py.h5l.TYPE_HARD:
                 group = group[name]
@@ -211,6 +213,7 @@ def row_count(array: Any) -> int:
     if array.is_virtual or array.external:
         raise LogError(f"{array.name} has its data in other files, which are not read; {_COPY}")
     size = math.prod(array.shape) * array.dtype.itemsize
+    # HDF5 decompresses a whole chunk, even for one row
     largest = max(size, math.prod(array.chunks or ()) * array.dtype.itemsize)
     file_size = array.file.id.get_filesize()
     if largest > max(_SMALL, _BEST_RATIO * file_size) or largest > MOST_BYTES:

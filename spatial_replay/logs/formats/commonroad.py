@@ -108,7 +108,10 @@ class _Collector:
         self._depth = self._inside = 0
         self._finished: list[Element] = []
         self.parser = expat.ParserCreate()
+        # one event for a text with line breaks:
+        # https://docs.python.org/3/library/pyexpat.html#xml.parsers.expat.xmlparser.buffer_text
         self.parser.buffer_text = True
+        # entities are dangerous: https://docs.python.org/3/library/xml.html
         self.parser.StartDoctypeDeclHandler = self._doctype
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
@@ -382,6 +385,7 @@ def _moving_states(
     occupied = obstacle.child("occupancySet")
     for occupancy in occupied.all("occupancy") if occupied else ():
         for step, state in _occupied_states(occupancy, report):
+            # an exact state is better than an occupancy of the same time step
             states.setdefault(step, state)
     return states
 
@@ -602,6 +606,7 @@ def _step(time: Element) -> int:
 
 def _whole(element: Element) -> int:
     text = element.text
+    # `int` also accepts signs, spaces, underscores and digits of other scripts
     if not (len(text) <= _LONGEST_STEP and text.isascii() and text.isdecimal()):
         raise ScenarioError(f"a time step is {text[:60]!r}; give an integer from 0 on")
     return int(text)

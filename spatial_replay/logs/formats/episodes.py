@@ -351,6 +351,7 @@ def frame_times_ns(frames: Integers, fps: float) -> Integers:
     period = Fraction(10**9) / Fraction(repr(float(fps)))
     if len(frames) and (frames.min() < 0 or int(frames.max()) * period > LATEST_NS):
         raise LogError(f"frames {int(frames.min())} to {int(frames.max())} are no valid numbers of frames")
+    # fast in int64, where products fit as checked above; other periods take fractions
     if period.denominator == 1 and period.numerator < 2**31:
         return frames.astype(np.int64) * period.numerator
     return np.array([round(frame * period) for frame in frames.tolist()], np.int64)

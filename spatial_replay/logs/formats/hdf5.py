@@ -113,6 +113,7 @@ class _Demonstrations(InGroups):
         home = file.group(self.folder) or file
         keys = sorted((key for key in home.names if _NUMBERED.fullmatch(key)), key=natural_key)
         places = [int(key.rpartition("_")[2]) for key in keys]
+        # groups of several prefixes may share a number
         places = places if len(set(places)) == len(keys) else list(range(len(keys)))
         self.episodes = tuple(
             self._describe(home, number, key) for number, key in zip(places, keys, strict=True)
@@ -291,6 +292,7 @@ class _IsaacLab(_Demonstrations):
         self.task = str(about.get("env_name") or "") or None
         steps = _object(about.get("sim_args"))
         try:
+            # a step of the environment has `decimation` steps of physics
             self.fps = 1 / (float(steps["dt"]) * int(steps["decimation"]))
         except (KeyError, TypeError, ValueError, ZeroDivisionError):
             self.fps = None

@@ -174,6 +174,7 @@ class _LeRobot(DataSet):
             numbers = _read_columns(file, {"episode_index"}).get("episode_index")
             if numbers is None:
                 raise LogError(f"{file.name} has no column episode_index")
+            # NaN differs from every number, so row 0 is a first row, too
             firsts = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0)
             ends = [*firsts[1:].tolist(), len(numbers)]
             rows_by_number: dict[int, _Rows] = {}
@@ -247,6 +248,7 @@ def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str
         frames = integer_or_none(row.get("length"))
         episodes.append(Episode(number, str(number), frames, str(task) if task else None))
         places = row.get("data/chunk_index"), row.get("data/file_index")
+        # version 2 names files by episode, version 3 by chunk and file number
         file_of[number] = f"episode_{number:06d}.parquet"
         if all(isinstance(place, int) for place in places):
             file_of[number] = "chunk-{:03d}/file-{:03d}.parquet".format(*places)
@@ -314,6 +316,7 @@ def _remarks(
     if "timestamp" in columns:
         off = np.abs(columns["timestamp"].reshape(-1) - frames / fps)
         at = int(np.nan_to_num(off, nan=0.0).argmax()) if len(off) else 0
+        # late times in float32 are less exact than the usual error
         if len(off) and off[at] > max(_TIME_ERROR_S, float(np.spacing(np.float32(frames[at] / fps)))):
             yield (
                 f"its timestamp is {columns['timestamp'].reshape(-1)[at]:.6g} s at frame {frames[at]:g},"

@@ -150,6 +150,7 @@ class _Hdf5(_Minari, InGroups):
             }
 
     def array_path(self, name: str) -> str:
+        # in HDF5, Minari names the elements of a tuple _index_0, _index_1 …
         return "/".join(f"_index_{part}" if part.isdecimal() else part for part in name.split("/"))
 
 

@@ -395,6 +395,7 @@ def _source(text: str, place: str, assets: Path | None) -> _ModelSource:
     folder = _Folder(assets)
     _include(root, folder, place, depth=0)
     _refuse_many(root, place)
+    # MuJoCo searches meshes in meshdir, or else in assetdir
     directories = [compiler.get(key, "") for compiler in root.iter("compiler") for key in _FOLDERS[::2]]
     files = _strip(root, folder, next((name for name in directories if name), ""))
     xml = ElementTree.tostring(root, encoding="unicode")
@@ -473,6 +474,7 @@ def _include(parent: ElementTree.Element, folder: _Folder, place: str, depth: in
             _include(child, folder, place, depth)
             continue
         parent.remove(child)
+        # the depth is limited, because a file may include itself
         content = folder.read(child.get("file", "")) if depth < 8 else None
         if content is not None:
             included = _element(content.decode("utf-8", "replace"), f"{place}, {child.get('file')}")

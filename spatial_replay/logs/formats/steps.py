@@ -138,6 +138,7 @@ class _Npz(_Steps):
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(".npy")
                 with archive.open(entry) as stream:
+                    # the header is checked first: a pickle is never loaded, nor an array that does not fit
                     shape, dtype = _npy_header(cast("BinaryIO", stream), f"{self.name}: {name}")
                 if dtype.hasobject:
                     self.remarks += (f"{name} holds Python objects (a pickle), which are never loaded",)

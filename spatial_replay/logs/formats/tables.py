@@ -84,6 +84,7 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     width = int(np.prod(widths))
     if len(is_null) == 0:
         return cast("Floats", numbers.reshape(count, width))
+    # `flatten` drops lists that are null
     filled = np.full((count, width), np.nan)
     filled[~is_null] = numbers.reshape(-1, width)
     return filled

@@ -253,6 +253,7 @@ def _report(entry: Any) -> ObjectReport:
         if len(height) != 2:
             raise _NoSampleError(f"{what}: height has {len(height)} numbers; give [bottom, top]")
         report.bottom, report.top = (_number(value, f"{what}: height") for value in height)
+        # given, but unknown: NaN differs from itself
         report.invalid = report.bottom != report.bottom and report.top != report.top
     if entry.get("yaw") is not None:
         report.yaw = _number(entry["yaw"], f"{what}: yaw")
@@ -267,6 +268,7 @@ def _add_part(report: ObjectReport, vertices: Any, radius: float, what: str) -> 
         if type(point) is not list or len(point) != 2:
             raise _NoSampleError(f"{what} holds {_short(point)}; give [x, y] pairs")
         x, y = point
+        # most numbers are floats, which need no check
         flat.append(x if type(x) is float else _number(x, what))
         flat.append(y if type(y) is float else _number(y, what))
     report.vertex_counts.append(len(points))
@@ -387,6 +389,7 @@ def _column_order(path: Path, header: str) -> list[str]:
 
 def _row(line: str, order: list[str]) -> dict[str, str]:
     try:
+        # one line at a time, so that an open quote does not swallow later lines
         cells = next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
         raise _NoSampleError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
@@ -541,6 +544,7 @@ def _box(cells: list[str]) -> tuple[int, list[float], bool, str]:
 
 
 def _integer(text: str, what: str, last: int) -> int:
+    # `int` also accepts signs, spaces, underscores and digits of other scripts
     is_number = len(text) <= len(str(_LARGEST)) and text.isascii() and text.isdecimal()
     if not is_number or int(text) > last:
         raise _NoSampleError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")

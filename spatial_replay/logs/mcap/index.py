@@ -448,10 +448,12 @@ class _Scan:
 
     def _next_chunk(self, position: int) -> ChunkPlace | None:
         """Return the next chunk with a consistent head, from a position on; None if there is none."""
+        # a chunk at the end of a window needs bytes of the next one
         overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap)
+            # in file order, whatever the compression
             for place in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
                 record = window[place : place + _CHUNK_HEAD_BYTES]
                 opcode, length = RECORD_HEAD.unpack_from(record)

@@ -129,10 +129,13 @@ def _decompress(compression: bytes, data: memoryview, size: int) -> bytes:
         raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
         if compression == b"zstd":
+            # zstandard ignores max_output_size if the frame has its size:
+            # https://python-zstandard.readthedocs.io/en/latest/decompressor.html
             if zstandard.frame_content_size(data) > size:
                 raise DamageError("the chunk holds more than it says")
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
         if compression == b"lz4":
+            # one byte more shows a chunk that is larger than it says
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise DamageError(f"the chunk does not decompress ({error})") from None
@@ -433,6 +436,7 @@ class McapSource(FileSource):
         """Open the file for a walk over its chunks; its faults begin with the faults of the index."""
         directory, faults = self._index
         with open_file(self.path) as stream:
+            # a copy, because every walk reports the faults of the index again
             yield ChunkWalk(stream, directory, deepcopy(faults), self.name, renamed)
 
     @cached_property

@@ -222,6 +222,7 @@ class _Summary:
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
         section += encode_records(*offsets) + footer
+        # the checksum covers the footer up to itself: https://mcap.dev/spec#footer-op0x02
         return section + struct.pack("<I", crc32(section))
 
     def _statistics(self) -> records.Statistics:
@@ -301,6 +302,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # a stream that failed cannot take the summary
         if isinstance(error, OutputError):
             self._threads.shutdown(cancel_futures=True)
         else:
@@ -416,6 +418,7 @@ class LogWriter:
         self._closed = True
         try:
             self.flush()
+            # 0: no checksum of the data section, as each chunk has one: https://mcap.dev/spec#data-end-op0x0f
             self._write_record(records.DataEnd(0))
             self._write(self._summary.section(self._offset) + MAGIC)
             self._flush_stream()
