@@ -155,7 +155,7 @@ def _find_pairs(
     if not pairs:
         titles = [result.title for result, _ in results]
         hint = nearest_hint(wanted, titles) or f"there are {', '.join(titles) or 'none'}"
-        raise UsageError(f"no result is named {wanted!r} to align by the progress of; {hint}")
+        raise UsageError(f"no result is named {wanted!r}, so its progress cannot align the runs; {hint}")
     return pairs
 
 

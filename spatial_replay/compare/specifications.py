@@ -542,7 +542,7 @@ def _pair_specs(
         names = [f"{file.filename} has {', '.join(spec.name for spec in file.specs)}" for file in (old, new)]
         raise UsageError(
             f"{old.filename} and {new.filename} have no spec in common: {'; '.join(names)}. "
-            "Give what is to be compared one name"
+            "Give specs that are to be compared the same name"
         )
     for old_spec, new_spec in pairs:
         if old_spec.parameter != new_spec.parameter:

@@ -535,7 +535,7 @@ class RunFile:
                 run = SearchedRun.from_document(json.loads(line))
             except (AttributeError, KeyError, TypeError, ValueError) as error:
                 raise LogError(
-                    f"{path}:{number}: this line is no run ({error}); delete the file, and search again"
+                    f"{path}:{number}: this line is not a run ({error}); delete the file, and search again"
                 ) from None
             self._known[key_of(run.case)] = run
         try:

@@ -103,9 +103,9 @@ def refuse_range(name: str, low: float, high: float) -> None:
     """
     for end in (low, high):
         if not math.isfinite(end):
-            raise UsageError(f"--vary {name}: {end:g} is no end of a range; write a finite number")
+            raise UsageError(f"--vary {name}: {end:g} is not an end of a range; write a finite number")
     if low >= high:
-        raise UsageError(f"--vary {name}: {low:g} to {high:g} is no range; write the lower end first")
+        raise UsageError(f"--vary {name}: {low:g} to {high:g} is not a range; write the lower end first")
 
 
 @dataclass(frozen=True, slots=True)

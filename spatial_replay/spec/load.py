@@ -802,7 +802,7 @@ def load_specification(
             f"{path.name} is YAML, not a specification; give a mapping by --mapping, a tags file by --tags"
         )
     if path.suffix in _LOG_ENDINGS:
-        raise UsageError(f"{path.name} is a log, not a specification; a log stands in front of --spec")
+        raise UsageError(f"{path.name} is a log, not a specification; give a log before --spec")
     if is_formula(path):
         raise UsageError(f"{shortened(str(path))} is a formula; parse_specification(text) takes it")
     try:

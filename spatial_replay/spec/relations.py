@@ -348,7 +348,7 @@ def load_plugin(location: str) -> Plugin:
     for title, functions in (("RELATIONS", relations), ("SIGNALS", signals)):
         if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
             raise UsageError(
-                f"the plug-in {location} has a {title} that is no dictionary of functions by name"
+                f"the plug-in {location} has a {title} that is not a dictionary of functions by name"
             )
     if not relations and not signals:
         raise UsageError(f"the plug-in {location} has no relations and signals; define RELATIONS or SIGNALS")

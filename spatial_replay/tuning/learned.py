@@ -562,7 +562,7 @@ def _check(runs: Sequence[LabelledRun]) -> None:
     good = [run for run in runs if run.is_good]
     if len(good) < 2:
         have = "there is no good run" if not good else f"{good[0].name} is the only good run"
-        raise UsageError(f"{have}; what may vary shows in several: give at least two, better five")
+        raise UsageError(f"{have}; give at least two, better five, to show what can vary")
     require_comparable(runs, "learn from")
     for run in runs:
         if len(run.trace) < _FEWEST_SAMPLES:

@@ -187,8 +187,8 @@ def test_the_example_of_the_page_prints_what_the_page_shows(
         ({"budget": 0}, "the budget is 0 runs; give 1 to 1,000,000"),
         ({"seed": -1}, "the seed is -1; give 0 or more"),
         ({"vary": {}}, "nothing is varied; name at least one parameter"),
-        ({"vary": {"speed": (2.0, 1.0)}}, "speed: 2 to 1 is no range; write the lower end first"),
-        ({"vary": {"speed": (0.0, math.inf)}}, "speed: inf is no end of a range"),
+        ({"vary": {"speed": (2.0, 1.0)}}, "speed: 2 to 1 is not a range; write the lower end first"),
+        ({"vary": {"speed": (0.0, math.inf)}}, "speed: inf is not an end of a range"),
         ({"vary": ["speed"]}, "'speed' is incomplete; write NAME=LOW:HIGH"),
         ({"vary": ["speed=a:2"]}, "speed: 'a' is not a number"),
         ({"specifications": ()}, "has no specification yet; give what has to hold"),
@@ -228,5 +228,5 @@ def test_a_folder_of_something_else_is_left_as_it_is(folder: Path, tmp_path: Pat
 def test_a_damaged_line_is_named(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "search.json").write_bytes((folder / "search.json").read_bytes())
     (tmp_path / "runs.jsonl").write_text('{"run": 1}\n')
-    with pytest.raises(sr.LogError, match=r"runs\.jsonl:1: this line is no run .* delete the file"):
+    with pytest.raises(sr.LogError, match=r"runs\.jsonl:1: this line is not a run .* delete the file"):
         search(tmp_path)

@@ -136,7 +136,7 @@ def test_a_batch_evaluates_logs_again_whatever_a_plugin_imports() -> None:
     [
         ("1 / 0", "cannot be loaded: ZeroDivisionError: division by zero"),
         ("", "has no relations and signals; define RELATIONS or SIGNALS"),
-        ("SIGNALS = 3", "has a SIGNALS that is no dictionary of functions by name"),
+        ("SIGNALS = 3", "has a SIGNALS that is not a dictionary of functions by name"),
         (MODULE + "\nSIGNALS = {'crowd': lambda sample: 1 / 0}", "fails for the signal 'crowd' at 0 ns"),
         (MODULE + "\nSIGNALS = {'crowd': lambda sample: 'many'}", "fails for the signal 'crowd' at 0 ns"),
     ],

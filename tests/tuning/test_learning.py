@@ -230,7 +230,7 @@ def moved_apart(trace: sr.Trace, factor: float) -> sr.Trace:
 @pytest.mark.parametrize(
     ("good", "bad", "said"),
     [
-        (GOOD[:1], BAD, "good run 1 is the only good run; what may vary shows in several"),
+        (GOOD[:1], BAD, "good run 1 is the only good run; give at least two, better five"),
         ([], BAD, "there is no good run"),
         (GOOD[:2], [GOOD[1]], "the bad run bad run 1 holds the same samples as the good run good run 2"),
         (
