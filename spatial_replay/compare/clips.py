@@ -61,6 +61,7 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
         return [KeptNode(result, 0, result.title) for result in violated or results]
     nodes, spec_names = [], dict[str, None]()
     for result in results:
+        # in reverse, so that the first of several nodes with one name remains
         names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
         spec_names |= dict.fromkeys([result.title, *names])
         if result.title in of or result.name in of:

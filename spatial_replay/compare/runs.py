@@ -179,6 +179,7 @@ def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification
 def _alignment(
     kind: AlignmentKind, about: str | None, knots: Sequence[Knot], a_ns: Integers, b_ns: Integers
 ) -> Alignment:
+    # interpolation needs times that increase in both runs
     increasing = [knots[0]]
     for knot in knots[1:]:
         if knot.a_ns > increasing[-1].a_ns and knot.b_ns > increasing[-1].b_ns:
@@ -700,6 +701,8 @@ def _bytes_to_compare(decision: PlanDecision | None) -> bytes | None:
     copy = PlanDecision.FromString(decision.SerializeToString())
     copy.ClearField("time_ns")
     copy.ClearField("outcome")
+    # by default, equal messages can have different bytes
+    # (https://protobuf.dev/programming-guides/serialization-not-canonical)
     copied: bytes = copy.SerializeToString(deterministic=True)
     return copied
 

@@ -466,6 +466,7 @@ def diff_over_source(
     before, after = evaluate_version(olds, old), evaluate_version(news, new)
     spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
+        # by id, because two results can have equal formulas
         id(new_spec.formula): compare_trees(
             old_spec.formula,
             new_spec.formula,
@@ -527,6 +528,7 @@ def _pair_specs(
     ]
     removed = [spec for spec in old.results if spec.name not in news]
     added = [spec for spec in new.results if spec.name not in olds]
+    # a removed and an added result of equal meaning are one renamed result
     for new_spec in tuple(added):
         for old_spec in removed:
             (formula,), regions = unify_regions([old_spec.formula], old.regions, new.regions)

@@ -953,6 +953,7 @@ class _Search:
                 f" {first.seconds:g} s; begin before that, in another folder"
             )
         descents = Descents(len(space.ordered), seed) if space.ordered else None
+        # another random stream than that of the descents
         random, barren = np.random.default_rng([seed, 1]), 0
         costs = {key_of(first.case): _cost(first)}
         best: tuple[float, list[float]] | None = None

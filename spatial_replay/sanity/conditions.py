@@ -147,6 +147,7 @@ def _add(first: Tree, second: Tree) -> Tree:
     total = dict(first.weights)
     for quantity, weight in second.weights:
         total[quantity] = total.get(quantity, Fraction(0)) + weight
+    # in a fixed order, so that equal sums are equal values
     weights = sorted(((key, value) for key, value in total.items() if value), key=lambda item: repr(item[0]))
     return Linear(tuple(weights), first.constant + second.constant)
 
@@ -179,6 +180,7 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
         case SignedDistance() | Misalignment():
             kind = "min"
             pairs = product(*map(members, measurement.terms))
+            # both measurements are symmetric; a fixed order makes equal ones equal values
             parts = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
             # an outer union is not split: the inner term may lie partly in one member and partly in another
@@ -204,6 +206,7 @@ def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Lin
 
 def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outline]) -> list[Fraction | None]:
     """Return the numbers of measurements between regions; None for an unknown number."""
+    # regions need no objects, so one empty sample is enough
     nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
     values = leaf_values(nothing, [Atom("", "", measurement) for measurement in measurements], {})[
         :, :, 0
@@ -246,6 +249,7 @@ def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
             radius = radius_of(measurement.term)
             bare = Projection(without_radius(measurement.term), measurement.axis, measurement.side)
             return Linear(((bare, unit),), radius if measurement.side == "max" else -radius)
+        # with heights, enlarging in the plane can change a distance by less than the radius
         case SignedDistance() if is_flat(measurement.first, regions) or is_flat(measurement.second, regions):
             terms = measurement.first, measurement.second
             bare_pair = SignedDistance(*sorted(map(without_radius, terms), key=repr))
@@ -348,6 +352,7 @@ class Fact(NamedTuple):
     def inequality(self, value: bool, label: int) -> Inequality:
         """Return the inequality of the fact (`value` is True) or of its negation, with a label."""
         rises = (self.side != "<=") == value
+        # ">" leaves equality open, so the fact and its negation are both strict
         is_strict = self.side == ">" or not value
         sign = -1 if rises else 1
         weights = tuple((quantity, sign * _whole(weight)) for quantity, weight in self.weights)
@@ -381,6 +386,7 @@ class FactDiagrams:
         # sums that are compared with "==", usually modes and counts
         self._compared: set[Weights] = set()
         atoms = [part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom)]
+        # first all sums that "==" compares: they decide which facts are exact
         for atom in atoms:
             self._tree_of(atom.expression)
         is_upright = is_about_heights(atoms) or any(

@@ -332,6 +332,7 @@ class _Examiner:
             if runs:
                 return self._search.shortest(*runs)
         except UndecidedError:
+            # one automaton of the whole part needs no product of several
             if whole is not None and (answer := self._of_whole(*whole)) is not None:
                 return answer
         self._undecided.setdefault(name, []).append(what)

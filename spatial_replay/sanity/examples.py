@@ -304,6 +304,7 @@ class _Attempt:
             return values
         label = ways[0][0].label
         conflicts: frozenset[int] = frozenset()
+        # the alternative with the least violation comes first
         for way in sorted(ways, key=lambda way: _missing(way, values)):
             if self._left <= 0:
                 break
@@ -538,6 +539,7 @@ def shortest_example(
             be placed.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
+    # a guess about bounds in seconds may be right at only one rate
     periods_ns = (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS)
     if rate_hz is not None:
         periods_ns = (round(_SECOND_NS / rate_hz),)
@@ -565,6 +567,7 @@ def shortest_example(
             {numbers[index][place]: word[index][numbers[index][place]] for at, place in core if at == index}
             for index in range(len(word))
         )
+        # a conflict within one sample excludes its facts in every sample
         avoided.append(tuple(filter(None, blamed)) if sum(map(bool, blamed)) == 1 else blamed)
         following = another(avoided)
         if following is None:

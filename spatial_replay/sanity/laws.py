@@ -191,6 +191,7 @@ def _transitive(
             outers.setdefault(protrusion.inner, {})[protrusion.outer] = protrusion
     beyond = {term: _reachable(term, outers) for term in outers}
     waiting = [protrusion for by_outer in outers.values() for protrusion in by_outer.values()]
+    # the loop appends further protrusions to its list
     for first in waiting:
         a, b = first.inner, first.outer
         for c, second in outers.get(b, {}).items():
@@ -233,6 +234,7 @@ def _nesting(
             for term in (protrusion.inner, protrusion.outer):
                 inside.setdefault(term, []).append(protrusion)
     waiting = list(distances)
+    # the loop appends further distances to its list
     for pair in waiting:
         for end, c in ((pair.first, pair.second), (pair.second, pair.first)):
             for protrusion in inside.get(end, ()):

@@ -272,6 +272,7 @@ class _Tableau:
                 self._value[dependent] = (was[0] + weight * step[0], was[1] + weight * step[1])
                 for variable, value in solved.items():
                     total = content.get(variable, 0) + weight * value
+                    # with floats, factors that cancel leave tiny remainders
                     if total > self._tolerance or total < -self._tolerance:
                         content[variable] = total
                     else:

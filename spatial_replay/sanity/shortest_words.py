@@ -453,6 +453,7 @@ class WordSearch:
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
         """Return the shortest run by A*; the automata give the lower bound of the remaining samples."""
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
+        # the number breaks ties, so that heapq compares nothing behind it
         order = count()
         # geometry is checked when a move leaves the queue, because most moves never leave it
         waiting: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
@@ -542,6 +543,7 @@ class WordSearch:
 
     def _compose(self, automaton: Automaton, state: int) -> int:
         """Return the moves from a state as a diagram over facts, with states as leaves."""
+        # stored, because the id of a deleted automaton can be reused
         self._automata[id(automaton)] = automaton
         conditions = self._conditions_of(automaton)
 

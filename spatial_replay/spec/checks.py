@@ -102,6 +102,7 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
         elif token.type in BINARY_TYPES:
             if level.prefix is not None:
                 yield _reach(level.prefix, token, source)
+                # one warning is enough for each prefix operator
                 level.prefix = None
             if published:
                 yield from _grouping_warnings(level, token, source)
@@ -179,6 +180,7 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
         stack: list[Formula] = [spec.formula] if spec.is_result else []
         while stack:
             node = stack.pop()
+            # inside a future operator, a past operator sees earlier samples
             if isinstance(node, Temporal) and node.operator in FUTURE_OPERATORS:
                 continue
             if isinstance(node, Temporal) and node.operator in PAST_OPERATORS:
@@ -242,6 +244,7 @@ def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterato
 def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic]:
     """Yield a warning for each unused definition, except specs: an unused spec is a result."""
     for name, statement in names.definitions.items():
+        # a broken definition already has a fault
         if isinstance(statement, (SpecStatement, BrokenStatement)) or name in names.used:
             continue
         message = f"{name!r} is {kind_of(statement)} that nothing uses"

@@ -106,6 +106,7 @@ class ComparisonBuilder:
                 return self._of_one(right, ((_MIRRORED[signs[0]], left),), written, scope)
         elif isinstance(left, _SIMPLE) and self._is_constant(right, scope):
             return self._of_one(left, ((signs[0], right),), written, scope)
+        # a quoted name is a text here, an unquoted one a signal
         if isinstance(left, Name) and isinstance(right, Name) and signs[0] in ("==", "!="):
             if right.is_quoted:
                 return self._of_text(left, signs[0], right, scope)
@@ -245,6 +246,7 @@ class ComparisonBuilder:
             message = "a factor of 0" if is_product else "division by zero"
             self.resolver.fault(factor.span, scope, message, "leave the number out, or write another factor")
             return Number(0.0)
+        # factors and divisors of expressions are positive, so a negative one becomes a negation
         size = abs(amount)
         if isinstance(amount, NamedNumber):
             size = NamedNumber(size, amount.constants)

@@ -156,6 +156,7 @@ def replace_constants(
             hint = nearest_hint(name, statements) or f"its constants are: {', '.join(statements) or 'none'}"
             raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
         pieces.append((statements[name].value.span, _new_text(name, value, values[name])))
+    # backwards, so that the offsets of earlier lines stay valid
     for span, piece in sorted(pieces, key=lambda each: each[0].start, reverse=True):
         text = text[: span.start] + piece + text[span.end :]
     return text

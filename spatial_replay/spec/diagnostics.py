@@ -17,6 +17,7 @@ MAX_FAULTS = 100
 
 _MAX_SUGGESTION_EFFORT = 10_000
 """Most name comparisons for the hints of one text; faults in every line would otherwise need millions."""
+# not str.splitlines, which also splits at form feeds and Unicode line separators
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
 

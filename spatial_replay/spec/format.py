@@ -57,6 +57,7 @@ def format_number(value: float) -> str:
 
 def format_duration(ns: int) -> str:
     """Return nanoseconds as exact seconds: "2.5s"."""
+    # Decimal, because floats of seconds do not hold every nanosecond
     return f"{Decimal(ns).scaleb(-9).normalize():f}s"
 
 
@@ -250,6 +251,7 @@ def format_specification(specification: Specification) -> str:
     for name, outline in specification.regions.items():
         lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")
     for scale in specification.scales:
+        # a signal with the name "lengths" needs quotes
         signal = "lengths" if scale.signal is None else written_name(scale.signal, relations | {"lengths"})
         lines.append(f"scale {signal} = {format_number(scale.divisor)}")
     for name, group in specification.groups.items():

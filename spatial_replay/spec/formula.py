@@ -467,6 +467,7 @@ class Bound:
     unit: Literal["samples", "ns"]
 
 
+# places do not count in comparisons: equal formulas can be at two places of a text
 _NO_SPAN = Span(0, 0)
 
 

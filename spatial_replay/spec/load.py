@@ -305,6 +305,7 @@ class QuantifierBuilder:
         for choice in choices:
             bound = dict(zip((name.text for name in written.variables), choice, strict=True))
             instances.append(self.elaborate(written.body, replace(inner, values={**scope.values, **bound})))
+        # `and` and `or` have at least two operands
         if len(instances) == 1:
             return instances[0]
         return Boolean("and" if written.quantifier == "forall" else "or", tuple(instances), span=span)
@@ -333,6 +334,7 @@ class QuantifierBuilder:
 
     def _without_clash(self, quantified: Quantified, scope: Scope) -> Quantified:
         """Rename variables that have the name of an object, region, group or definition."""
+        # the canonical text does not distinguish a variable from an object of the same name
         others = other_names(quantified.body)
         renamed = {
             variable: self._fresh(variable, scope.bound | others)
@@ -434,6 +436,7 @@ class Elaborator:
             if isinstance(definition, DefStatement):
                 self._check_macro(definition)
         specs = [elaborated.spec for elaborated in self.known.values()]
+        # the size of a spec includes those of the specs that it names
         total = sum(elaborated.size for name, elaborated in self.known.items() if name not in self.referred)
         if total > MAX_SIZE:
             self._too_large(statements[-1].name.span)
@@ -450,6 +453,7 @@ class Elaborator:
         formula = self.formula(statement.formula, scope)
         if parameter is not None:
             self._check_capture(statement, formula)
+        # a node has one name, so a second name needs a node of its own
         if formula.name is not None:
             formula = Boolean("spec", (formula,), span=statement.formula.span)
             self.deepest += 1
@@ -709,6 +713,7 @@ def parse_specification(
     _check_relations(custom_relations)
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
+    # some editors write a byte order mark, which is not a part of the text
     text = text.removeprefix("\ufeff")
     names = RELATION_NAMES.union(custom_relations)
     if constants:

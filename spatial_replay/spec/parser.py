@@ -158,6 +158,7 @@ def _looking_back(written: Quantity) -> Quantity:
             if leftmost is written:
                 operand: Quantity = written.operands[0]
                 return operand
+            # in [-a + b] the sign belongs to a alone, so the delay is the negative of the whole
             return Arithmetic("-", (written,), written.span, written.depth + 1)
     hint = "write [-3] for three samples earlier, [-2.5s] for 2.5 seconds"
     if isinstance(written, Name):
@@ -279,6 +280,7 @@ class TreeBuilder:
         inner = children[1]
         if isinstance(inner, BooleanSyntax):
             return inner._replace(span=_cover(children), is_bracketed=True)
+        # brackets do not widen the span of a name, because its length says whether the name is quoted
         return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
 
     def relation(self, children: list[Any]) -> RelationSyntax:
@@ -416,6 +418,7 @@ def _split_bare_formula(tokens: Sequence[Token], faults: Faults) -> Iterator[Tok
 
 
 def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bool, faults: Faults) -> bool:
+    # directly after -, the word is the rest of a name without quotes, such as safe-region
     if token.type in STATEMENT_TYPES and not (last.type == "MINUS" and last.end_pos == token.start_pos):
         if token.line == last.line:
             message = f"{token.value!r} begins a statement within a line"

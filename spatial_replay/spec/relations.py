@@ -291,6 +291,7 @@ def plugins_of(text: str) -> dict[str, Plugin]:
     plugin_places = [place for place in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if place]
     used = set(used_modules(text))
     allowed = {Path(place).stem if place.endswith(".py") else place: place for place in plugin_places}
+    # pyproject.toml is read only if a text needs it
     if used - set(allowed):
         allowed |= {name: name for name in _listed_plugins() if name in used}
     return {name: load_plugin(_place(place)) for name, place in allowed.items()}

@@ -78,6 +78,7 @@ def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
     """
     if not corners:
         raise OutlineError("a polygon without corners", "write at least one corner (x, y)")
+    # repeated corners would be edges of length 0, which touch their neighbours
     ring = [corner for index, corner in enumerate(corners) if index == 0 or corner != corners[index - 1]]
     if len(ring) > 1 and ring[0] == ring[-1]:
         ring.pop()
@@ -162,6 +163,7 @@ def _crossing(ring: Sequence[Corner], effort: Effort) -> tuple[Corner, Corner] |
             effort.left -= 1
             if effort.left < 0:
                 raise OutlineError("the polygons of this text have too many corners", "use fewer of them")
+            # neighbouring edges always meet at their common corner
             if (first - second) % count not in (1, count - 1) and _meet(*edges[first], *edges[second]):
                 return edges[min(first, second)][0], edges[max(first, second)][0]
     return None
@@ -361,6 +363,7 @@ class Namespace:
         corners = [(self.plain_number(x), self.plain_number(y)) for x, y in shape.points]
         radius = self.plain_number(shape.radius) if shape.radius is not None else 0.0
         height = self._height(statement)
+        # a placeholder, so that the uses of the region are checked, too
         if self.faults.count > before:
             return Outline(((0.0, 0.0),))
         try:
@@ -536,6 +539,7 @@ class Resolver:
         return written.text not in scope.values and isinstance(defined, BrokenStatement)
 
     def _delay(self, term: Term, written: Delayed, scope: Scope) -> Term:
+        # a delay applies to the footprint before it is enlarged or reduced to its centre
         if isinstance(term, Enlarged | Centre):
             inner: Any = self._delay(term.term, written, scope)
             return replace(term, term=inner)
@@ -621,6 +625,7 @@ class Resolver:
         for end in (lower, upper):
             if isinstance(end, Duration):
                 units.add("ns")
+            # 0 fits both units
             elif end:
                 units.add("samples")
         if len(units) == 2:

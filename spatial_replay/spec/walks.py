@@ -341,6 +341,7 @@ def can_settle(formula: Formula, *, satisfied: bool) -> bool:
             )
         case Temporal(operator="G" | "F" as operator, operands=(operand,), bound=bound):
             is_open = bound is None or bound.upper is None
+            # a later sample can always violate an open `G`, or satisfy an open `F`
             if is_open and (operator == "G") == satisfied:
                 return isinstance(operand, Truth)
             return can_settle(operand, satisfied=satisfied)

@@ -540,6 +540,7 @@ class Margins:
         self.runs, self._parse, self._each = tuple(runs), parse, each
         self.varied = tuple(self._fitting(constant) for constant in varied)
         self.evaluations = 0
+        # one cache for each instance; a cache of the method would keep all instances alive
         self.specification = lru_cache(_REMEMBERED)(self._parsed_at)
         self._compiled: OrderedDict[tuple[str, Point], _Result] = OrderedDict()
         self._robustness: dict[tuple[int, str, Point], Robustness] = {}

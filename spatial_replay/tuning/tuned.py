@@ -314,6 +314,7 @@ class Search:
     def __init__(self, margins: Margins, seed: int = 0) -> None:
         self._margins, self._seed = margins, seed
         numbers = list(range(len(margins.runs)))
+        # in random order, only about ln(n) of n runs change the limit in `least_for_all`
         random.Random(seed).shuffle(numbers)
         self._good = [number for number in numbers if margins.runs[number].is_good]
         self._bad = [number for number in numbers if not margins.runs[number].is_good]
