@@ -224,6 +224,7 @@ _CALL: Final = 32
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a function of arrays and numbers that may run as machine code."""
+    # a wrapper for calls from C would only take time to compile
     return _Kernel(function, {"no_cfunc_wrapper": True})
 
 

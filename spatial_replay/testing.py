@@ -40,6 +40,7 @@ def assert_satisfied(
             is the output of `explain`.
         UsageError, SpecificationError, LogError: the log cannot be evaluated.
     """
+    # pytest leaves this frame out of tracebacks
     __tracebackhide__ = True
     replayed = replay_log(log, specifications, **options)
     expectation = Expectation(at_least=at_least, tolerance=tolerance, allow=frozenset(allow))

@@ -294,6 +294,7 @@ def named_arguments(called: _Called) -> _Called:
         try:
             return function(*values, **named)
         except TypeError:
+            # any other cause is raised again below
             refuse_unknown(named, [name for name in signature(called).parameters if name != "cls"])
             raise
 

@@ -81,6 +81,7 @@ class PlannedSteps(Decorator):
 
     def terminate(self, new_status: Status) -> None:
         """Conclude a step that is interrupted."""
+        # py_trees interrupts a behaviour with the status INVALID
         if new_status is Status.INVALID and self._is_executing:
             self._conclude(Outcome(False, f"{self.name} was interrupted"))
 

@@ -115,5 +115,6 @@ class Processes:
                 return Outcomes(tuple(outcomes), f"{reason} Other calls are served as before")
             finally:
                 ours.close()
+                # the process may not have been started
                 with suppress(AttributeError, ValueError):
                     process.kill()

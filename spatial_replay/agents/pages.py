@@ -78,6 +78,7 @@ def _sections(text: str, headings: Sequence[str]) -> str:
     lines: list[str] = []
     is_inside = is_code = False
     for line in text.splitlines():
+        # a comment in code looks like a heading
         is_code ^= line.startswith("```")
         if not is_code and (match := _HEADING.match(line)):
             is_inside = match[2] in headings

@@ -127,7 +127,6 @@ def _state(path: str, files: _LogFiles) -> str | None:
             ),
         ]
     )
-    # file names that are not UTF-8 contain surrogates (PEP 383)
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -142,6 +141,7 @@ def _hash_of_log(path: str, files: _LogFiles) -> str:
         digest = (
             _hash_of(Path(name)) if number is None else _cached_hash(name, files.state(name)[1].st_mtime_ns)
         )
+        # names that are not UTF-8 contain surrogates (PEP 383)
         total.update(f"{Path(name).name}\0{digest}\0".encode("utf-8", "surrogatepass"))
     return f"files:{total.hexdigest()}" + ("" if number is None else f"#{number}")
 

@@ -116,6 +116,7 @@ def _task(requests: list[RowRequest]) -> Task:
 def _file_name(log: str, requests: list[RowRequest]) -> str:
     """Return a file name with the log's name and a hash of the page's inputs."""
     digest = hashlib.sha256("".join(request.key or "" for request in requests).encode()).hexdigest()[:12]
+    # the end of a long name is kept, because it distinguishes logs
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 

@@ -361,6 +361,7 @@ class ResultsFolder:
                 self._files.remove([name])
                 continue
             keys = table.column("key").to_pylist()
+            # two batches may have written the same rows into a bucket, which has no lock
             new_keys = set(keys) - taken_keys
             taken_keys |= new_keys
             if len(new_keys) < _MOST_TOGETHER:

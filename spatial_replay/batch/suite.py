@@ -343,6 +343,7 @@ def _case(
     name = str(entry.get("name", ""))
     entry = {key: value for key, value in entry.items() if places.get(key) not in wrong}
     mapping = entry.get("mapping")
+    # YAML reads a time such as 5 as a number
     start, end = entry.get("from"), entry.get("to")
     return Case(
         name=name,
@@ -358,6 +359,7 @@ def _case(
             semantics=entry.get("semantics", "ltlf"),
             strict_names=entry.get("strict_names", False),
             constants=_pairs(entry.get("constants", {})),
+            # as a text, because conditions have to be hashable
             requires=json.dumps(entry["requires"], sort_keys=True) if entry.get("requires") else "",
         ),
         expectation=Expectation(

@@ -227,6 +227,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
             prog_name=PROGRAM,
             complete_var=COMPLETION_VARIABLE,
             standalone_mode=False,
+            # https://no-color.org
             color=False if os.environ.get("NO_COLOR") else None,
         )
         sys.stdout.flush()

@@ -160,4 +160,6 @@ def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[
 
 
 _SYSTEM: Final = ("/dev", "/proc", "/sys", "/usr", "/lib", "/lib64")
+"""Folders that the interpreter and libraries read."""
 _CACHES: Final = ("SPATIAL_REPLAY_CACHE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+"""Environment variables that name folders of machine code."""

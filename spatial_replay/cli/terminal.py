@@ -50,6 +50,7 @@ Line: TypeAlias = str | tuple[str | Coloured, ...]
 
 _NO_BREAK: Final = "\N{NO-BREAK SPACE}"
 _BEFORE_UNIT: Final = re.compile(r"(?<=\d) (?=[^\W\d][\w/^²]{0,4}(?![\w]))")
+"""A space between a number and a short word, which may be its unit."""
 _LEAST_WIDTH: Final = 60
 """Least width of lines, characters."""
 

@@ -187,6 +187,7 @@ def _entry_path(
 ) -> str | None:
     """Return the path of the log that an entry names; None if that log exists but is not judged."""
     value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
+    # a bool is an int in Python
     if not isinstance(value, str | int) or isinstance(value, bool):
         raise UsageError("it names no episode; give 'log', a path, or 'episode', a number or name")
     name = str(value).strip()

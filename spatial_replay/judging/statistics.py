@@ -63,6 +63,7 @@ def e_value(won: int, lost: int) -> float:
     _scipy()
     from scipy.special import betaln
 
+    # in logarithms, because the power of 2 overflows from 1,024 pairs on
     return math.exp((won + lost) * math.log(2.0) + float(betaln(won + 1, lost + 1)))
 
 

@@ -426,6 +426,7 @@ class Replay:
         """Write the messages of a block in parts, because messages of many results are large."""
         most = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
         begins = range(0, max(len(trace), 1), most)
+        # the log's own messages may lie before the first sample or after the last one
         starts_ns = [-FOREVER, *(int(trace.times_ns[begin]) for begin in begins[1:]), FOREVER]
         for begin, (start_ns, end_ns) in zip(begins, pairwise(starts_ns), strict=True):
             part = trace.slice(begin, min(begin + most, len(trace)))

@@ -317,6 +317,7 @@ class LoadedLog:
         if looks_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
             options = replace(self.options, keep=self._keep)
             return LoadedLog(self._source, files, options, saved=self._saved)
+        # a shallow copy shares the samples and their cached measurements
         log = copy(self)
         log._files, log._kept = tuple(files), logged_specifications(files, self.trace.units)
         selection = Selection(self._source, tuple(files), self.options)

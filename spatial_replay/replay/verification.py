@@ -49,6 +49,7 @@ from spatial_replay.version import __version__
 
 NAMESPACE = "spatial-replay"
 LARGEST_SIGNATURE = 2**16
+"""Size limit of a signature file, bytes."""
 _HEADING = "spatial-replay certificate 1"
 _PUBLIC_KEY = re.compile(r"(?:ssh|ecdsa|sk)-[\w@.-]+ [A-Za-z0-9+/]+=*(?: (?P<comment>.*))?$")
 _LONGEST_S = 120.0
@@ -249,6 +250,7 @@ def explain_differences(
 def _difference(topic: str, now: bytes, then: bytes) -> str | None:
     """Return the difference of a message from the recorded one; None if only the encoding differs."""
     try:
+        # literals, because a bare name in a pattern would capture the topic
         match topic:
             case "/spatial/objects":
                 return _of_samples(ObjectStates.FromString(now), ObjectStates.FromString(then))
