@@ -83,7 +83,7 @@ def replay_log(
         log: a file in any format, its address (s3://, gs://, az://, https://), or a trace.
         specifications: one or several, parsed or as files; None takes the specifications in the log.
         output: the annotated log to write (MCAP).
-        layer: write the derived messages only, without the log's own.
+        layer: whether only derived messages are written, without the log's own messages.
         keep: the log's own messages in the output: "all", "mapped" for mapped topics, or patterns of topics
             such as "/camera/*"; several are combined. The default is all messages, but none of a ROS 2 bag.
         arrow: the title of the result whose violation the output's scene points at; "" for the first one.
@@ -148,7 +148,7 @@ def diff_specifications(
     output: PathName | None = None,
     **options: Unpack[Evaluating],
 ) -> SpecificationDiff:
-    """Compare two versions of a specification over a log: changes, their times, and the edits behind.
+    """Compare two versions of a specification over a log: changes, their times and their causes.
 
     Edits are found by evaluation. The old specification with the edit alone has the new verdict. The new
     specification without the edit has the old verdict.
@@ -156,7 +156,7 @@ def diff_specifications(
     Args:
         log: a file in any format, or a trace.
         old, new: parsed, or as files.
-        output: a page to write, with both under one time cursor; its name ends in .html.
+        output: a page to write, with both sides under one time cursor; its name ends in .html.
         options: options of evaluation and reading, as for `replay_log`.
 
     Raises:
@@ -189,7 +189,7 @@ def diff_logs(
         specifications: one or several, parsed or as files; None takes the specifications in a log.
         align: "time" since the zero of each log, "progress" of an automaton, or the name of a spec. The
             spec's first change of sign in each run is then the event.
-        output: a page to write, with both under one time cursor; its name ends in .html.
+        output: a page to write, with both sides under one time cursor; its name ends in .html.
         options: options of evaluation and reading for both logs, as for `replay_log`.
 
     Raises:
@@ -318,7 +318,7 @@ def learn(
     profile: str = DEFAULT_PROFILE,
     **reading: Unpack[Reading],
 ) -> Learned:
-    """Find a short specification that all good runs satisfy, and each of whose lines a bad run violates.
+    """Find a short specification: all good runs satisfy it, and a bad run violates each line.
 
     Without bad runs, its lines are common properties of the good runs: ends, invariants and orders of events.
     Limits keep a margin from the good runs (see `docs/learning.md`).
@@ -382,8 +382,8 @@ def evaluate_logs(
     Raises:
         UsageError: a pattern has no log, an option is invalid, or pyarrow is not installed.
         SpecificationError: specifications have errors.
-        OutputError: results cannot be written; those written so far stay.
-        ClusterError: the scheduler is lost; the results written so far stay.
+        OutputError: results cannot be written; earlier results are kept.
+        ClusterError: the scheduler is lost; results so far are kept.
     """
     from spatial_replay.batch.explanations import explain_batch, failing_places
     from spatial_replay.batch.run import prepare, run_batch, workers_of
@@ -589,7 +589,7 @@ def _files(
 
 
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:
-    """Return the files that are read."""
+    """Return the input files."""
     files = [
         specification
         for specification in _specification_list(specifications)

@@ -210,10 +210,10 @@ _Result = TypeVar("_Result")
 _PATIENCE_S: Final = 0.8
 """Time that a process interprets kernels in any case, seconds: as long as loading numba and code."""
 _FIRST_S: Final = 1.5
-"""This time for a kernel that was never run, before numba is loaded. Most take a tenth of the guess."""
+"""Limit instead of `_PATIENCE_S` for a kernel that was never run, seconds: most take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
-"""Times that each kernel is interpreted afterwards, seconds: before compiling, and before loading."""
+"""Limits per kernel after that, seconds: before compiling (`_COLD_S`), before loading (`_WARM_S`)."""
 _GUESS_S: Final = 2e-6
 """Guessed time of a kernel that was never run, seconds per array element."""
 _LONG: Final = 3.0
@@ -488,7 +488,7 @@ class _Kernel(Generic[_Arguments, _Result]):
 
     @property
     def is_entry(self) -> bool:
-        """Whether Python code may call it, too."""
+        """Whether Python code may call the kernel, too."""
         return "no_cpython_wrapper" not in self.options
 
     @property

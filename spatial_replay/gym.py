@@ -95,8 +95,8 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
             log: function that is called at the end of each episode, and returns the path of its log.
 
         Raises:
-            UsageError: a spec or option is unknown, the spec is a template, or there are no objects and
-                signals. `until` is given for a vector environment that resets its episodes itself.
+            UsageError: a spec or option is unknown, the spec is a template, or objects and signals are
+                missing; or `until` is given with a vector environment that resets itself.
             NoAutomatonError: `reward="progress"` with a spec that has no automaton.
         """
         super().__init__(env)

@@ -101,7 +101,7 @@ _FEW: Final = 3
 
 
 def without_numbers(text: str) -> str:
-    """Return a text with 0 for each number outside of code: equal for texts that differ in numbers only."""
+    """Return a text with 0 for each number outside of code, to compare texts without their numbers."""
     return _CODE_OR_NUMBER.sub(lambda match: match[1] or "0", text)
 
 
@@ -124,7 +124,7 @@ def plural(count: int, noun: str) -> str:
 
 DIGITS: Final = 4
 LARGEST_PLAIN: Final = 1e12
-"""Digits of numbers in texts, and the number from which on they have an exponent."""
+"""Digits of numbers in texts, and the least number with an exponent."""
 
 
 def number_text(number: float) -> str:
@@ -232,7 +232,7 @@ def shortened_formula(text: str) -> str:
 
 
 def time_text(time_ns: int, first_ns: int = 0) -> str:
-    """Return a time in seconds since another, or a duration: "5.533 s", the form of all times in texts."""
+    """Return a time since another one, or a duration, in the form of all texts: "5.533 s"."""
     return str(Instant(time_ns, first_ns))
 
 

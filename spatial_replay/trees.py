@@ -41,7 +41,7 @@ class PlannedSteps(Decorator):
         """Wrap the subtree that executes a step.
 
         Args:
-            recorder: with a planner.
+            recorder: a recorder with a planner.
             stages: "pick", "way" or "place" by the name of a behaviour: the stage of a motion that fails if
                 the behaviour, or one below it, fails.
 

@@ -207,7 +207,7 @@ class Files:
         self._temporary.cleanup()
 
     def path(self, name: str) -> str:
-        """Return the path of a file with the text of an argument. A text may also be such a path itself.
+        """Return a file for the text of an argument: a new file with the text, or the file that it names.
 
         Raises:
             UsageError: the text is empty or too long, or names a file outside the roots.

@@ -142,7 +142,7 @@ def explain_batch(
     results: str | os.PathLike[str] | None = None,
     progress: Progress = no_progress,
 ) -> BatchResult:
-    """Return the result of a batch in which the rows at some places are explained.
+    """Explain the rows of a batch at some places, and return its result.
 
     Args:
         results: folder of results that also stores the explanations.

@@ -32,7 +32,7 @@ def identify(
     Args:
         known: identities by state.
         workers: executor that reads the logs with unknown states.
-        progress: shows how many have been read.
+        progress: shows the number of logs read.
     """
     states = states_of(paths)
     unknown = [path for path, state in states.items() if state is None or state not in known]
@@ -166,7 +166,7 @@ def _version_at(address: str) -> str:
 
 
 def _version_of(file: RemoteFile) -> tuple[int, str]:
-    """Return the size of a remote file, and its strong tag or, without one, the digest of its bytes."""
+    """Return the size of a remote file, and its strong ETag; without one, the digest of its bytes."""
     version = file.current_version()
     if version.is_exact:
         return version.size, str(version.tag)

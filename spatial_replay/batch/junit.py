@@ -47,7 +47,7 @@ def write_junit(
     Args:
         name: name of the suite.
         reports: paths of pages about logs, by case and log.
-        inputs: files that the output must not be.
+        inputs: files that the output must not overwrite.
         largest: size limit of the report, bytes.
 
     Raises:

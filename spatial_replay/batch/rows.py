@@ -53,7 +53,7 @@ ResultName: TypeAlias = tuple[int, str, str | None]
 """A result of a task: the number of its specification file, its spec, and the object of a template."""
 
 _LONGEST: Final = 2_000
-"""Characters of a text in a row."""
+"""Length limit of a text in a row, characters."""
 _MOST: Final = 20
 """Entries of each list in a row. The last entry counts the entries left out."""
 _KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
@@ -87,7 +87,7 @@ class ResultRow:
         spec: its name.
         object: the object that a template's parameter stands for, or None.
         requirement, title: the id and sentence of the spec, or None.
-        line: of the spec in its file, from 1.
+        line: line of the spec in its file, from 1.
         verdict: None if there is an error.
         unit: the declared unit of the robustness, or "".
         robustness, lower, upper: NaN where not determined.
@@ -103,7 +103,7 @@ class ResultRow:
         vacuous: sentences on the parts that decided nothing.
         left: sentences on group members that left the log within reach of a threshold and came back.
         doubts: names of the verdict's assumptions that the log contradicts.
-        doubtful: a sentence on each of them.
+        doubtful: a sentence on each of these assumptions.
         dropped: a sentence on messages that the recorder dropped; None for none.
         samples: number of evaluated samples.
         zero_ns: zero of the times in sentences about the log.

@@ -501,8 +501,8 @@ def run_batch(
 
     Raises:
         UsageError: the folder holds something else.
-        OutputError: rows cannot be written; those written so far stay.
-        ClusterError: the scheduler of a cluster is lost; rows written so far stay.
+        OutputError: rows cannot be written; earlier rows are kept.
+        ClusterError: the scheduler of a cluster is lost; rows so far are kept.
     """
     folder = ResultsFolder.create(results)
     with folder.lock():
@@ -539,7 +539,7 @@ def run_batch(
         places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
         table = _record_of(requests).store_in(with_explanations(table, places))
         folder.write_run(table)
-    # an unreadable log has no key, and was tried
+    # an unreadable log has no key, but its evaluation was tried
     evaluated = {task.log for task in tasks} | {
         request.log.path for request in requests if request.key is None
     }
@@ -620,7 +620,7 @@ def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
-    """Return the conditions that rows depend on. Constants are missing: the meaning has their values."""
+    """Return the conditions that rows depend on, without constants: the meaning has their values."""
     mapping = conditions.mapping
     return [
         None if mapping is None else load_mapping(mapping).identity,

@@ -41,7 +41,7 @@ RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
 )
 """Ranks of verdicts, the worst first. None is an error or a result that is gone."""
 _LONGEST_CONDITION: Final = 1_000
-"""Characters of a condition. Long ones may crash https://docs.python.org/3/library/ast.html#ast.parse."""
+"""Length limit, characters: https://docs.python.org/3/library/ast.html#ast.parse may crash on long texts."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,7 +220,7 @@ class DaskCluster:
                         task = waiting.pop(future)
                         yield task, self._result(future)
             finally:
-                # the executor would wait for them, and the scheduler may be gone
+                # the executor would wait for these tasks, and the scheduler may be gone
                 for future in waiting:
                     future.cancel()
 

@@ -146,7 +146,7 @@ def write_json_lines(
 
 
 def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
-    """Return the exit code of a run: that of a replay of all its logs, without expected results."""
+    """Return the exit code of a run, as of a replay; expected results count as satisfied."""
     names = ("failure", "error_kind", "verdict", "faults")
     codes = set()
     for failure, kind, verdict, faults in zip(*(table.column(n).to_pylist() for n in names), strict=True):

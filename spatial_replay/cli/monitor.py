@@ -280,7 +280,7 @@ def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
 
 
 class _SignalTrigger:
-    """Fires the trigger at SIGUSR1. A signal before the recorder exists fires it as soon as it exists."""
+    """Fires the trigger at SIGUSR1. A signal before the recorder exists is kept until then."""
 
     def __init__(self) -> None:
         self._fire: Callable[[str], None] | None = None

@@ -142,7 +142,7 @@ def log_output_option(text: str, *, required: bool = True) -> Callable[[_Command
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace a log that exists already.")
-"""For commands whose recordings cannot be repeated."""
+"""Option of commands whose recordings cannot be repeated."""
 
 durability_option = click.option(
     "--durability",

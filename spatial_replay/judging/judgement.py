@@ -97,7 +97,7 @@ class JudgedEpisode:
         margin: the robustness; None where not determined.
         success_at: seconds from the begin of the episode to its first success; None without one.
         tested: see `SpecResult.tested`.
-        reason: a sentence on what decided.
+        reason: the reason of the verdict, a sentence.
         task, seed: values in the data set, or None.
         log: path or address.
         failure, failure_at: name and time in seconds of a failed episode's first failure, if a file of

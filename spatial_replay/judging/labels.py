@@ -20,7 +20,7 @@ from spatial_replay.text import first_lines, listing, nearest_hint, plural
 LABEL_FILES: Final = ("labels.json", "labels.csv")
 """Names of label files that are found next to logs."""
 _LARGEST: Final = 256 * 2**20
-"""Bytes of a label file."""
+"""Size limit of a label file, bytes."""
 _MOST_FAULTS: Final = 20
 _FRAME_KEYS: Final = ("frame_index", "frame", "step", "timestamp", "time_ns")
 _TRUTHS: Final[Mapping[str, bool | None]] = {

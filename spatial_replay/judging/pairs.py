@@ -93,7 +93,7 @@ def _start_alike(new: JudgedEpisode, old: JudgedEpisode, conditions: Conditions,
 
 
 def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
-    """Return the centre of each object in the first sample of a log; none if it cannot be read."""
+    """Return the centre of each object in the first sample of a log; none if the log is unreadable."""
     try:
         source, options = opened_task(Task(log, (), conditions), ())
         window = options.window

@@ -116,7 +116,7 @@ def write_labels(judgement: Judgement, file: Path, inputs: Sequence[Path] = ()) 
     """Write the table of labels as Parquet or CSV, by the ending of the file's name.
 
     Raises:
-        UsageError: the ending is another one, or the output is an input.
+        UsageError: the ending is neither .parquet nor .csv, or the output is an input.
         OutputError: the file cannot be written.
     """
     from pyarrow import csv, parquet

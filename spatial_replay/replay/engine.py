@@ -249,7 +249,7 @@ class LogAccount:
             first_ns: zero of times in texts.
 
         Raises:
-            SpecificationError: names that the log never has, if names are strict.
+            SpecificationError: a name is missing, and names are strict.
         """
         missing = selection.missing_names(self._names)
         dropped = dropped_samples(selection.source)
@@ -390,7 +390,7 @@ class Replay:
         Raises:
             LogError: the log has no sample.
             UsageError: the window has no sample.
-            SpecificationError: names that the log never has, if names are strict.
+            SpecificationError: a name is missing, and names are strict.
         """
         self._is_beside = layer
         needs_messages = write is not None or self._hashes is not None
@@ -443,7 +443,7 @@ class Replay:
         Args:
             results: results of `run`, with series and leaves.
             times_ns: times of the samples, increasing.
-            show: receives the scene at each of them.
+            show: receives the scene at each of these times.
         """
         if not times_ns:
             return
@@ -681,14 +681,14 @@ def run_replay(
         keep_series: keep every sample's numbers in memory.
         keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
         output: path of the annotated log; an existing file is replaced only when the log is complete.
-        inputs: files that the output must not be.
+        inputs: files that the output must not overwrite.
         layer: leave the source's own messages, metadata and attachments out of the output.
         certify: hash inputs and results, for which messages are read, too; always done with an output.
         advance: called with the number of samples of each block that is done.
 
     Raises:
         UsageError: an option is invalid, the window has no sample, or the output is an input.
-        SpecificationError: names that the log never has, if names are strict.
+        SpecificationError: a name is missing, and names are strict.
         LogError: the log has no sample.
         OutputError: the output cannot be written.
     """

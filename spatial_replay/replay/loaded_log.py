@@ -268,7 +268,7 @@ class LoadedLog:
         Raises:
             LogError: the log has no sample, or cannot be read.
             UsageError: the window has no sample, or an option is invalid.
-            SpecificationError: names that the log never has, if names are strict.
+            SpecificationError: a name is missing, and names are strict.
         """
         keep = KEEP_ALL if options.keep is None else options.keep
         selection = Selection(source, tuple(files), replace(options, keep=keep))
@@ -311,7 +311,7 @@ class LoadedLog:
 
         Raises:
             UsageError: an option does not fit the specifications.
-            SpecificationError: names that the log never has, if names are strict.
+            SpecificationError: a name is missing, and names are strict.
         """
         looks_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
         if looks_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
@@ -603,7 +603,7 @@ _MOST_CHANGES: Final = 100
 class Playback:
     """The messages that an annotated log would have, in the order of time.
 
-    After a seek, they equal the messages of a replay, for any division into stretches. Only the scene
+    After a seek, the messages equal those of a replay, for any division into stretches. Only the scene
     differs: it is drawn again at once, and entities of another time are deleted.
 
     Attributes:

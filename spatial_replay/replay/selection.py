@@ -161,7 +161,7 @@ _FIRST_NS = 10**8
 
 
 def look_before(files: Sequence[Specification]) -> bool:
-    """Say whether specifications look back at samples before a window."""
+    """Return whether specifications look back at samples before a window."""
     return any(look_back([spec.formula for spec in file.specs]) for file in files)
 
 
@@ -267,7 +267,7 @@ def known_zero_ns(source: Source) -> int:
 
 
 def has_samples_from(source: Source, time_ns: int) -> bool:
-    """Say whether a log has samples at or after a time."""
+    """Return whether a log has samples at or after a time."""
     return any(len(block.trace) for block in read_blocks(source.keeping(), time_ns))
 
 

@@ -75,8 +75,8 @@ def export_table(
         The numbers of rows and of nodes, and the losses while reading, each with its place.
 
     Raises:
-        UsageError: the ending is another one, the library for Parquet is missing, or the log has no
-            robustness.
+        UsageError: the ending is neither .parquet nor .csv, the library for Parquet is missing, or the log
+            has no robustness.
         LogError: the log is damaged, and no robustness is left.
         OutputError: the output cannot be written.
     """

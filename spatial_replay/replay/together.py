@@ -107,7 +107,7 @@ class JointReplay:
         """Evaluate short logs, and yield the results of each.
 
         Raises:
-            SpecificationError: names that a log never has, if names are strict.
+            SpecificationError: a name is missing in a log, and names are strict.
         """
         traces = [log.traces[0] if len(log.traces) == 1 else Trace.concatenate(log.traces) for log in logs]
         joined, semantics = one_after_another(traces), self._selection.options.semantics
