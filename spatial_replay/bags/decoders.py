@@ -138,6 +138,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
     if schema is None or schema.encoding != "protobuf":
         place = "missing" if schema is None else f"in {schema.encoding!r:.100}"
         raise LogError(f"the definition of {type_name!r:.100} is {place}; protobuf needs a descriptor set")
+    # a pool for each type, because logs may define a name in different ways
     pool = DescriptorPool()
     try:
         for file in _in_order(_add_well_known_types(FileDescriptorSet.FromString(schema.data))):

@@ -47,6 +47,7 @@ _FIELD = re.compile(
 _ANNOTATIONS = re.compile(r"^\s*(?:@[A-Za-z_]\w*(?:\s*\([^()]*\))?\s*)+", re.ASCII)
 _SEPARATOR = re.compile(r"^={20,}[ \t]*\r?$", re.MULTILINE)
 _HEAD = re.compile(r"\s*(?:MSG|IDL): *(?P<name>\S+)[ \t]*\r?(?:\n|\Z)")
+# built-in types of ROS 1: http://wiki.ros.org/msg
 _BUILT_IN = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 
 
@@ -78,7 +79,7 @@ def full_type_name(name: str) -> str:
 
 
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
-    """Parse the types in a .msg text: its own type, and used types after lines of equals signs.
+    """Parse the types in a .msg text: its own type, then each used type after a line of equals signs.
 
     Constants and default values are ignored, because messages do not depend on them.
 
@@ -131,6 +132,7 @@ def _iter_fields(body: str, owner: str, type_names: set[str]) -> Iterator[Field]
             raise LogError(
                 f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is not a field"
             )
+        # a constant is not in the bytes of a message
         if field_match["rest"].startswith("="):
             continue
         limit, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
@@ -147,6 +149,7 @@ def _resolve(name: str, owner: str, type_names: set[str]) -> str:
     if "/" in name:
         return full_type_name(name)
     neighbour = f"{owner.rpartition('/')[0]}/{name}"
+    # ROS 1 writes a header without its package: http://wiki.ros.org/msg
     return "std_msgs/msg/Header" if name == "Header" and neighbour not in type_names else neighbour
 
 

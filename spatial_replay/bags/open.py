@@ -112,7 +112,7 @@ class McapLog(MessageReader):
 
     @property
     def channel_topics(self) -> frozenset[str]:
-        """Topics of its channels, whose definitions are not checked."""
+        """Topics of its channels; their definitions are not checked."""
         return frozenset(channel.topic for channel in self._declared.values())
 
     @property

@@ -306,6 +306,7 @@ class SqliteBag(MessageReader):
             # in a separate folder, so that only the copies are read and written
             with closing(sqlite3.connect(copy, isolation_level=None)) as database:
                 database.execute("PRAGMA trusted_schema=OFF")
+                # the checkpoint copies the pages of the write-ahead log into the copy of the file
                 (_, frames, _) = database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
             if frames < 1:
                 raise sqlite3.DatabaseError("no whole change is in it")
@@ -373,6 +374,7 @@ class SqliteBag(MessageReader):
         def key(row: Row | RowHead) -> tuple[int, int]:
             return (row[0], 0) if as_recorded else (row[2], row[0])
 
+        # the last row before the damage, after which the search for intact rows continues
         after = (-1, -1)
         with _opened(self._whole) as database:
             try:
@@ -538,6 +540,7 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
     An unreadable range of ids is halved until single unreadable ids are found.
     """
     # rowid, because `id` can be another column if the definition of the table is damaged
+    # NOT INDEXED, because an index can be damaged, too
     query = (
         "SELECT rowid, topic_id, timestamp FROM messages NOT INDEXED"
         " WHERE rowid BETWEEN ? AND ? ORDER BY rowid"
@@ -556,6 +559,7 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
                     first = max(first, row[0] + 1)
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
+                # the limit of steps is reached, so the other ranges count as lost
                 spans.append((first, last))
                 break
             middle = (first + last) // 2

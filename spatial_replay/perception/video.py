@@ -475,7 +475,7 @@ class VideoFile:
         if self.copy_fault is None:
             convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
         for packet in self._container.demux(self._stream):
-            # the pts that FFmpeg guesses for an .avi are late, and out of order with B frames
+            # FFmpeg guesses pts for an .avi: with B frames, they are out of order and up to 0.2 s late
             if is_avi:
                 packet.pts = None if is_reordered else packet.dts
             slot = packet.dts if is_reordered and packet.size else None

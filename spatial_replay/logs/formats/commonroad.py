@@ -285,6 +285,7 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     elements = iter_elements(path, faults, _OBSTACLES)
     step_s = _step_size(path, next(elements))
     obstacles = list(_iter_obstacles(path, faults, elements))
+    # a scenario of static obstacles only is one sample
     steps = sorted({step for obstacle in obstacles for step in obstacle.moving}) or ([0] if obstacles else [])
     if not obstacles and not len(faults):
         raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
@@ -567,6 +568,7 @@ def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[
 
 def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
     """Return a convex outline around all parts."""
+    # the hull of several parts with a rounded one is no polygon
     if len(parts) > 1 and any(part.radius for part in parts):
         x, y, radius = _around(parts)
         return OutlinePart([(x, y)], radius)

