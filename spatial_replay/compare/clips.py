@@ -255,6 +255,7 @@ class ClipSearch:
     ) -> None:
         results = [node.result for node in kept]
         needs_samples = any(result.object is not None or look_back([result.formula]) for result in results)
+        # only delayed terms and objects that come and go need samples, which take time to read
         trace = Selection(source, files, options).trace() if needs_samples else None
         self._parts = []
         for node in kept:
@@ -424,6 +425,7 @@ def cut_clip(
     if options.window.every != 1:
         raise UsageError("a clip keeps every sample; leave out --every")
     require_ltlf(options.semantics, "a clip")
+    # the first pass only evaluates, so it copies no messages
     first_pass = replace(options, keep=())
     whole = Replay(source, files, first_pass, keep_leaves=True, certify=False).run(advance=advance)
     nodes = chosen_nodes(whole.results, of)

@@ -490,7 +490,7 @@ class TreeDiff:
     """Edits between two formulas; empty if their meaning and names are the same.
 
     Attributes:
-        units: groups of edits that can only be applied together: one edit, or all that share a node.
+        units: groups of edits that are applied together: a single edit, or several that share a node.
     """
 
     units: tuple[tuple[Edit, ...], ...]
@@ -666,6 +666,7 @@ class _Comparison:
                 operator == new_operator
             ):
                 return self._match(old.node, old.members(operator), new.node, new.members(operator))
+            # operands were added to a formula or, in the next case, all but one were removed
             case _, Boolean(operator="and" | "or" as operator) if self._is_among(old, new.members(operator)):
                 return self._match(new.node, [old], new.node, new.members(operator))
             case Boolean(operator="and" | "or" as operator), _ if self._is_among(new, old.members(operator)):
@@ -845,6 +846,7 @@ class _Comparison:
 
         match(lambda old, new: self.meaning(old.node) == self.meaning(new.node))
         match(lambda old, new: old.node.name is not None and old.node.name == new.node.name)
+        # the most similar pairs first, so that they get each other as partners
         for least in (1.0, 0.5, 0.01):
             match(lambda old, new, least=least: _is_alike(old, new, least, by_operator=True))
         match(lambda old, new: _is_alike(old, new, 0.5, by_operator=False))

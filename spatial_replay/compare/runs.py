@@ -440,6 +440,7 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
     columns = [(first.bottom, second.bottom), (first.top, second.top)]
     columns += [(a.yaw[a_rows], b.yaw[b_rows]), (a.uncertainty[a_rows], b.uncertainty[b_rows])]
     for value, beside in columns:
+        # NaN on both sides is no difference
         moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
     # relative to one vertex, because means of coordinates far from the origin lose digits when subtracted
     corner = first.vertices[first.vertex_start[first.part_start[:-1]]]

@@ -849,7 +849,7 @@ def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]
 
 
 def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
-    """Mark a folder as the folder of a search, or check its mark.
+    """Mark an empty folder as the folder of a search, or check that its mark is of the same search.
 
     Raises:
         UsageError: the folder has another search, or other files.
@@ -978,6 +978,7 @@ class _Search:
             for run in (yield asked) if asked else ():
                 runs.append(replace(run, number=len(runs) + 1))
                 costs[key_of(run.case)] = _cost(run)
+            # the budget ends within this round, so some cases have no costs
             if len(asked) < len(new):
                 break
             reported = [costs[key_of(case)] for case in cases]

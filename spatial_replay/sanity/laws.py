@@ -94,6 +94,7 @@ def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequ
 
 
 def _distance(a: Term, b: Term) -> SignedDistance:
+    # the distance is symmetric; a fixed order makes equal ones equal values
     first, second = sorted((a, b), key=repr)
     return SignedDistance(first, second)
 

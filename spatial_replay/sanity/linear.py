@@ -167,6 +167,7 @@ class _Tableau:
             if goal is None:
                 return set()
             row = self._rows[variable]
+            # the lowest number first (Bland's rule)
             entering = next(
                 (candidate for candidate in sorted(row) if self._can_move(candidate, row[candidate], rises)),
                 None,

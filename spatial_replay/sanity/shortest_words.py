@@ -104,6 +104,7 @@ def word_of_length(
     for _ in range(MAX_CONFLICTS_OF_A_LENGTH):
         if allowed == NO:
             return None
+        # requirements are those of the sides alone (`whole`), without the exclusions
         word = runs.split(necessary(runs.diagrams, whole, first_cube(runs.diagrams, allowed)))
         excluded = [conflict for cube in word for conflict in conflicts(cube)]
         if not excluded:

@@ -247,6 +247,7 @@ def format_specification(specification: Specification) -> str:
     """Return the canonical text of a specification, with one line for each `spec`."""
     relations = RELATION_NAMES | specification.relations
     lines = [f"use {specification.profile}"]
+    # the digest is a comment, because parsing does not check it
     lines += [f"use {name}  # SHA-256 {digest}" for name, digest in specification.plugins.items()]
     for name, outline in specification.regions.items():
         lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")

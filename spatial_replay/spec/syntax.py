@@ -157,6 +157,7 @@ class BooleanSyntax(NamedTuple):
     """Boolean operator; consecutive `and` or `or` without brackets are one node with several operands."""
 
     operator: Literal["not", "and", "or", "xor", "->", "<->"]
+    # a list, because the parser appends to it while it reads a chain
     operands: list[FormulaSyntax]
     span: Span
     depth: int

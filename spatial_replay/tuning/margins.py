@@ -295,6 +295,7 @@ def _decimal(name: str, value: Value, written: Constant) -> Decimal:
     if isinstance(read, Duration) != (written.duration_ns is not None):
         kind = "a number" if written.duration_ns is None else "a duration such as 2s"
         raise UsageError(f"{name} cannot be {value!r}: it is {kind} ({text_of_constant(written)} as written)")
+    # repr gives the digits of the text; Decimal(0.1) would have those of the binary float
     return Decimal(read.ns) if isinstance(read, Duration) else Decimal(repr(read))
 
 
@@ -577,6 +578,7 @@ class Margins:
         return Robustness(lower, upper)
 
     def _of_result(self, run: int, name: str, point: Point) -> Robustness | None:
+        # only the constants of a result are in its key, because others do not change it
         key = run, name, tuple([point[axis] for axis in self.axes[name]])
         if key not in self._robustness:
             result = self._compile(name, point)

@@ -136,6 +136,7 @@ def members_of(trace: Trace) -> dict[str, set[str]]:
     for column, name in enumerate(trace.names):
         rows = trace.rows[:, column]
         rows = rows[rows != ABSENT]
+        # an unknown object has the row -2 - row, which still has its class (see `Trace`)
         codes = np.unique(trace.class_code[np.where(rows < 0, -2 - rows, rows)])
         for code in codes.tolist():
             if class_name := trace.classes[code]:

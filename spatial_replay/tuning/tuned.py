@@ -98,6 +98,7 @@ def evolve(
         [(0.0, 1.0)] * len(sizes),
         rng=np.random.default_rng(seed),
         x0=[number / size for number, size in zip(start, sizes, strict=True)],
+        # Sobol points cover the space evenly, even if they are few
         init="sobol",
         popsize=_CANDIDATES,
         maxiter=_GENERATIONS,
@@ -136,7 +137,10 @@ class _Part(NamedTuple):
 
 
 class ExactSearch:
-    """Exact search for points at which runs have a margin; constants are given by their looseness."""
+    """Exact search for points at which runs have a margin.
+
+    The looseness of a constant is its number of steps from the tightest value.
+    """
 
     def __init__(self, margins: Margins, point_of: Callable[[Sequence[int]], Point]) -> None:
         """Prepare the search.
@@ -162,6 +166,7 @@ class ExactSearch:
         best, low = feasibility.looseness, self._least((*good, *bad), feasibility.looseness)
         ends = self._steps, [0] * len(self._steps)
         high = min(self._least(good, ends[0]), self._least(bad, ends[1]))
+        # an invalid end has the margin -inf, which is not an upper bound
         if any(self._is_invalid((*good, *bad), end) for end in ends):
             high = math.inf
         is_proven = True
@@ -172,6 +177,7 @@ class ExactSearch:
                 break
             if high - low <= _PRECISION * abs(low) or low == high:
                 break
+            # without an upper bound the level is doubled
             level = (low + high) / 2 if math.isfinite(high) else max(1.0, 2 * low)
             tried = self.decide(good, bad, level)
             if tried.looseness is None:
@@ -220,6 +226,7 @@ class ExactSearch:
             axis = max(self._joint.axes, key=lambda axis: (high[axis] - low[axis]) / self._steps[axis])
             if high[axis] > low[axis]:
                 middle = (low[axis] + high[axis]) // 2
+                # boxes are a stack, so the tighter half is searched first
                 boxes.append((_with(low, [axis], middle + 1), list(high)))
                 boxes.append((list(low), _with(high, [axis], middle)))
         return Feasibility(None, is_proven=not boxes)
@@ -369,7 +376,7 @@ class Search:
         together = self._least(self._good, _PARTS, self._at)
         point = self._at(together)
         for axis, steps in enumerate(self._steps):
-
+            # the defaults bind the values of this iteration
             def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
                 return self._with(point, axis, self._number_at(axis, looseness))
 
@@ -393,6 +400,7 @@ class Search:
         if alone or failing:
             return Found(at(first), is_held=False, conflict=(*alone, *failing), alone=alone)
         number = self._crossing(first, last, at)
+        # the widest margin is at the crossing or one step before it
         widest = max(number, max(number - 1, first), key=lambda each: self._least_margin(at(each)))
         least = self._least_margin(at(widest))
         interval = self.interval(at(widest), 0, least)
@@ -540,6 +548,7 @@ class Search:
                 break
             # every third step is a bisection, because secants can leave one end in place for many steps
             share = 0.5 if turn % 3 == 2 else below / (below - above)
+            # strictly between the ends, so that the interval always shrinks
             middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
             if (middle_excess := excess(middle)) >= 0.0:
                 high, above = middle, middle_excess
