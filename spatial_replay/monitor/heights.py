@@ -108,6 +108,7 @@ def _comparisons_of(specification: Specification) -> Iterator[_Comparison]:
 def _samples_with_one_above(trace: Trace, specification: Specification) -> Integers:
     """Return the samples in which an object, or a region, is wholly above another."""
     batch = trace.footprints
+    # logs without heights are not compared again
     if not len(batch.bottom) or np.isnan(batch.bottom).all():
         return np.empty(0, np.int64)
     # absent objects read the appended infinities, which decide no extremum

@@ -218,7 +218,7 @@ class LogNumbers:
 
     @property
     def ranges(self) -> Sequence[ThresholdRange]:
-        """The range of each atom that compares one signal or distance with a number."""
+        """The range of each atom that compares one signal or distance with a number or text."""
         return tuple(
             replace(threshold_range, samples=self.samples) for threshold_range in self._ranges.values()
         )
@@ -246,7 +246,7 @@ class LogNumbers:
 
 
 def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
-    """Return a line for each window in samples, with its length in seconds at the log's rate."""
+    """Return lines on windows in samples, and on nested ones, with their seconds at the log's rate."""
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
@@ -432,7 +432,7 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
 
 
 def _compared_quantity(atom: Atom) -> Expression | None:
-    """Return the only signal or distance that an atom compares with a number; None for other atoms."""
+    """Return the only signal or distance that an atom compares; None for other atoms."""
     if atom.relation == "sum":
         return None
     parts = {part for part in iter_expressions(atom.expression) if isinstance(part, (Signal, Measurement))}

@@ -542,6 +542,7 @@ class PaperRun:
         """
         self._max_pairs = max_pairs
         self._table = paper_table(formula, leaves)
+        # a kernel with memory between samples: NumPy took 0.35 to 0.64 ms for an update instead of 0.03
         self._memory = _first_memory(self._table)
         self._position = 0
         self._value = np.full(len(self._table.rows), np.nan)

@@ -174,6 +174,7 @@ def find_vacuous(
     )
 
 
+# cached, because a batch asks for the same instances at each of its logs
 @lru_cache(maxsize=256)
 def _may_decide_nothing(instance: Instance) -> bool:
     """Return whether a part of a formula can be untested in some log.

@@ -848,6 +848,7 @@ def _step(
 
 
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
+# the kernel treats unknown positions, too: 21 µs for 20 people instead of 1.3 ms by a trace
 _NOT_THERE, _HIDDEN = (Struct("=5d").pack(parts, nan, nan, nan, 0.0) for parts in (0.0, -1.0))
 
 

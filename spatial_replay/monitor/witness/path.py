@@ -300,6 +300,7 @@ class _Walk:
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples in an operator's window."""
+        # one window: the windows of all samples slowed explanations of many intervals down several times
         begin, end = windows_of(formula, self._nodes.times_ns, np.array([sample]))
         return range(int(begin[0]), int(end[0]))
 
