@@ -255,7 +255,7 @@ def test_tables_grow_linearly_with_both_polarities_at_every_level():
 
 def test_too_many_bindings_are_refused():
     many = points(**{f"o{n}": [n] for n in range(30)})
-    with pytest.raises(UsageError, match=rf"x, y, z over 30 objects brings .* {MAX_BINDINGS} is the limit"):
+    with pytest.raises(UsageError, match=rf"x, y, z over 30 objects gives .* {MAX_BINDINGS} is the limit"):
         judged("forall x, y, z in all: x dist y >= 0", many)
     with pytest.raises(UsageError, match=rf"{MAX_BINDINGS} is the limit"):
         judged("forall x in all: forall y in all: exists z in all: x closer y than z", many)
