@@ -285,7 +285,7 @@ class Automaton(Displayed):
         """
         if not self.is_listable:
             raise UsageError(
-                f"the Hanoi format has every transition of {self.name}, of which there are too many "
+                f"the Hanoi format needs every transition of {self.name}, and there are too many "
                 f"({size_words(self)}); text and .dot files show the states nearest to the start"
             )
         numbers = range(len(self.propositions))

@@ -150,7 +150,7 @@ def compiled_by_mona(skeleton: Skeleton, propositions: int) -> Machine:
     # checked before ltlf2dfa is imported, which takes about a second
     executable = shutil.which("mona")
     if executable is None:
-        raise NoAutomatonError("it is not installed, and may still compile it: apt-get install mona")
+        raise NoAutomatonError("it is not installed, and may compile the formula: apt-get install mona")
     if find_spec("ltlf2dfa") is None:
         raise NoAutomatonError(
             "ltlf2dfa, which writes its programs, is not installed: pip install 'spatial-replay[mona]'"

@@ -50,7 +50,7 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = 
         recorder.attach(planner, timings=timings)
     elif timings:
         raise UsageError(
-            "a recorder with a planner was given its timings when that was attached; leave them out"
+            "the recorder has this planner already, so its timings cannot be changed; leave timings out"
         )
     return run_plan(recorder, robot.execute, robot.look)
 

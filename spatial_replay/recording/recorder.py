@@ -394,10 +394,10 @@ class Recorder(SampleWriter):
             raise UsageError(f"{self.name} has a planner already; open another recorder")
         if self._clips is not None or not self._blocks:
             remedy = "open a Recorder without a trigger, and with block=True"
-            raise UsageError(f"{self.name} may leave samples out, on which decisions depend; {remedy}")
+            raise UsageError(f"{self.name} may drop samples, and decisions depend on all of them; {remedy}")
         if planner.specification not in self._files:
             name, remedy = planner.specification.filename, "open the Recorder with planner=planner"
-            raise UsageError(f"{self.name} does not record {name}, which is planned for; {remedy}")
+            raise UsageError(f"{self.name} does not record {name}, the planner's specification; {remedy}")
         if self._last_ns >= 0 or planner.has_observed:
             raise UsageError("decisions depend on all samples; attach a new planner before the first one")
 

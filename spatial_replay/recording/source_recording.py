@@ -106,7 +106,7 @@ def _units_metadata(source: Source, unit: str) -> dict[str, str]:
     """Return the metadata entries of axes and units; `unit`, if given, is the unit of lengths."""
     axes = source.axes
     if unit and axes.unit not in ("", unit):
-        raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
+        raise UsageError(f"{source.name} declares lengths in {axes.unit}, not in {unit}; leave the unit out")
     unit = checked_units({"": unit})[""] if unit else axes.unit
     return replace(axes, unit=unit).metadata()
 

@@ -228,7 +228,7 @@ def test_of_an_automaton_with_too_many_transitions_the_states_nearest_to_the_sta
     )
     assert "state 59:" in words and "state 60:" not in words
     assert "196 more states" in machine.to_dot()
-    with pytest.raises(UsageError, match=r"Hanoi format has every transition .*256 states"):
+    with pytest.raises(UsageError, match=r"Hanoi format needs every transition .*256 states"):
         machine.to_hoa()
 
 

@@ -68,7 +68,7 @@ def test_units_stay_with_a_log_its_copies_and_its_verdicts(tmp_path: Path) -> No
         verdicts = dict(open_source(log).metadata())[VERDICTS]
         assert verdicts["reach"].endswith(" m")
     assert b"source_axes" not in (tmp_path / "bare.mcap").read_bytes()
-    with pytest.raises(UsageError, match="declares lengths in m, and not in px"):
+    with pytest.raises(UsageError, match="declares lengths in m, not in px"):
         record_source(open_source(tmp_path / "run.mcap"), tmp_path / "px.mcap", unit="px")
     with Recorder(tmp_path / "own.mcap", specifications=spec, units={"": "m", "battery": "V"}) as recorder:
         for sample in run().samples():
