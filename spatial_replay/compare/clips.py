@@ -309,9 +309,9 @@ class ClipSearch:
             step = max(2 * step, 1)
 
     def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
-        """Return the end nearest to the inner end with which the window still has the results.
+        """Return the end of the shortest window that still has the results, between two ends.
 
-        The outer end has them. The search starts at the inner end, because long windows cost most.
+        The window with the outer end has them. The search starts inside, because long windows cost most.
         """
         if inner == outer or holds(inner):
             return inner
@@ -328,7 +328,7 @@ class ClipSearch:
 
 def _join_times(times_ns: Sequence[Integers]) -> Integers:
     first = times_ns[0]
-    # lengths alone prove nothing: objects of a template can appear one after another for equally many samples
+    # times are compared, not lengths: objects that appear one after another can have equally many samples
     if all(np.array_equal(sample_times, first) for sample_times in times_ns):
         return first
     return np.unique(np.concatenate(times_ns))

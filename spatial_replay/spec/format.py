@@ -288,7 +288,7 @@ def _format_outline(outline: Outline) -> str:
 
 
 class Branch(NamedTuple):
-    """Node of a tree, as a line of text.
+    """Node of a tree for one line of text.
 
     Attributes:
         id: number of the node in text order; the root is 0.

@@ -651,7 +651,7 @@ _LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyTyp
 def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
     """Return operands that skip the samples or members in which a rate has no value yet.
 
-    The result is the given tuple if the operands have no rates outside of inner operators that skip samples.
+    The result is the given tuple if there is nothing to skip: no rates, or only in operators that skip them.
     """
     conditions = [rate_conditions(operand) for operand in operands] if operator in _LEFT_OUT_AS else []
     if not any(conditions):
