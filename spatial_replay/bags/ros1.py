@@ -597,6 +597,7 @@ class Ros1Bag(MessageReader):
             name=connection.topic,
             type=full_type_name(connection.type),
             encoding="ros1",
+            # a scan counts only the chunks that are left, so its count shows no loss
             count=count if self._directory.is_indexed else None,
             schema=Schema(connection.type, "ros1msg", definition),
             latched=connection.is_latched,

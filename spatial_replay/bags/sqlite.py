@@ -100,7 +100,8 @@ def _plain(text: str) -> Any:
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
                 raise LogError("it refers to parts of itself, or is nested too deep; no recorder writes that")
-        return yaml.load(text, Loader=loader)  # the loader makes plain values only
+        # safe, because the loader creates plain values only
+        return yaml.load(text, Loader=loader)
     # malformed numbers and dates raise errors of all these types
     except (yaml.YAMLError, ValueError, OverflowError, TypeError, KeyError) as error:
         raise LogError(f"it is no YAML ({' '.join(str(error).split()):.200})") from None

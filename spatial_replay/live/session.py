@@ -520,6 +520,7 @@ class LiveSession:
                 case Connected(server):
                     if self._server is not None:
                         self._notes.append(f"connected again to {self._address}")
+                        # silence counts from the new connection on
                         self._last_s = dict.fromkeys(self._last_s, time.monotonic())
                     self._server, self._is_connected = server, True
                     self.connected.set()
@@ -723,6 +724,7 @@ class LiveSession:
             while not all(log.reserve() for log in self._logs):
                 await asyncio.sleep(_PAUSE_S)
             now_s = time.monotonic()
+            # the newest sample is never dropped
             if now_s - arrived_s > LATE_S and sample.time_ns != last_ns:
                 self._dropped += 1
                 for recorder in self._recorders:
@@ -784,6 +786,7 @@ class LiveSession:
         now_s = time.monotonic()
         if self._assembler is not None:
             arrived_s = min(arrived_s, self._assembler.arrived_s(sample.time_ns))
+        # the arrival is infinite for a sample that no message completed
         self._delay_s = max(0.0, now_s - min(arrived_s, now_s))
         for recorder in self._recorders:
             recorder.write(sample)

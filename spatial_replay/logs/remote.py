@@ -147,7 +147,7 @@ def each_ahead(
         while waiting:
             yield waiting.popleft()[1].result()
     finally:
-        # no wait: garbage collection may close this generator in the middle of the start of a thread
+        # garbage collection may close this generator while a thread starts, and a wait would then block it
         threads.shutdown(wait=False, cancel_futures=True)
 
 
@@ -207,6 +207,7 @@ class HeldBytes:
             self._parts[start] = data[start - begin : end - begin]
             self._size += end - start
         while len(self._parts) > 1 and self._size > MOST_HELD_BYTES:
+            # dicts keep the order of insertion
             oldest = next(iter(self._parts))
             self._size -= len(self._parts.pop(oldest))
             self._begins.remove(oldest)
@@ -668,8 +669,10 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     parent = user_cache_folder("downloads")
+    # with the version, so that each version has its own copy
     identities = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
     folder = parent / hashlib.sha256("\n".join(identities).encode()).hexdigest()[:32]
+    # without a strong tag, a copy may be outdated, so it is made again
     if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
     ):

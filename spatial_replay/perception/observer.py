@@ -88,6 +88,7 @@ def poses_on_plane(
     left = (places[:, :, 3] - places[:, :, 0]) + (places[:, :, 2] - places[:, :, 1])
     # in a square, the sides to the left, turned by -90 degrees, equal the sides ahead: average both
     along = ahead + np.stack([left[..., 1], -left[..., 0]], axis=-1)
+    # `along` is the sum of four edges
     edge = np.linalg.norm(along, axis=-1) / 4
     yaw = np.arctan2(along[..., 1], along[..., 0]) - turn[:, None]
     cosine, sine = np.cos(yaw), np.sin(yaw)
@@ -122,6 +123,7 @@ def poses_on_plane(
             noise = sigmas * math.sqrt(spread[index, 3, 3]) / size[index]
             ratio = edge[index, 0] / size[index] - 1
             off = float(np.linalg.norm(places[index, 0] - squares[index], axis=1).max()) / size[index]
+            # a tag above the plane of an uncalibrated camera appears larger, below it smaller
             beyond = abs(ratio) - (larger[index] if ratio * tag.z > 0 else 0.0)
             if beyond > _SIZE_TOLERANCE + noise or off > 2 * _SIZE_TOLERANCE + 2 * noise:
                 doubt = (

@@ -242,6 +242,7 @@ def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
 def _bilinear(grey: Image, points: Floats) -> Floats:
     """Interpolate an image between its pixels; beyond its border, values are those at the border."""
     height, width = grey.shape
+    # below the last pixel, so that its next neighbour exists
     x = np.clip(points[..., 0], 0, width - 1.001)
     y = np.clip(points[..., 1], 0, height - 1.001)
     column, row = x.astype(np.int64), y.astype(np.int64)

@@ -112,6 +112,7 @@ class HomographyPlane:
         """See `Plane`."""
         entries = self.pixel_from_plane.ravel()[:8]
         steps = _STEP * np.maximum(np.abs(entries), 1e-3)
+        # central differences by each entry
         moved = np.repeat(np.append(entries, 1.0)[None], 16, axis=0)
         moved[np.arange(8), np.arange(8)] += steps
         moved[np.arange(8, 16), np.arange(8)] -= steps
@@ -212,6 +213,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     solution, (fitted, derivative) = solved, _appearing(known_corners, solved, tags.camera)
     off = np.linalg.norm(fitted - seen, axis=1)
     unknowns = derivative.shape[-1]
+    # per degree of freedom, so that few tags do not look exact
     rms = float(np.sqrt(np.square(off).sum() / max(2 * len(off) - unknowns, 1)))
     by_tag = off.reshape(-1, 4).mean(axis=1)
     place = int(by_tag.argmax())
@@ -222,6 +224,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     # an error of a tag's place moves its corners by this many pixels per unit
     per_pixel = _pixels_per_unit(seen, known_corners)
     variance = error**2 + (tags.reference_error * per_pixel) ** 2
+    # covariance of a least squares fit: variance (J^T J)^-1
     spread = np.asarray(variance * np.linalg.pinv(flat_derivative.T @ flat_derivative), np.float64)
     plane: Plane
     if tags.camera is None:
@@ -299,6 +302,7 @@ def _refuse_misfit(
     if off.max() <= limit:
         return
     first = references[0]
+    # half a turn first, because OpenCV prints AprilTags upside down
     for turns in (2, 1, 3):
         # the corners of all tags in a turned order
         turned = np.roll(known.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)

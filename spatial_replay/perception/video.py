@@ -344,6 +344,7 @@ class VideoFile:
         self._goes_back = False
         av = load_av()
         try:
+            # opened first, so that a missing file has the usual error
             with path.open("rb"):
                 pass
         except OSError as error:

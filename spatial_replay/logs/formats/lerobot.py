@@ -159,6 +159,7 @@ class _LeRobot(DataSet):
         """
         likely = self._file_of[number]
         named = self._file_by_end.get(likely)
+        # a file of version 2 that holds its episode needs no search
         is_alone = named is not None and named.name == likely and number in self._rows_of(named)
         # metadata of copied or merged data sets names wrong files, so all files are searched
         files = [named] if named is not None and is_alone else self._files

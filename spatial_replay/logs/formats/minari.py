@@ -193,6 +193,7 @@ class _Tables(_Minari):
             raise LogError(f"{self.name}#{episode.number}: {folder.name} has no data; download it again")
         try:
             table = library.concat_tables([_table(file, library) for file in files])
+            # a damaged file can have offsets outside its buffers
             table.validate(full=True)
             return dict(_leaves(table, library))
         except (OSError, ValueError, library.ArrowException) as error:

@@ -102,6 +102,7 @@ class SceneModel:
         self.names = tuple(self._bodies)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
+        # poses in the default state give the geoms in the frames of their bodies
         self._geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
         mocap = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
         self.remarks = tuple(remarks)

@@ -401,6 +401,7 @@ class _Scan:
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
             if self._end > self._size:
                 raise DamageError("the data end within a chunk")
+            # damage can look like the end of the data
             if self._next_chunk(following) is not None:
                 raise DamageError("the data end before the last chunk")
             # the summary section repeats records that were read already

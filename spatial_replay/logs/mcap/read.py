@@ -573,7 +573,7 @@ def decode_samples(
 
 
 def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
-    """Return the places of all messages, except places that are in `own` but not in `sound`."""
+    """Return the places of all messages except damaged samples: samples in `own` that are not in `sound`."""
     return np.setdiff1d(np.arange(len(messages)), np.setdiff1d(own, sound))
 
 
