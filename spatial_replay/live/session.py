@@ -238,7 +238,7 @@ _SAMPLES_BEFORE_DOUBTS: Final = 100
 """Number of samples before a run is first compared with its mapping; it doubles each time."""
 
 _USUAL: Final = 9
-"""Number of intervals between messages of a topic whose median is the usual interval."""
+"""Number of latest intervals between messages of a topic; their median is its usual interval."""
 
 _GRACE_TURNS: Final = 5
 """Number of turns of the event loop in which arrived messages reach the inbox."""

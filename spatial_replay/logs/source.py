@@ -109,7 +109,7 @@ class Source:
 
     @property
     def axes(self) -> Axes:
-        """Axes of the source, or of the source that a log was recorded from. Samples use `OUR_AXES`."""
+        """Axes of the source; for our logs, axes of the recorded source. Samples use `OUR_AXES`."""
         return OUR_AXES
 
     @property

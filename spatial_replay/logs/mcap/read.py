@@ -406,7 +406,7 @@ class McapSource(FileSource):
 
     @property
     def axes(self) -> Axes:
-        """Axes of the original source; samples are always y-up."""
+        """Axes of the recorded source; samples are always y-up."""
         return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property
