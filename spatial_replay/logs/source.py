@@ -25,7 +25,7 @@ BLOCK_SAMPLES = 12_288
 
 
 SAMPLES_A_GAP: Final = 10
-"""Number of samples that are inserted in a gap, per longest allowed pause."""
+"""Number of samples that are inserted for each `max_gap_ns` of a gap."""
 _MOST_IN_GAP = 10_000
 """Approximate limit of the samples that are inserted in one gap."""
 

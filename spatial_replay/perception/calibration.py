@@ -34,7 +34,7 @@ _LOOSE: Final = 0.02
 """Largest relative standard deviation of the focal length; above it, the views were too much alike."""
 
 _WRONG: Final = 8.0
-"""Error of corners that shows another sheet than the stated one, pixels; a bent sheet stays far below."""
+"""Error of corners above which the sheet is not the stated one, pixels; a bent sheet is far below."""
 
 _WIDE: Final = 0.6
 """Least share of the image's width and height that the tags of all views should cover."""

@@ -19,7 +19,7 @@ from spatial_replay.errors import LogError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.formats.episodes import MOST_BYTES
 
-# https://www.zlib.net/zlib_tech.html
+# the limit of deflate: https://www.zlib.net/zlib_tech.html
 _BEST_RATIO: Final = 1100
 """Largest compression ratio; deflate reaches 1,032."""
 _SMALL: Final = 2**26
