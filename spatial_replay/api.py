@@ -99,9 +99,7 @@ def replay_log(
     if isinstance(keep, str):
         keep = (keep,)
     if keep is not None and (output is None or layer):
-        raise UsageError(
-            "keep applies to an annotated log with the log's own messages; give output, not layer"
-        )
+        raise UsageError("keep chooses the log's own messages in an annotated log; give output, and no layer")
     if keep is None and output is None:
         # without an output, only the messages of samples are read
         keep = (MAPPED,)
@@ -398,9 +396,7 @@ def evaluate_logs(
     if specifications is None:
         named = _paths(logs)
         if len(named) != 1 or conditions != Conditions():
-            raise UsageError(
-                "without specifications, give the path of a suite file, and nothing that it says"
-            )
+            raise UsageError("give specifications, or one suite file without other options")
         suite = load_suite(named[0])
     else:
         suite = _suite(logs, specifications, conditions)

@@ -391,7 +391,7 @@ compile_task(sys.argv[1])
 def _compile_in_child(task: str, folder: Path, lock: int) -> int:
     """Compile a task in a child, which continues if this process ends. Return its status."""
     if not sys.executable or getattr(sys, "frozen", False):
-        raise OSError("this program has no interpreter of its own to begin a child process with")
+        raise OSError("this program has no Python interpreter for a child process")
     # with this setting, the child starts no child itself
     environment = {
         **os.environ,

@@ -297,7 +297,7 @@ def _place(start: str) -> tuple[int, int]:
     line, _, row = (start or "0.0").partition(".")
     if not (line.isascii() and line.isdecimal() and row.isascii() and row.isdecimal() and len(start) < 20):
         raise UsageError(
-            f"next: {_quote(start)} is not a place in an answer; give the `next` of the part before"
+            f"next: {_quote(start)} is not a place in an answer; give the `next` of the previous part"
         )
     return int(line), int(row)
 

@@ -121,7 +121,9 @@ class Tools:
     async def list_logs(self, ctx: Context, next: _Next = "") -> CallToolResult:
         """List the logs and data sets below the roots: size, length, objects, label."""
         if next and not (next.isascii() and next.isdecimal() and len(next) < 20):
-            raise UsageError(f"next: {next!r:.80} is not a place in the list; give that of the answer before")
+            raise UsageError(
+                f"next: {next!r:.80} is not a place in the list; give the one of the previous answer"
+            )
         first = int(next or 0)
         listing = await self._run(ctx, [["list", *map(str, self._bounds.folders)]])
         if not listing.outcomes:
@@ -439,7 +441,7 @@ def _answer(
         "left_off": page.left_off,
         "next": following,
     }
-    more = [f'the answer goes on: call {tool} again with next="{following}"'] if following else []
+    more = [f'the answer continues: call {tool} again with next="{following}"'] if following else []
     text = "\n".join([*page.lines, *page.warnings, *more])
     return CallToolResult(content=[TextContent(type="text", text=text)], structured_content=values)
 

@@ -40,7 +40,7 @@ class LocalFolder:
         """
         refuse_addresses(path, "give it as a text: a path joins its slashes")
         if path.exists() and not path.is_dir():
-            raise UsageError(f"{path} is a file; results are a folder, give that")
+            raise UsageError(f"{path} is a file; give a folder for results")
         self.path: Final = path
         self.location: Final = str(path.resolve())
 
@@ -326,7 +326,7 @@ class ResultsFolder:
             version = json.loads(data)["spatial_replay_results"]
         except (MissingFileError, ValueError, LookupError, TypeError):
             raise UsageError(
-                f"{path} does not hold the results of a batch; give those, or an empty or new folder"
+                f"{path} does not hold the results of a batch; give its folder, or an empty or new one"
             ) from None
         if version != FORMAT:
             raise UsageError(
@@ -438,10 +438,10 @@ class ResultsFolder:
             return self._read(LAST_RUN)
         except MissingFileError:
             raise UsageError(
-                f"no run has ended in {self._files} so far; run the batch again, and it goes on"
+                f"no run has ended in {self._files} so far; run the batch again; it continues"
             ) from None
         except LogError as error:
-            raise LogError(f"{error}; run the batch again, which writes it again") from None
+            raise LogError(f"{error}; run the batch again to replace it") from None
 
     def read_explanations(self) -> dict[tuple[str, str, str | None], tuple[Any, ...]]:
         """Return the explanations in the last run by key, spec and object, see `EXPLANATION`."""

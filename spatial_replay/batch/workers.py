@@ -255,8 +255,8 @@ class DaskCluster:
 
     def _scheduler_loss(self) -> ClusterError:
         return ClusterError(
-            f"--dask {self._address}: the scheduler answers no more; the results so far stay, and the same "
-            "command goes on from there"
+            f"--dask {self._address}: the scheduler stopped answering; the results so far are stored, "
+            "and the same command continues from them"
         )
 
     @contextmanager

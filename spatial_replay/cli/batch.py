@@ -276,7 +276,7 @@ def batch(
     from spatial_replay.batch.run_table import compare, with_baseline
 
     if dask is not None and jobs is not None:
-        raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
+        raise UsageError("--jobs applies to this machine, not to a cluster; remove --jobs or --dask")
     suite = _suite(logs, conditions, semantics).allowing(allow)
     cases = prepare(suite, progress)
     warnings = [warning for case in cases for file in case.files for warning in file.warnings]
@@ -325,7 +325,7 @@ def resumable(folder: str) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as error:
-        error.add_note(f"what was evaluated so far is in {folder}; the same command goes on from there")
+        error.add_note(f"the results so far are in {folder}; the same command continues from them")
         raise
 
 

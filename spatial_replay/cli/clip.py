@@ -293,7 +293,7 @@ def verify(
         else:
             show(f"{log.name}: its certificate is signed by {signed_by}")
     if sign is not None and differences:
-        warn(f"{log.name} was not signed: only a log whose certificate is right is")
+        warn(f"{log.name} was not signed, because its certificate does not match")
     elif sign is not None:
         with replacing(signature, local_files([log, sign])) as stream:
             stream.write(sign_certificate(verified.recorded, sign))

@@ -425,9 +425,7 @@ def replay(
         print_verdicts(replayed, output, window_ns)
     if output is not None and not layer and not keep and not default_keep(inputs.source):
         hint = f"{output} is opened next to it; with --topics all it holds its messages, too"
-        show_message(
-            "note", f"{inputs.source.name} stays as it is, for rosbags and `ros2 bag`: {hint}", "cyan"
-        )
+        show_message("note", f"{inputs.source.name} is unchanged, for rosbags and `ros2 bag`: {hint}", "cyan")
     verdicts = [str(result.verdict) for result in replayed.results]
     if "violated" in verdicts and json_file != "-" and semantics == "ltlf" and sys.stderr.isatty():
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"

@@ -155,7 +155,7 @@ def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
         # spreadsheets write CSV with a byte order mark
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise UsageError(f"{file} is not UTF-8; save it as that") from None
+        raise UsageError(f"{file} is not UTF-8; save it as UTF-8") from None
     except (OSError, ValueError) as error:
         raise MissingFileError.of(file, error) from None
     if len(data) > _LARGEST:

@@ -89,7 +89,7 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
         if not any(is_kept(topic, (pattern,), ()) for topic in topics):
             raise UsageError(
                 f"no topic of {source.name} fits {pattern!r}; it has {listing(topics)}; "
-                "'all' keeps everything, 'mapped' the topics that make the samples"
+                "'all' keeps everything, 'mapped' the topics of the samples"
             )
 
 

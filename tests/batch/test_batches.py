@@ -789,7 +789,7 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (["empty", "--spec", "gate.spatial"], "no log in this folder"),
         (["logs"], "give a specification with --spec FILE"),
         (["logs", "--spec", "G (cart dist person >= 0)"], "is a formula, and results name files"),
-        (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; results are a folder"),
+        (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; give a folder for results"),
         (["logs", "--spec", "gate.spatial", "-o", "https://h/results"], "give a folder of a bucket"),
         (["logs", "--spec", "gate.spatial", "-o", "logs"], "does not hold the results of a batch"),
         (["logs", "--spec", "gate.spatial", "-o", "old"], "results of format 0"),

@@ -97,7 +97,7 @@ def test_a_batch_that_is_killed_loses_no_row_and_has_none_twice(fleet: Path) -> 
             _, said = process.communicate(timeout=60)
         assert process.returncode in (130, -signal.SIGKILL, 1), said
         if process.returncode == 130:
-            assert "the same command goes on from there" in said
+            assert "the same command continues from them" in said
         stored = sum(keys_of_files(fleet))
         assert stored >= 1
     deadline = time.monotonic() + 30
@@ -180,7 +180,7 @@ def test_sigterm_ends_a_batch_whose_workers_wait_for_ever(fleet: Path, jobs: str
     Path("few.spatial").write_text("use cell\nspec few = G (crowd <= 3)\n")
     arguments = ["batch", "logs", "--spec", "few.spatial", "--plugin", "cell.py", "--jobs", jobs]
     code, said = interrupted([*PROGRAM, *arguments], signal.SIGTERM, fleet, Path("at_work").exists)
-    assert (code, "the same command goes on from there" in said) == (130, True), said
+    assert (code, "the same command continues from them" in said) == (130, True), said
 
 
 def test_a_pipe_is_the_error_of_its_log(fleet: Path) -> None:
@@ -278,7 +278,7 @@ def test_a_cluster_evaluates_a_batch_outlives_a_worker_and_ends_with_its_schedul
         killer = when_stored(fleet, 1, process.pid)
         done = command(*arguments)
         killer.join(60)
-    assert (done.code, "the scheduler answers no more" in done.err) == (70, True), done.err
+    assert (done.code, "the scheduler stopped answering" in done.err) == (70, True), done.err
     assert "Traceback" not in done.err
     assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
 
