@@ -424,7 +424,14 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
             )
         )
     never = int(a.times_ns[-1]) + 1
-    diffs.sort(key=lambda diff: (diff.apart_ns or never, -diff.greatest_shift, diff.first_ns, diff.name))
+    diffs.sort(
+        key=lambda diff: (
+            never if diff.apart_ns is None else diff.apart_ns,
+            -diff.greatest_shift,
+            diff.first_ns,
+            diff.name,
+        )
+    )
     return tuple(diffs)
 
 

@@ -42,6 +42,21 @@ def test_blocks_that_miss_their_goals_are_named_with_the_nodes_they_fail(data_fo
     assert {each.name for each in spec.moved} == {"red1", "red2", "green1", "green2"}
 
 
+def test_an_object_that_differs_from_the_first_sample_on_comes_first() -> None:
+    def run(*places: tuple[float, float]) -> sr.Trace:
+        return sr.Trace.from_samples(
+            sr.Sample(
+                10**9 * second,
+                {"cup": sr.Footprint.disc(cup, 0, 0.1), "plate": sr.Footprint.disc(plate, 5, 0.1)},
+            )
+            for second, (cup, plate) in enumerate(places)
+        )
+
+    specification = sr.parse_specification("spec near = G (cup dist plate <= 9)")
+    diff = sr.diff_logs(run((0, 0), (0, 0), (0, 0)), run((1, 0), (1, 0), (1, 9)), specification)
+    assert [(entry.name, entry.apart_ns) for entry in diff.objects] == [("cup", 0), ("plate", 2 * 10**9)]
+
+
 ROUND = """\
 spec near = cup dist plate <= 1
 spec away = F ((cup dist plate <= 1) and F (cup dist plate >= 4))
