@@ -76,20 +76,21 @@ _FIELD_TYPES: Final[Mapping[str, PackedElementField.NumericType.ValueType]] = Ma
         "|u1": PackedElementField.UINT8,
     }
 )
-"""Types of the fields of a cell, by those of numpy."""
+"""Type of a cell's field for each type of numpy."""
 
 
 class TurnedMap(NamedTuple):
-    """A candidate's map for one orientation of the object, the index into the map's turns."""
+    """A candidate's map for one orientation of the object; `turn` is an index of the map's turns."""
 
     candidate: Candidate
     turn: int
 
 
 def maps_of(step: Step) -> list[TurnedMap]:
-    """Return all maps that a step depends on, by edge, in the order in which a log has them.
+    """Return all maps of a step, by edge, in the order of the log.
 
-    The chosen object in its target orientation comes last, since a viewer shows the last message of a topic.
+    The map of the chosen object in its target orientation is the last one, because a viewer shows the last
+    message of a topic.
     """
     return [
         TurnedMap(candidate, turn)
@@ -100,7 +101,7 @@ def maps_of(step: Step) -> list[TurnedMap]:
 
 
 def _is_aim(candidate: Candidate, turn: int) -> bool:
-    """Return whether this is the orientation nearest to that of the target, which may be turned from it."""
+    """Return whether `turn` is the map's orientation nearest to the target's, which may lie between two."""
     target = candidate.target
     return target is not None and candidate.map.cell_of(target.x, target.y, target.turn)[0] == turn
 
@@ -111,7 +112,7 @@ def map_digest(gradient: GradientMap) -> bytes:
 
 
 def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessage:
-    """Return a map as a message, drawn under the scene; blocked cells are NaN, and transparent."""
+    """Return a map as a message that is drawn below the scene; blocked cells are NaN, and transparent."""
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
     colours = dict(zip(_COLOURS, np.moveaxis(cell_colours(values), -1, 0), strict=True))
@@ -140,7 +141,7 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
 
 
 def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield what a map is made of, for one orientation, (rows, columns) each, with names."""
+    """Yield the layers of a map for one orientation: pairs of a name and values (rows, columns)."""
     turn, gradient, room_from = turned.turn, turned.candidate.map, turned.candidate.room_from
     yield "limited_by", (layers.limiting[turn] + 1).astype("<u2")
     yield "blocked_by", (layers.blocked_by[turn] + 1).astype("<u2")
@@ -149,23 +150,23 @@ def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndar
     varies = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
     numbers = sorted(range(len(varies)), key=lambda number: not varies[number])[:MOST_LAYERS]
     for number in sorted(numbers):
-        # a number in front, so that no conjunct is named like another field
+        # a leading number, so that no conjunct has the name of another field
         name = f"{number + 1}: {layers.conjuncts[number]}"
         yield name, _singles(layers.robustness[number, turn])
 
 
 def _singles(values: np.ndarray) -> np.ndarray:
-    """Return numbers as a viewer draws them, NaN where they are not finite."""
+    """Return single-precision numbers, with NaN for numbers that are not finite, as viewers need them."""
     return np.where(np.isfinite(values), values, np.nan).astype("<f4")
 
 
 def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
-    """Return each field of a map's message as (rows, columns); nothing if the sizes in it do not fit."""
+    """Return each field of a map's message, (rows, columns); none if the sizes in the message do not fit."""
     columns, cell, row = message.column_count, message.cell_stride, message.row_stride
     rows = len(message.data) // row if row else 0
     if not rows or not columns or cell * columns > row:
         return {}
-    # a field without a type is a number
+    # a field without a type is read as a number
     types = {PackedElementField.UNKNOWN: "<f4"} | {kind: name for name, kind in _FIELD_TYPES.items()}
     return {
         field.name: np.ndarray((rows, columns), types[field.type], message.data, field.offset, (row, cell))
@@ -204,10 +205,10 @@ PLAN_VERSION: Final = 4
 """Version of the messages; a log of another version cannot be recomputed."""
 
 MOST_LISTED: Final = 3
-"""Conjuncts and causes that are listed of a map."""
+"""Maximum number of listed conjuncts of a map, and of listed causes."""
 
 _LONGEST: Final = 400
-"""Characters of alternatives in the text; JSON has all."""
+"""Maximum length of alternatives in the text, characters; JSON has all."""
 
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
@@ -218,14 +219,14 @@ _CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _DRAWINGS, _TIMINGS)
 
 
 class BlackBox:
-    """A planner whose decisions are written, as messages.
+    """A planner whose decisions are written as messages.
 
-    Samples, decisions and outcomes have to go through it in the order in which they happen. Equal ones give
-    equal bytes, so that a log can be verified by recomputing it.
+    Samples, decisions and outcomes must go through it in their order. Equal samples and outcomes give equal
+    bytes, so that a log can be verified by recomputing it.
 
     Attributes:
         planner: the planner.
-        planning_s: time spent planning, in seconds of real time.
+        planning_s: wall time of the planning, s.
     """
 
     def __init__(
@@ -238,8 +239,8 @@ class BlackBox:
         """Begin before the first sample.
 
         Args:
-            write: takes the messages of each decision, and of each outcome.
-            timings: also log how long each decision took, so that equal runs do not give equal logs.
+            write: called with the messages of each decision, and of each outcome.
+            timings: also log the duration of each decision; logs of equal runs then differ.
         """
         self.planner, self.planning_s = planner, 0.0
         self._write, self._times = write, timings
@@ -252,10 +253,10 @@ class BlackBox:
         self._frame: MapFrame | None = None
 
     def observe(self, sample: Sample) -> None:
-        """Take the next sample.
+        """Observe the next sample.
 
         Raises:
-            TraceError: its time is not after that of the last one.
+            TraceError: its time is not after the previous sample's time.
         """
         began = time.perf_counter()
         self.planner.observe(sample)
@@ -266,12 +267,12 @@ class BlackBox:
         self.planning_s += time.perf_counter() - began
 
     def next_step(self) -> Step:
-        """Return the planner's next step, and write it, unless it is the same wait as before.
+        """Return the planner's next step, and write it unless the previous wait continues.
 
-        The outcome of a wait is written with the decision after it.
+        The outcome of a wait is written with the next decision.
 
         Raises:
-            UsageError: nothing was observed yet, or the last step was not concluded.
+            UsageError: no sample was observed yet, or the last step was not concluded.
         """
         began = time.perf_counter()
         step = self.planner.next_step()
@@ -300,7 +301,7 @@ class BlackBox:
         return step
 
     def conclude(self, outcome: Outcome) -> None:
-        """Take the outcome of the last step, and write it.
+        """Record the outcome of the last step, and write it.
 
         Raises:
             UsageError: no step is being executed.
@@ -314,7 +315,7 @@ class BlackBox:
         self._write(self._messages(end_ns, [self._with_outcome(outcome, end_ns)], [], [path]))
 
     def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
-        """Return the last decision with its outcome if it was a wait."""
+        """Return the last decision with its outcome if it was a wait, else nothing."""
         if self._step is None or self._step.kind != "wait":
             return []
         return [self._with_outcome(wait_outcome(self._step, self.planner.states), end_ns)]
@@ -333,15 +334,15 @@ class BlackBox:
         return self._decision
 
     def _moving_object(self) -> TrackedObject | None:
-        """Return the object that the last step moves, from the newest sample."""
+        """Return the object that the last step moves, as in the newest sample."""
         if self._step is None or self._step.target is None or self._sample is None:
             return None
         return self._sample.objects.get(self._step.target.name)
 
     def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
-        """Return messages of each channel, numbered on from those before."""
+        """Return messages of each channel, with consecutive numbers."""
         streams = []
-        # only a decision may have a timing
+        # not strict, because only some decisions have messages of the last channel, timings
         for channel, messages in zip(_CHANNELS, of_channels, strict=False):
             first = self._written[channel]
             self._written[channel] += len(messages)
@@ -352,7 +353,7 @@ class BlackBox:
 
 
 def _timing(step: Step, took_s: float) -> Log:
-    """Return how long a decision took, for the log of sentences, which no certificate covers."""
+    """Return a sentence on the duration of a decision, for a topic that no certificate covers."""
     text = f"decision {step.number} took {took_s * 1e3:.1f} ms"
     message = Log(level=Log.INFO, message=text, name="planner")
     message.timestamp.FromNanoseconds(step.time_ns)
@@ -360,10 +361,10 @@ def _timing(step: Step, took_s: float) -> Log:
 
 
 def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:
-    """Return the metadata from which decisions can be recomputed.
+    """Return the metadata that a log needs to recompute its decisions.
 
     Args:
-        filename: of the specification, as the log names it.
+        filename: name of the specification's file in the log.
     """
     return {
         "settings": text_from_settings(planner.settings),
@@ -378,7 +379,7 @@ def decision_from_payload(payload: bytes) -> PlanDecision:
     """Decode a message on the topic of decisions.
 
     Raises:
-        LogError: it is damaged.
+        LogError: the message is damaged.
     """
     try:
         return PlanDecision.FromString(payload)
@@ -387,9 +388,9 @@ def decision_from_payload(payload: bytes) -> PlanDecision:
 
 
 def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, ...]:
-    """Return decisions by number, of each the latest message.
+    """Return the latest message of each decision, sorted by number.
 
-    A decision is written twice if it has an outcome; the second message repeats the first one.
+    A decision is written again with its outcome.
     """
     by_number = {decision.number: decision for decision in decisions}
     return tuple(by_number[number] for number in sorted(by_number))
@@ -408,9 +409,9 @@ def explained_decision(
     """Return a decision as a message without an outcome, with the layers of its maps.
 
     Args:
-        planner: that made it.
-        first_map: the number of the step's first map in the log.
-        layers: the maps taken apart, if they are known.
+        planner: planner that made the decision.
+        first_map: number of the step's first map in the log.
+        layers: layers of the maps, if they are already computed.
     """
     layers = layers or _layers_of(step, planner)
     message = decision_message(step, planner.automaton.name, first_map)
@@ -425,7 +426,7 @@ def explained_decision(
 
 
 def decision_message(step: Step, specification: str = "", first_map: int = 0) -> PlanDecision:
-    """Return a decision as a message, without an outcome and without the layers of maps."""
+    """Return a decision as a message without an outcome, and without the layers of its maps."""
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
     pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
     return PlanDecision(
@@ -498,7 +499,7 @@ def target_message(target: Target) -> PlanTarget:
 
 
 def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
-    """Yield lines about all decisions of a log."""
+    """Yield lines on all decisions of a log."""
     *before, last = decisions
     motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
     is_cut = last.HasField("target") and not last.HasField("outcome")
@@ -519,7 +520,7 @@ def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
 
 
 def decision_lines(decision: PlanDecision) -> Iterator[str]:
-    """Yield lines about one decision."""
+    """Yield lines on one decision."""
     yield _heading(decision)
     yield f"  {decision.reason}"
     if decision.considered:
@@ -538,7 +539,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
 
 
 def brief_lines(decision: PlanDecision) -> Iterator[str]:
-    """Yield at most five lines about one decision."""
+    """Yield at most five lines on one decision."""
     yield f"{_heading(decision)}: {decision.reason}"
     if decision.considered:
         *before, edge = decision.considered
@@ -557,7 +558,7 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
 
 
 def plain(sentence: str) -> str:
-    """Return a sentence for a terminal, without the backquotes around formulas."""
+    """Return a sentence for a terminal, without backquotes."""
     return sentence.replace("`", "")
 
 
@@ -590,7 +591,7 @@ def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str
 
 
 def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
-    """Yield why other objects are not moved, with those of equal reasons together."""
+    """Yield the reasons why other objects are not moved; objects with the same reason share a text."""
     names: dict[str, list[str]] = {}
     for candidate in candidates:
         if candidate.rejected:
@@ -603,7 +604,7 @@ def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
 
 
 def effort_text(decision: PlanDecision) -> str:
-    """Return which attempt at its edge a decision is, and how much was searched for it."""
+    """Return the number of the attempt at the edge of a decision, and the search effort."""
     search, edge = decision.search, decision.considered[-1] if decision.considered else None
     attempt = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
     counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
@@ -619,12 +620,12 @@ def _outcome_text(decision: PlanDecision) -> str:
 
 
 def joint_suffix(edge: PlanEdge) -> str:
-    """Return when a target has its robustness, of several motions for one edge."""
+    """Return the addition that a robustness is valid after all motions of an edge; "" for a single motion."""
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 
 
 def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
-    """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
+    """Yield lines on an edge; `blocks` has the lines of previous edges, which are not repeated."""
     path = _path(edge) + (edge.order and f"; {edge.order}")
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
     yield f"    wanted      {_either(edge.wanted)}"
@@ -632,7 +633,7 @@ def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: b
         yield f"    {'' if number else 'on the way':<12}{plain(rule)}"
     for candidate in edge.candidates:
         rows = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
-        # maps have numbers of their own, and may say the same
+        # compared without the numbers of maps, which differ even if the rest is equal
         edge_name = f"{edge.source} -> {edge.target}"
         first_edge = blocks.setdefault((candidate.object, candidate.rejected, *rows), edge_name)
         if candidate.rejected and first_edge != edge_name:
@@ -659,7 +660,7 @@ def _candidate_text(candidate: PlanCandidate) -> str:
 
 
 def _maps(candidate: PlanCandidate) -> str:
-    """Return the numbers of its messages on the topic of gradient maps."""
+    """Return the numbers of a candidate's maps on the topic of gradient maps."""
     numbers = sorted(turned_map.number for turned_map in candidate.maps)
     if len(numbers) < 2:
         return "".join(f" (map {number})" for number in numbers)
@@ -680,12 +681,12 @@ def _target_text(target: PlanTarget) -> str:
 
 
 def place_text(target: PlanTarget) -> str:
-    """Return which object goes where."""
+    """Return the name and place of a target."""
     return f"{target.object} to ({target.x:.4g}, {target.y:.4g})"
 
 
 def _some(texts: Sequence[str]) -> str:
-    """Return alternatives, or the first of them and the number of the others."""
+    """Return alternatives; of many, the first ones and the number of the others."""
     ends = list(accumulate(map(len, texts)))
     count = max(1, sum(end <= _LONGEST for end in ends))
     more = f" or {len(texts) - count} more" if count < len(texts) else ""
@@ -699,13 +700,13 @@ def limiting_conjuncts(candidate: PlanCandidate) -> list[PlanConjunct]:
 
 
 def best_robustness(candidate: PlanCandidate) -> float:
-    """Return the greatest robustness found: at the centre of a free cell, or at the target within one."""
+    """Return the greatest robustness at the centre of a free cell or at the target, which may lie between."""
     target = candidate.target.robustness if candidate.HasField("target") else -math.inf
     return max(candidate.best, target)
 
 
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
-    """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
+    """Yield pairs (key, text) on limiting conjuncts, blocking causes and the cost of room."""
     for conjunct in limiting_conjuncts(candidate)[:MOST_LISTED]:
         at_target = (
             f", {conjunct.at_target:.4g} in the target's cell" if conjunct.HasField("at_target") else ""
@@ -718,7 +719,7 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
 
 
 def room_sentence(candidate: PlanCandidate) -> str:
-    """Return what the room around a target costs; nothing if it costs nothing."""
+    """Return a sentence on the cost of the room around a target; "" if there is no cost."""
     if not candidate.HasField("room"):
         return ""
     room = candidate.room
@@ -747,12 +748,12 @@ def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban
 
 
 def kind_text(decision: PlanDecision) -> str:
-    """Return the kind of a decision as steps name it: "no path"."""
+    """Return the kind of a decision, as in `Step.kind`: "no path"."""
     return decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
 
 
 def aim_of(decision: PlanDecision) -> PlanEdge | None:
-    """Return the edge that a decision is for, if any; see `Step.aim`."""
+    """Return the aim of a decision, or None; see `Step.aim`."""
     last = decision.considered[-1] if decision.considered else None
     return None if last is None or last.pruned else last
 
@@ -767,7 +768,7 @@ def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
 
 
 def _write_numbers(row: dict[str, Any], message: Message) -> None:
-    """Write numbers that protobuf writes as text, such as 64-bit integers, as in all our JSON."""
+    """Rewrite numbers that protobuf writes differently: 64-bit integers as text, infinity as "Infinity"."""
     for field, value in message.ListFields():
         json_value = row[field.name]
         if field.type == field.TYPE_FIXED64:

@@ -1,6 +1,6 @@
-"""Demands of an edge in words: what is wanted, and what must hold or be avoided on the way.
+"""Sentences on the demands of an edge: its goal, and the conditions to keep or to avoid on the way.
 
-A guard is given as text: literals joined by "and", a negative one as "not …". In sentences, formulas stand
+A guard is a text of literals joined by "and"; a negative literal is "not …". In sentences, formulas are
 between backquotes.
 """
 
@@ -13,19 +13,19 @@ from typing import Final, NamedTuple
 import numpy as np
 
 _MOST_PROPOSITIONS: Final = 12
-"""Guards over more propositions are not simplified, since the truth table doubles with each of them."""
+"""Maximum number of propositions of simplified guards, because each one doubles the truth table."""
 _LONGEST: Final = 100
-"""Characters of a formula."""
+"""Maximum length of a formula, characters."""
 _MOST_RULES: Final = 4
-"""Bans of several literals that are listed."""
+"""Maximum number of listed bans with several literals."""
 
 
 class Ban(NamedTuple):
     """Literals that must not all be true together.
 
     Attributes:
-        holding: propositions that would hold.
-        failing: propositions that would not.
+        holding: propositions of the positive literals.
+        failing: propositions of the negative literals.
     """
 
     holding: tuple[str, ...]
@@ -33,7 +33,7 @@ class Ban(NamedTuple):
 
     @property
     def rule(self) -> str:
-        """What to keep or to avoid, as a sentence."""
+        """The ban as a rule for the robot: keep, avoid, or not before."""
         if not self.holding:
             return f"keep {_listing(self.failing, 'or')}"
         if not self.failing:
@@ -42,7 +42,7 @@ class Ban(NamedTuple):
 
     @property
     def breach(self) -> str:
-        """What would be the case, as a sentence."""
+        """The sentence that the ban would be violated."""
         if not self.holding:
             return f"{_listing(self.failing, 'and')} would fail"
         before = f" before {_listing(self.failing, 'or')}" if self.failing else ""
@@ -50,10 +50,10 @@ class Ban(NamedTuple):
 
 
 def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, ...]:
-    """Return the shortest bans that together forbid the same as guards, in their order.
+    """Return the shortest bans that together forbid exactly the guards, in the order of the guards.
 
     Args:
-        given_up: guards of edges that were given up; bans may forbid these, too, to be shorter.
+        given_up: guards of pruned edges; bans may also forbid these, if that makes them shorter.
     """
     return tuple(
         Ban(
@@ -67,7 +67,7 @@ def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, .
 
 
 def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
-    """Return the first of some bans that forbids a guard; without any, the guard itself as a ban."""
+    """Return the first ban that forbids a guard; without one, the guard itself as a ban."""
     literals = _literals_of(guard).items()
     for ban in bans:
         if {(text, True) for text in ban.holding} | {(text, False) for text in ban.failing} <= literals:
@@ -76,7 +76,7 @@ def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
 
 
 def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
-    """Return what to keep and to avoid on the way, with bans of one literal put together."""
+    """Return the rules for the way, with all bans of a single literal in one or two rules."""
     kept = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
     avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
     others = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
@@ -90,7 +90,7 @@ def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
 
 
 def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:
-    """Return what each alternative of a progress set wants, without literals that bans already name."""
+    """Return the goal of each alternative of a progress set, without literals that bans already name."""
     kept = {text for ban in bans if not ban.holding and len(ban.failing) == 1 for text in ban.failing}
     avoided = {text for ban in bans for text in ban.holding}
     alternatives = []
@@ -102,7 +102,7 @@ def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:
 
 
 def _literals_of(guard: str) -> dict[str, bool]:
-    """Return the propositions of a guard, and whether each is to hold; none of "true"."""
+    """Return the propositions of a guard, and whether each must hold; none for the guard "true"."""
     literals = {}
     for literal in _operands_of_and(guard):
         text = literal.removeprefix("not ")
@@ -122,7 +122,7 @@ def _operands_of_and(text: str) -> list[str]:
 
 
 def _unbracketed(text: str) -> str:
-    """Return a text without the brackets around all of it."""
+    """Return a text without its outer brackets, if one pair encloses all of it."""
     depths = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
     is_bracketed = text.startswith("(") and text.endswith(")") and min(depths[:-1], default=0) > 0
     return text[1:-1] if is_bracketed else text
@@ -131,10 +131,10 @@ def _unbracketed(text: str) -> str:
 def _simplified(
     cubes: Sequence[Mapping[str, bool]], ignored: Sequence[Mapping[str, bool]] = ()
 ) -> list[dict[str, bool]]:
-    """Return cubes without literals that make no difference to their union, each once.
+    """Return distinct cubes without literals that do not affect the union of all cubes.
 
     Args:
-        ignored: cubes of which it does not matter whether they belong to the union.
+        ignored: cubes that may belong to the union or not.
     """
     names = tuple(dict.fromkeys(name for cube in (*cubes, *ignored) for name in cube))
     simplified = [dict(cube) for cube in cubes]
@@ -155,12 +155,12 @@ def _part_of_table(cube: Mapping[str, bool], names: Sequence[str]) -> tuple[int 
 
 
 def _listing(texts: Sequence[str], conjunction: str) -> str:
-    """Return formulas between backquotes, the last two joined by a conjunction."""
+    """Return formulas between backquotes; a conjunction joins the last two."""
     *first, last = [f"`{_shortened(text)}`" for text in texts] or ["anything"]
     return f"{', '.join(first)} {conjunction} {last}" if first else last
 
 
 def _shortened(text: str) -> str:
-    """Return a formula, of a long one the first operand of its "and"."""
+    """Return a formula; a long one is shortened to the first operand of its "and"."""
     first, *others = _operands_of_and(text)
     return f"{first} and {len(others)} more" if others and len(text) > _LONGEST else text

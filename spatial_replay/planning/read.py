@@ -1,4 +1,4 @@
-"""Decisions in logs: read as messages, repeated from the samples and compared, or with other settings."""
+"""Decisions in logs: their messages, their verification, and decisions with other settings."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ class LoggedDecisions(NamedTuple):
     """The decisions in a log.
 
     Attributes:
-        decisions: one or more, in order, each with its outcome if it has one.
-        faults: the parts of the log that could not be read.
+        decisions: one or more decisions in order, with their outcomes.
+        faults: sentences on parts of the log that could not be read.
     """
 
     name: str
@@ -78,14 +78,14 @@ class LoggedDecisions(NamedTuple):
     faults: tuple[str, ...]
 
     def lines(self) -> Iterator[str]:
-        """Yield lines about each decision: its aim, the candidates, the choice and the outcome."""
+        """Yield lines on each decision: its aim, the candidates, the choice and the outcome."""
         return plan_lines(self.name, self.decisions)
 
     def brief(self, number: int) -> Iterator[str]:
-        """Yield at most five lines about one decision.
+        """Yield at most five lines on one decision.
 
         Raises:
-            UsageError: there is none with this number.
+            UsageError: the log has no decision with this number.
         """
         return brief_lines(self.decision(number))
 
@@ -93,7 +93,7 @@ class LoggedDecisions(NamedTuple):
         """Return one decision.
 
         Raises:
-            UsageError: there is none with this number.
+            UsageError: the log has no decision with this number.
         """
         for decision in self.decisions:
             if decision.number == number:
@@ -114,7 +114,7 @@ def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
     """Read the messages of all decisions in a log.
 
     Raises:
-        UsageError: the log has none.
+        UsageError: the log has no decisions.
         MissingFileError, LogError: the log cannot be read.
     """
     source = open_source(log)
@@ -134,7 +134,7 @@ def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
 
 
 def planner_of(source: Source) -> Planner:
-    """Return the planner that a log was made with, before its first sample.
+    """Return the planner of a log in its state before the first sample.
 
     Raises:
         UsageError: the log holds no plan.
@@ -172,7 +172,7 @@ def _plan_of(source: Source) -> Mapping[str, str]:
 
 
 def rerun_of(source: Source) -> Rerun:
-    """Return the planned run of a log, to repeat it from before its first sample.
+    """Return the planned run of a log for a repetition from its first sample.
 
     Raises:
         UsageError: the log holds no plan.
@@ -196,9 +196,9 @@ class LoggedStep(Printed, Displayed):
     """A decision of a planned run.
 
     Attributes:
-        step: the decision, with all maps that it depends on.
-        message: the same as a log has it, with the outcome if it has one.
-        sample: the sample that it was made on.
+        step: decision with all maps on which it depends.
+        message: message of the decision in the log, with its outcome if it has one.
+        sample: newest sample at the decision.
     """
 
     step: Step
@@ -206,7 +206,7 @@ class LoggedStep(Printed, Displayed):
     sample: Sample = field(repr=False)
 
     def lines(self) -> Iterator[str]:
-        """Yield its aim, the candidates, the choice and the outcome."""
+        """Yield lines on the aim, the candidates, the choice and the outcome."""
         return decision_lines(self.message)
 
 
@@ -215,7 +215,7 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
 
     Raises:
         UsageError: the log holds no plan.
-        MissingFileError, LogError: the log cannot be read, or has other decisions than those recomputed.
+        MissingFileError, LogError: the log cannot be read, or a decision differs from the recomputed one.
     """
     source = open_source(log)
     rerun = rerun_of(source)
@@ -246,13 +246,13 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
 def why_not_there(
     log: str | PathLike[str], number: int, name: str, place: tuple[float, float]
 ) -> Iterator[str]:
-    """Yield why a decision does not bring an object to a place: each demand there, and what is in the way.
+    """Yield the reasons why a decision does not bring an object to a place: each demand, and obstacles.
 
-    Values are those of the middle of the place's cell, in the orientation of the target if there is one.
+    Values are for the centre of the place's cell, in the orientation of the target if there is one.
 
     Raises:
-        UsageError: the log holds no plan, no such decision, an object that it did not consider, or a place
-            outside its map.
+        UsageError: the log has no plan or no such decision, the decision did not consider the object, or the
+            place is outside its map.
         MissingFileError, LogError: the log cannot be read.
     """
     steps = {logged.step.number: logged for logged in read_steps(log)}
@@ -307,7 +307,7 @@ def _blocking_texts(
     bans: Sequence[Ban],
     settings: Settings,
 ) -> Iterator[str]:
-    """Yield what keeps an object out of a cell, and by how much."""
+    """Yield the causes that keep an object out of a cell, with numbers."""
     kind = "" if cause is None else cause.kind
     if cause is not None and kind == "constraint":
         danger = danger_of(gradient.made_of.now, gradient.made_of.constraints)[cell]
@@ -332,10 +332,10 @@ def _blocking_texts(
 
 
 def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:
-    """Check that a recomputed step is the recorded decision.
+    """Check that a recomputed step equals the recorded decision.
 
     Raises:
-        LogError: it is another one.
+        LogError: it differs.
     """
     if (step.number, step.reason) != (decision.number, decision.reason):
         raise LogError(
@@ -353,14 +353,14 @@ class PlannerMessage(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """A sample, None before the first one, and the planner's messages from it until the next sample."""
+    """A sample, None before the first one, and the planner's messages between it and the next sample."""
 
     sample: Sample | None
     messages: list[PlannerMessage]
 
 
 def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
-    """Iterate over samples with the planner's messages that follow each of them."""
+    """Iterate over samples, each with the planner's messages until the next sample."""
     moment = Moment(None, [])
     waiting: list[PlannerMessage] = []
     for block in blocks:
@@ -380,7 +380,7 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
 
 
 def planner_messages(messages: Messages) -> Iterator[PlannerMessage]:
-    """Iterate over the messages on the planner's topics, in their order."""
+    """Iterate over the messages on the planner's topics, in the order of the log."""
     for topic, row in zip(messages.topics, messages.rows(), strict=True):
         if topic in PLANNER_TOPICS:
             yield PlannerMessage(row.log_time_ns, topic, row.payload)
@@ -390,9 +390,9 @@ class Rerun:
     """A planned run that is repeated from the samples and outcomes of its log.
 
     Attributes:
-        box: the planner; samples go to its `observe`.
-        last: the decision repeated last.
-        is_moving: whether its motion has not been concluded yet.
+        box: planner with its messages; samples go to its `observe`.
+        last: newest repeated decision.
+        is_moving: whether the motion of this decision is not concluded yet.
     """
 
     def __init__(self, planner: Planner) -> None:
@@ -403,7 +403,7 @@ class Rerun:
         self.is_moving = False
 
     def take_messages(self) -> Messages:
-        """Return the messages of what was repeated since the last call, and keep them no longer."""
+        """Return and forget the messages since the last call."""
         messages = merge(self._written)
         self._written.clear()
         return messages
@@ -412,8 +412,8 @@ class Rerun:
         """Repeat a recorded decision, or conclude it with its recorded outcome.
 
         Raises:
-            LogError: a decision without the outcome of the one before, or an outcome without a decision.
-            UsageError: nothing was observed yet.
+            LogError: the outcome of the previous decision is missing, or the decision of an outcome.
+            UsageError: no sample was observed yet.
         """
         if not recorded.HasField("outcome"):
             if self.is_moving and self.last is not None:
@@ -422,7 +422,7 @@ class Rerun:
                 )
             self.last = self.box.next_step()
             self.is_moving = self.last.kind == "execute"
-        # the outcome of a wait is written with the next decision, and so is repeated with it
+        # the next decision writes the outcome of a wait, so repeating that decision repeats the outcome
         elif recorded.kind != PlanDecision.KIND_WAIT:
             if not self.is_moving:
                 raise LogError(f"the log has the outcome of decision {recorded.number}, and not the decision")
@@ -446,10 +446,10 @@ class Recomputed:
     """The result of recomputing the decisions of a log.
 
     Attributes:
-        decisions: how many decisions were recomputed.
-        maps: how many gradient maps were recomputed, one for each orientation of an object.
-        differences: what differs from the log, each with its place.
-        faults: the parts of the log that could not be read.
+        decisions: number of recomputed decisions.
+        maps: number of recomputed gradient maps, one for each orientation of an object.
+        differences: sentences on the differences from the log, each with its time.
+        faults: sentences on parts of the log that could not be read.
     """
 
     decisions: int
@@ -459,16 +459,16 @@ class Recomputed:
 
 
 def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda samples: None) -> Recomputed:
-    """Recompute every decision of a planned run from its samples alone, and compare all messages' bytes.
+    """Recompute every decision of a planned run from its samples, and compare all messages byte for byte.
 
-    Outcomes come from the controller, so they are taken from the log. A complete log with no decision, or
-    with none after a motion, differs too.
+    Outcomes come from the controller, so they are taken from the log. A complete log without a decision, or
+    without a decision after a motion, also counts as different.
 
     Args:
-        advance: called with the number of samples after each block.
+        advance: called with the number of samples of each block.
 
     Raises:
-        UsageError: the log holds no plan, or begins within the run.
+        UsageError: the log has no plan, or begins within the run.
         LogError: the settings or the specification of the plan cannot be read.
     """
     extent, comparison = _run_extent(source), _Comparison(rerun_of(source))
@@ -478,10 +478,10 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
         if sample is not None:
             comparison.rerun.box.observe(sample)
             samples += 1
-        # they all have the sample's time, unless the log has lost samples
+        # all messages have the sample's time, unless the log has lost samples
         for time_ns, messages in groupby(recorded, key=lambda each: each.time_ns):
             comparison.compare(time_ns, list(messages))
-    # a log of which parts are missing has other differences than that it is incomplete
+    # a damaged log also lacks samples, so only an undamaged log is checked for a begin within the run
     is_part = extent.is_copy if extent.samples is None else samples < extent.samples
     if not faults and is_part and (extent.is_cut or comparison.began_within):
         raise UsageError(
@@ -502,13 +502,13 @@ def _iter_blocks(source: Source, faults: list[str], advance: Callable[[int], Non
 
 
 class _Comparison:
-    """The recorded and the recomputed messages of one run.
+    """Comparison of the recorded and recomputed messages of a run.
 
     Attributes:
-        rerun: the run that is repeated.
+        rerun: repeated run.
         began_within: whether the log lacks the first decisions.
-        decisions, maps: how many were recomputed.
-        differences: between the messages; after the first ones, nothing more is compared.
+        decisions, maps: numbers of recomputed decisions and maps.
+        differences: differences at the first time at which messages differ; later messages are not compared.
     """
 
     def __init__(self, rerun: Rerun) -> None:
@@ -519,7 +519,7 @@ class _Comparison:
 
     def compare(self, time_ns: int, recorded: list[PlannerMessage]) -> None:
         """Compare the messages of one time, after the newest sample was observed."""
-        # a planner that took another decision is in another state, so all later messages would differ
+        # after a different decision the planner's state differs, so all later messages would differ
         if self.differences:
             return
         is_first = self.rerun.last is None
@@ -549,7 +549,7 @@ class _Comparison:
 
 
 def _missing(rerun: Rerun) -> Iterator[str]:
-    """Yield what a log lacks that goes on to the end of its run."""
+    """Yield a sentence if a complete log lacks a decision or an outcome."""
     last, planner = rerun.last, rerun.box.planner
     if last is None:
         yield "the log has no decision, and a planned run has at least one"
@@ -584,13 +584,13 @@ def _seconds(time_ns: int) -> str:
 
 
 class _RunExtent(NamedTuple):
-    """How much of a run a log has, by its metadata.
+    """The part of a run that a log has, by its metadata.
 
     Attributes:
-        samples: of the run; None if it did not come to its end.
+        samples: number of samples of the run; None if its log has no end.
         was_interrupted: whether the run was ended from outside.
         is_copy: whether a replay wrote the log.
-        is_cut: whether that replay began after the source's first sample.
+        is_cut: whether this replay began after the source's first sample.
     """
 
     samples: int | None
@@ -632,21 +632,20 @@ _REDONE: Final = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replanned(Printed):
-    """Decisions of a planner on the samples of a log.
+    """Decisions of a planner on the samples of a log, with another specification or other settings.
 
-    After the first decision by which something else is done, the recorded samples say nothing more: they are
-    what followed on the recorded one.
+    They end with the first decision with another motion: later samples follow from the recorded motion.
 
     Attributes:
-        name: of the log.
-        changes: what was changed, each as a sentence; empty if nothing was.
-        decisions: how many the log has.
-        same: how many, from the first on, are the same byte for byte, with all their maps.
-        alike: how many in all, from the first on, do the same.
-        recorded, redone: the first decision that differs, None if all do the same; `recorded` is None where
-            the log has none at that sample.
-        messages: of what was redone, the decision that differs included.
-        faults: the parts of the log that could not be read.
+        name: name of the log.
+        changes: sentences on the changes; empty if nothing was changed.
+        decisions: number of decisions in the log.
+        same: number of first decisions that are equal byte for byte, with all their maps.
+        alike: number of first decisions with the same motion, including the equal ones.
+        recorded, redone: first decision with another motion; None if there is none. `recorded` is also None
+            if the log has no decision at that sample.
+        messages: messages of the redone decisions, including the first different one.
+        faults: sentences on parts of the log that could not be read.
     """
 
     name: str
@@ -660,10 +659,10 @@ class Replanned(Printed):
     faults: tuple[str, ...] = ()
 
     def lines(self, width: int = 100) -> Iterator[str]:
-        """Yield how many decisions are the same, and the first that differs, with both maps.
+        """Yield lines on the number of equal decisions, and on the first different decision with both maps.
 
         Args:
-            width: of the two columns of maps, in characters.
+            width: width of the two columns of maps, characters.
         """
         changes = ", ".join(self.changes) or "nothing changed"
         yield f"{self.name}: {plural(self.decisions, 'decision')}, redone with {changes}"
@@ -691,7 +690,7 @@ class Replanned(Printed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """It as values for JSON."""
+        """The result as values for JSON."""
         sides = {
             side: None if step is None else decision_rows([step.message])[0]
             for side, step in (("recorded", self.recorded), ("redone", self.redone))
@@ -705,7 +704,7 @@ class Replanned(Printed):
 
     @property
     def is_different(self) -> bool:
-        """Whether something else would have been done."""
+        """Whether a decision has another motion."""
         return self.redone is not None
 
 
@@ -716,10 +715,10 @@ def _first(count: int, of: int) -> str:
 
 
 def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
-    """Yield what the maps of the last edges say, of each object in two columns.
+    """Yield lines on the maps of each object for the last edges, in two columns.
 
     Args:
-        column: characters of a column.
+        column: width of a column, characters.
     """
     if redone.recorded is None or redone.redone is None:
         return
@@ -764,18 +763,18 @@ def redo_decisions(
 ) -> Replanned:
     """Decide again on the samples of a planned run, with another specification or other settings.
 
-    As long as the same is done, outcomes are those of the log. While both planners wait, the new one is asked
-    at every sample, as `plan` does.
+    Outcomes come from the log while both planners have the same motions. While both planners wait, the new
+    one decides at every sample, as in `plan`.
 
     Args:
-        specification: to plan for instead of the recorded one.
-        changes: to the recorded settings, by the keys of settings files.
-        name: the spec to plan for, if there are several.
-        advance: called with the number of samples after each block.
+        specification: specification to plan for instead of the recorded one.
+        changes: changes of the recorded settings, by the keys of settings files.
+        name: name of the spec to plan for, if there are several.
+        advance: called with the number of samples of each block.
 
     Raises:
-        UsageError: the log holds no plan; settings that do not go together; a specification that cannot be
-            planned for.
+        UsageError: the log has no plan, settings contradict each other, or the planner refuses the
+            specification.
         LogError: the settings or the specification of the plan cannot be read, or the recorded decisions do
             not follow from the samples.
     """
@@ -817,7 +816,7 @@ def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
 
 
 class _Redoing:
-    """A run whose decisions are repeated as recorded, and redone beside; attributes as of `Replanned`."""
+    """A run whose recorded decisions are repeated and redone side by side; attributes as in `Replanned`."""
 
     def __init__(self, source: Source, planner: Planner, is_changed: bool) -> None:
         self._source, self._is_changed = source, is_changed
@@ -829,7 +828,7 @@ class _Redoing:
         self.messages: list[Messages] = []
 
     def take(self, sample: Sample | None, recorded: list[PlannerMessage]) -> None:
-        """Take a sample and the recorded messages that follow it."""
+        """Process a sample and the recorded messages after it."""
         decisions = [
             decision_from_payload(message.payload) for message in recorded if message.topic == PLAN_DECISION
         ]
@@ -841,7 +840,7 @@ class _Redoing:
         self._new.box.observe(sample)
         waiting = self._new.last is not None and self._new.last.kind == "wait"
         if self._is_changed and waiting and not new_decisions:
-            # what it decides now comes before anything in the log
+            # a decision of the new planner at this sample precedes the next recorded decision
             step = self._new.box.next_step()
             if step is not self._new.last:
                 self._differ(sample, None, step, self._new.take_messages())
@@ -851,7 +850,7 @@ class _Redoing:
                 return
 
     def _repeat(self, sample: Sample, decision: PlanDecision, recorded: list[PlannerMessage]) -> bool:
-        """Repeat a decision or its outcome; return whether the same was done."""
+        """Repeat a decision or its outcome with both planners; return whether their motions are equal."""
         before = self._new.last
         self._old.repeat(decision)
         self._old.take_messages()
@@ -883,13 +882,13 @@ class _Redoing:
 
 
 def _does_the_same(old: Step, new: Step) -> bool:
-    """Return whether two decisions have the robot do the same."""
+    """Return whether two decisions have the same motion; the robustness of their targets may differ."""
     targets = [step.target and replace(step.target, robustness=0.0) for step in (old, new)]
     return old.kind == new.kind and targets[0] == targets[1]
 
 
 def _has_all(recorded: list[PlannerMessage], redone: Messages) -> bool:
-    """Return whether the log has messages byte for byte."""
+    """Return whether all messages are in the log, byte for byte."""
     payloads = {(message.topic, message.payload) for message in recorded}
     return all((message.topic, message.payload) in payloads for message in planner_messages(redone))
 
@@ -904,7 +903,7 @@ def _on_redone_topics(messages: Messages) -> Messages:
 
 @dataclass(frozen=True)
 class ReplannedSource(SourceOf):
-    """A planned log with what would have been decided beside what was."""
+    """A planned log with redone decisions next to the recorded ones."""
 
     beside: Messages
 
