@@ -428,7 +428,7 @@ def judge(
 
     Args:
         logs: episodes: files, folders, patterns, data sets.
-        labels: a JSON or CSV file, or a field of the data set. Without it, labels are in labels.json or
+        labels: a JSON or CSV file, or a field of the data set. By default, labels are in labels.json or
             labels.csv next to the logs, or in the data set.
         result: the name of the spec that judges; by default the last one that no other spec uses.
         against: earlier episodes to compare with.

@@ -1,8 +1,8 @@
 """Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
 Compiling all kernels takes longer than reading a short log, and loading machine code from disk takes time,
-too. So a kernel is interpreted while little work is due (see `_may_interpret`). Long kernels are shared among
-the processor's cores.
+too. Therefore a kernel is interpreted while little work is due (see `_may_interpret`). Long kernels are
+shared among the processor's cores.
 
 Both forms give the same bits. Kernels use only sums, products, quotients, square roots, sines and cosines of
 IEEE doubles, without fast-math and fused contraction.
@@ -158,7 +158,7 @@ class Compiler:
             sys.setswitchinterval(before)
 
     def await_code(self) -> bool:
-        """Start a thread that loads the code of all trials, unless one runs. Return whether it started."""
+        """Start a thread that loads the code of all trials unless one runs; return whether it started."""
         with self.lock:
             if self.loader is not None or self.folder is None:
                 return False
@@ -167,7 +167,7 @@ class Compiler:
             return True
 
     def finish(self, count: int) -> bool:
-        """End the thread that loads code, unless more than `count` trials wait. Return whether it ends."""
+        """End the thread that loads code unless more than `count` trials wait; return whether it ends."""
         with self.lock:
             if len(self.trials) > count:
                 return False
@@ -239,8 +239,8 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a kernel that is interpreted two to five times as fast.
 
-    It gets arrays as memoryviews of plain numbers; in named tuples, only arrays of one dimension. So it may
-    only read and set single elements, slice one dimension, and never divide by zero.
+    The kernel gets arrays as memoryviews of plain numbers; in named tuples, only arrays of one dimension.
+    Such a kernel may only read and set single elements, slice one dimension, and never divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
     return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True, times=kernel.times)
@@ -642,7 +642,7 @@ def cache_folder() -> Path | None:
 def remove_damaged_files(folder: Path) -> None:
     """Remove machine code that does not match its digest.
 
-    Code newer than its digest may be unfinished while other processes use the folder. It is kept.
+    Code newer than its digest is kept while other processes use the folder, because it may be unfinished.
     """
     descriptor = _opened_lock(folder)
     try:

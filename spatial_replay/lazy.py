@@ -42,7 +42,7 @@ def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Call
 class Displayed:
     """A value that `spatial_replay.notebook` can display.
 
-    That package imports the values, so values cannot import it. It is loaded by name for a display.
+    The package `notebook` imports the values, so values import it only by name, for a display.
     """
 
     __slots__ = ()

@@ -21,7 +21,7 @@ MOST_TEXT: Final = 100_000
 """Length limit of a text argument, characters."""
 
 _LINES: Final = 4_000
-"""Size limit of the lines of an answer, bytes. They are sent twice: as text and as values."""
+"""Size limit of the lines of an answer, bytes. The lines are sent twice: as text and as values."""
 _WARNINGS: Final = 1_500
 _ROW: Final = 3_000
 """Size limit of a row, bytes."""

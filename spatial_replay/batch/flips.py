@@ -48,7 +48,7 @@ class ResultChange:
 
     @property
     def text(self) -> str:
-        """Both verdicts with their numbers; only one if the other run lacks the result."""
+        """The verdicts of both runs with their numbers; only one if the other run lacks the result."""
         result = self.difference
         before, now = (
             "error" if verdict is None else f"{verdict} ({self._number(number)})"

@@ -105,7 +105,7 @@ class _LogFiles:
 def states_of(paths: Sequence[str]) -> dict[str, str | None]:
     """Return a hash of the file states of each log: path, device, inode, size and times.
 
-    The hash is equal while the files are unchanged. It is None for an address and for unreadable files.
+    The hash is equal while the files are unchanged. An address and unreadable files have None.
     """
     files = _LogFiles()
     return {path: None if is_address(path) else _state(path, files) for path in paths}

@@ -1,7 +1,7 @@
 """Evaluates one log with all its specifications: a task in, rows out.
 
-A task is sent to another process, so it holds the texts of its specifications and no open file. Its rows are
-plain values, too.
+A task is sent to another process, so it holds the texts of its specifications and no open file. The rows of a
+task are plain values, too.
 """
 
 from __future__ import annotations
@@ -334,7 +334,7 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
 
 
 def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int], **values: Any) -> ResultRow:
-    """Return a row with the name, the requirement and the line of a spec, and other values."""
+    """Return a row with values of a spec (name, requirement, title, line) and other values."""
     return replace(
         row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name], **values
     )

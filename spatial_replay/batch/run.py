@@ -258,7 +258,7 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
 def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
     """Return the episodes of a data set; none if the path is no data set.
 
-    A damaged data set is one log, and its row reports the error. So a batch skips no log silently.
+    A damaged data set is one log, and its row reports the error, so that a batch skips no log silently.
     """
     whole = _log_at(path, folder)
     try:

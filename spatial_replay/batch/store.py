@@ -155,7 +155,7 @@ _FORMAT_FILE: Final = "format.json"
 _IDENTITIES: Final = "identities.parquet"
 _ROWS: Final = "rows"
 _MOST_TOGETHER: Final = 500
-"""Keys per file of rows. Their rows wait in memory until the file is written."""
+"""Keys per file of rows. The rows of a file wait in memory until it is written."""
 _LONGEST_WAIT_S: Final = 0.5
 """Time between two files of rows, seconds. A killed batch loses the results of this time."""
 _MOST_SMALL: Final = 50
@@ -244,7 +244,7 @@ def _decode_table(data: bytes) -> pa.Table:
 
 
 def _footer(data: bytes) -> int:
-    """Return the offset of a Parquet footer. Its length and `PAR1` end the file, 4 bytes each."""
+    """Return the offset of a Parquet footer, whose length and `PAR1` end the file, 4 bytes each."""
     return max(0, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
 
 

@@ -1,6 +1,6 @@
 """Suites: logs with their specifications and the expected results.
 
-A suite comes from a YAML file or a command line. It names logs by patterns, folders and addresses, and
+A suite comes from a YAML file or a command line. A suite names logs by patterns, folders and addresses;
 `run.find_logs` finds the logs.
 """
 

@@ -1,8 +1,8 @@
 """Processes that work on many tasks: on this machine, or on a Dask cluster.
 
-Both take a function and tasks, and yield results as they arrive. If a worker on this machine dies, the tasks
-of its pool run once more, one by one. A task whose worker dies again has the result `WorkerLost`. Scheduling
-is left to `concurrent.futures` and Dask.
+Executors take a function and tasks, and yield results as they arrive. If a worker on this machine dies, the
+tasks of its pool run once more, one by one. A task whose worker dies again has the result `WorkerLost`.
+Scheduling is left to `concurrent.futures` and Dask.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Works in several processes on this machine. They end when this process ends, even if it is killed."""
+    """Works in several processes on this machine, which end with this process, even if it is killed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -133,7 +133,7 @@ def _results(
 
 @contextmanager
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
-    """Start processes. They end at once if the block ends early or leaves suspects."""
+    """Start processes, which end at once if the block ends early or leaves suspects."""
     context = forking_context([_PRELOADED])
     others = set(multiprocessing.active_children())
     ours, theirs = multiprocessing.Pipe(duplex=False)
@@ -261,7 +261,7 @@ class DaskCluster:
 
     @contextmanager
     def _connection(self) -> Iterator[Any]:
-        """Connect a client. It is closed even if the cluster is gone."""
+        """Connect a client, which is closed even if the cluster is gone."""
         with importing("clusters need Dask", extra="cluster"):
             import distributed
         client_type = cast(Any, distributed).Client

@@ -1,7 +1,7 @@
 """The program `spatial-replay`: its commands, its exit codes, and its reports of errors.
 
-A command is imported when it is used, because the import may load numba and the log readers. So `--help`
-lists the commands without importing them.
+A command is imported when it is used, because the import may load numba and the log readers. `--help` lists
+the commands without importing them.
 """
 
 from __future__ import annotations

@@ -259,8 +259,9 @@ def batch(
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are stored in a
     folder, and another run evaluates only missing ones. A log that cannot be read has a row with its error.
 
-    One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
-    anything fails, 3 if logs are damaged or unfit, 4 if results are unknown, doubtful or tested by nothing.
+    One exit code covers all logs, with the meanings of replay. The code is 0 if everything is as expected, 1
+    if anything fails, 3 if logs are damaged or unfit, 4 if results are unknown, doubtful or tested by
+    nothing.
 
     \b
     Examples:
@@ -561,8 +562,8 @@ def results(
 ) -> ExitCode:
     """Show the last run of a batch: totals, and the worst results with their reasons.
 
-    With the results of a LATER run over the same logs, it lists flipped verdicts and lower robustness. It
-    then exits with 1 if a verdict flipped.
+    With the results of a LATER run over the same logs, the command lists flipped verdicts and lower
+    robustness, and exits with 1 if a verdict flipped.
 
     EXPR compares columns with texts and numbers: == != < <= > >=, "text" in COLUMN, and, or, not, none.
 

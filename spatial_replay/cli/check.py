@@ -516,10 +516,10 @@ def doctor(
 ) -> int:
     """Find faults of a specification before any run.
 
-    It finds specs that no run can satisfy, that every run satisfies, or that follow from another spec or
-    contradict it. It also finds implications whose antecedent never holds. It uses the automaton and laws of
-    geometry. For each result, it prints the shortest run that satisfies it, and the shortest run that
-    violates it. Exits with 1 if there is a fault, otherwise with 0.
+    Faults are specs that no run can satisfy, that every run satisfies, or that follow from another spec or
+    contradict it. Implications whose antecedent never holds are faults, too. The automaton and laws of
+    geometry decide. For each result, the command prints the shortest run that satisfies it and the shortest
+    run that violates it. Exits with 1 if there is a fault, otherwise with 0.
 
     \b
     Examples:

@@ -58,8 +58,8 @@ def clip(
 
     The clip has the same verdicts, robustness and witnesses as the log for the violated results; if none is
     violated, for all results. It is an annotated log: every viewer plays it, and `replay` evaluates it
-    without other files. It has the messages of all topics in its time. It also has the last earlier message
-    of each topic and the last earlier transform of each frame, with their own times.
+    without other files. The clip has the messages of all topics in its time. The last earlier message of each
+    topic and the last earlier transform of each frame are in the clip, too, with their own times.
 
     T is 5s or 500ms. Exits with 0 if the clip was written, 3 if the log is damaged.
 
@@ -123,10 +123,10 @@ _MOST_LISTED = 20
 def recover(log: LogFile, output: Path) -> int:
     """Save the readable part of a damaged log, and list the missing data.
 
-    It reads MCAP logs, ours and external ones, and ROS bags: truncated, damaged, or left without an index by
-    a killed recorder. The output is a proper log with an index. It has every readable message byte for byte,
-    in the order of time, with metadata and attachments. The list of missing data is also a metadata record of
-    the output, and later readers of the output warn of it.
+    The input is an MCAP log, ours or an external one, or a ROS bag: truncated, damaged, or left without an
+    index by a killed recorder. The output is a proper log with an index. Every readable message is in the
+    output byte for byte, in the order of time, with metadata and attachments. The list of missing data is
+    also a metadata record of the output, and later readers of the output warn of it.
 
     Exits with 0 if nothing is missing, with 3 if something is.
 

@@ -59,8 +59,8 @@ _PROGRESS_S: Final = 0.2
 def mcp(roots: tuple[str, ...], output: Path | None, limit: float) -> None:
     """Serve the commands to agents as tools, by the Model Context Protocol.
 
-    It speaks over standard input and output, until the client closes them. Only files below the roots are
-    read. Data leaves this machine only to the client. Plug-ins are off.
+    The server speaks over standard input and output, until the client closes them. Only files below the roots
+    are read. Data leaves this machine only to the client. Plug-ins are off.
 
     \b
     Examples:
@@ -139,8 +139,8 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
 def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[Any, ...]], None]:
     """Return an audit hook (PEP 578) that refuses files outside some folders, and connections.
 
-    It also refuses further files that mappings, bags and data sets name. It does not see files that libraries
-    in C open by themselves.
+    The hook also refuses further files that mappings, bags and data sets name. Files that libraries in C open
+    by themselves are not seen.
     """
     places = [*readable, sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *_SYSTEM]
     places += [str(Path(__file__).parents[1]), *filter(None, map(os.environ.get, _CACHES))]

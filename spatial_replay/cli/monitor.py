@@ -180,8 +180,8 @@ def monitor(
     Ctrl-C ends the run. Exits with 0 if all results are satisfied, 1 if any is violated, 4 if any is unknown
     or doubtful, 3 if the server does not answer or its time jumps back.
 
-    With --clips, nothing is written until a trigger fires. Then a log of the time before and after it is
-    written. SIGUSR1 and the service `trigger` of --serve fire it, too.
+    With --clips, nothing is written until a trigger fires. Each trigger writes a log of the time before and
+    after it. SIGUSR1 and the service `trigger` of --serve fire it, too.
 
     \b
     Examples:

@@ -499,7 +499,7 @@ def load_spec_options(
     """Return the specifications of a command line, with its values of constants.
 
     Args:
-        default: function that returns the specification for constants alone; None without one.
+        default: function that returns a specification, for a command line with constants only; or None.
 
     Raises:
         UsageError: no specification has a given constant.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
-"""Results that are printed without counts, at most. More results are also counted."""
+"""Number of results above which results are also counted by verdict."""
 _MOST_SHOWN: Final = 20
 """Results that are all printed, at most. If there are more, only the worst `_SHOWN` are printed."""
 _SHOWN: Final = 12

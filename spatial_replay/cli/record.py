@@ -406,7 +406,7 @@ def record(
     length_ns: int | None,
     simulation: SimulationArguments,
 ) -> int:
-    """Record a run of a simulated world as a log (MCAP), or with the commands below another source.
+    """Record a run of a simulated world as a log (MCAP); the commands below record other sources.
 
     A robot follows a script. In push it pushes three blocks, in pick-place it picks and places nine things,
     and in table-setting it sets a table. Equal options give an equal log, byte for byte. Needs

@@ -266,7 +266,7 @@ def serve(
     the specifications is a parameter: change one, and the curves, colours, events and verdicts of the whole
     log are updated. With --watch, saving a specification file updates them, too. Viewers can
     change constants; with --watch, the key w in this terminal saves their new values to the specification
-    files. So does the service write_constants.
+    files. The service write_constants saves them, too.
 
     Write a time T as 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
     2026-01-31T12:00:00Z. Ctrl-C stops the server, with exit code 130.

@@ -227,8 +227,8 @@ Advance = Callable[[int], None]
 def progress(label: str, total: int | None = None) -> Iterator[Advance]:
     """Show the progress of some work: `with progress("reading", len(items)) as advance: ... advance(1)`.
 
-    If standard error is a terminal, a bar appears after a second. It is removed at the end of the work. While
-    kernels are compiled, its label says so. A cell of a notebook shows no bar, although it runs
+    If standard error is a terminal, a bar appears after a second. The bar is removed at the end of the work.
+    Its label says when kernels are compiled. A cell of a notebook shows no bar, although it runs
     `!spatial-replay …` on a terminal.
 
     Args:
@@ -294,7 +294,7 @@ class _Bar:
             self._shown.update(self._shown.task_ids[0], description=self._description, completed=self._done)
 
     def _appear(self) -> None:
-        # None within other work: there is one bar at a time, that of the whole work
+        # None inside other work, which already has a bar
         self._shown = _start_bar(self._description, self._total, self._done)
         # steps may have been done while the bar was made
         self._update()

@@ -127,9 +127,9 @@ def tune(
 ) -> ExitCode:
     """Find the constants with which good runs satisfy a specification and bad runs violate it.
 
-    With good and bad runs, these values have the widest margin between them. With good runs only, they are
-    the tightest ones. Constants to tune have a range in the text, const near = 70 in [40, 100], or are named
-    by --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
+    With good and bad runs, the values have the widest margin between both. With good runs only, the values
+    are the tightest ones. Constants to tune have a range in the text, such as const near = 70 in [40, 100],
+    or are named by --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
 
     Exits with 0 if there are such values. Otherwise it lists the runs that contradict each other, and exits
     with 1.

@@ -150,7 +150,7 @@ TASKS: Mapping[str, Callable[[], None]] = MappingProxyType(
 def warmup(jobs: int | None) -> None:
     """Compile every kernel once, for all later runs on this machine.
 
-    It is for container images, and for use before a control loop. Short logs are evaluated without compiled
+    Use the command in container images, and before a control loop. Short logs are evaluated without compiled
     code. The code is stored next to the installed package or, if that is read-only, in the user's cache
     folder. SPATIAL_REPLAY_CACHE names another folder.
 

@@ -59,7 +59,7 @@ def read_labels(
     """Read the labels of episodes.
 
     Args:
-        labels: a JSON or CSV file, or the name of a field of the data set. Without it, labels are in
+        labels: a JSON or CSV file, or the name of a field of the data set. By default, labels are in
             `labels.json` or `labels.csv` next to the logs, or in the data set.
         reading: what a mapping says about data sets.
 

@@ -90,7 +90,7 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
 
     `subtask_index` is the index of the frame's stage in `names`, and `judge.progress` is its progress.
     `language_persistent` has a row for each change of the stage, with the style `subtask`. Frames of other
-    episodes have -1, NaN and no rows. So do episodes with different numbers of frames and samples.
+    episodes have -1, NaN and no rows, as have episodes whose numbers of frames and samples differ.
     """
     import pyarrow as pa
 

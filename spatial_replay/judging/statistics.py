@@ -58,7 +58,7 @@ def mcnemar_p(won: int, lost: int) -> float:
 def e_value(won: int, lost: int) -> float:
     """Return the e-value for one side winning more often; it may be checked after every episode.
 
-    It is the likelihood of a uniformly distributed chance of winning, divided by that of a chance of 1/2.
+    The e-value is the likelihood of a uniformly distributed chance of winning, divided by that of 1/2.
     """
     _scipy()
     from scipy.special import betaln

@@ -32,7 +32,7 @@ _WORDS: Final = {True: "success", False: "failure", None: None}
 
 
 def labelled_batch(judgement: Judgement) -> BatchResult:
-    """Return the batch of a judgement with its labels. Its failures are the disagreements."""
+    """Return the batch of a judgement with its labels. Disagreements are the failures of this batch."""
     import pyarrow as pa
     import pyarrow.compute as pc
 

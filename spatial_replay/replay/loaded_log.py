@@ -306,8 +306,8 @@ class LoadedLog:
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
         """Return the log with other specifications, and with the samples and measurements in memory.
 
-        The log is read again if only the new specifications look back at samples before the window. It is
-        also read again if its ends are trimmed and the new specifications name other objects or signals.
+        The log is read again if only the new specifications look back at samples before the window. A log
+        with trimmed ends is also read again if the new specifications name other objects or signals.
 
         Raises:
             UsageError: an option does not fit the specifications.

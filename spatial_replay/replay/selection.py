@@ -55,8 +55,8 @@ CLIP_METADATA: Final = "spatial_replay_clip"
 def default_keep(source: Source) -> tuple[str, ...]:
     """Return the messages of a source that an annotated log keeps: none of ROS 2, else all.
 
-    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. So the bag is unchanged,
-    and the annotated log is opened next to it.
+    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. Therefore the bag is
+    unchanged, and the annotated log is opened next to it.
     """
     messages = _external(source)
     return () if messages is not None and messages.profile == "ros2" else KEEP_ALL

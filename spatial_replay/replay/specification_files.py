@@ -36,8 +36,8 @@ _State: TypeAlias = tuple[int, int, int, int]
 class SpecificationFiles:
     """Specification files that are read again when they are saved.
 
-    It holds the last read state of the files, and the constants that were written into them. One thread
-    watches, and others may write.
+    The object holds the last read state of the files, and the constants that were written into them. One
+    thread watches, and others may write.
     """
 
     def __init__(
