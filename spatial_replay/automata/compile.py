@@ -199,7 +199,7 @@ def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
         process.stdin.write(program)
         process.stdin.close()
     except BrokenPipeError:
-        # MONA has ended; its exit code and output tell the reason
+        # MONA has ended; its exit code and output give the reason
         pass
     # one more byte shows that the output is too long
     printed = process.stdout.read(_MAX_OUTPUT + 1)

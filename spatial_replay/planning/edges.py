@@ -308,7 +308,7 @@ class IdleTransitions(NamedTuple):
         return frozenset(pairwise(self.states))
 
     def along(self, path: Sequence[Transition]) -> tuple[int, ...]:
-        """Return the targets of a path's first transitions, as far as time alone takes them."""
+        """Return the states along a path that time alone reaches; none if its first edge needs a motion."""
         steps = zip(path, self.states[1:], strict=False)
         return tuple(state for _, state in takewhile(lambda step: step[0].target == step[1], steps))
 

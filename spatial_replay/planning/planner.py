@@ -518,10 +518,10 @@ class Planner:
         return replace(self._decision("execute", considered, reason), target=target)
 
     def bans(self, consideration: Consideration, pruned: Iterable[tuple[Edge, Reason]]) -> tuple[Ban, ...]:
-        """Return what must not be on the way to an edge, in few words.
+        """Return the shortest bans for the way to an edge.
 
         Args:
-            pruned: the edges given up; what takes one of them is not told apart from what must not be.
+            pruned: pruned edges, whose guards the bans may also forbid.
         """
         source = consideration.edge[0]
         given_up: list[str] = []

@@ -191,7 +191,7 @@ class MessageChannel:
                 at, last = times_apart(time_ns, self._last_ns)
                 raise UsageError(
                     f"a message on {self.topic} at {at} follows one at {last}; give times that do not"
-                    " decrease, or each thread a topic"
+                    " decrease, or a topic for each thread"
                 )
             self._put(time_ns, time_ns, payload)
 

@@ -254,7 +254,7 @@ class SampleWriter:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Store an error for the next `write` to raise, because nobody sees an error of this thread."""
+        """Store an error for the next `write` to raise, because errors of this thread would go unnoticed."""
         if not isinstance(error, SpatialReplayError):
             what = f"a sample or message could not be written ({type(error).__name__}: {error})"
             failure = OutputError(f"{self.name} ends here: {what}")
