@@ -633,6 +633,7 @@ def cache_folder() -> Path | None:
         if is_new:
             _remove_stale(parent, keep=name)
             if shipped is not None:
+                # code of a read-only image is copied, because it need not be compiled again
                 with suppress(OSError):
                     shutil.copytree(shipped, folder, dirs_exist_ok=True)
         return folder

@@ -176,6 +176,7 @@ class VectorJudge(_VectorWrapper):
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         begins = self._ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._ended)
         self._ended = np.logical_or(terminations, truncations)
+        # copies, because an environment may reuse its arrays
         rewards, terminations, infos = np.array(rewards), np.array(terminations), dict(infos)
         for number, observation in enumerate(iterate(self.env.observation_space, observations)):
             episodes, info = self._episodes[number], _info_of(infos, number)

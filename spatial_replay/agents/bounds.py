@@ -83,6 +83,7 @@ class Bounds:
         if not text:
             raise UsageError(f"{argument} is empty; give a path below {self.names}")
         if _ADDRESSES in text:
+            # a server may resolve .. to an address outside
             if ".." not in text and text.startswith(self.addresses or ("\0",)):
                 return text
             raise UsageError(f"{argument}: {_quote(text)} is outside the roots, which are {self.names}")

@@ -136,6 +136,7 @@ class Tools:
                 commands.append(["info", self._bounds.place(log["path"], "log")])
                 rows.append({"path": self._bounds.relative(log["path"]), "episodes": log["episodes"]})
         described = await self._run(ctx, commands)
+        # the time limit may have ended the call before the last outcome
         for row, command, outcome in zip(rows, commands, described.outcomes, strict=False):
             row |= _facts(outcome) | {"bytes": _bytes_of(Path(command[1]))}
         lines = [_log_line(row) for row in rows] or ["no logs below the roots"]

@@ -81,6 +81,7 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
 def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
     """Return the curves of a spec as SVG. The worst is on top, and each curve links to its page."""
     finite = [curve for curve in curves if np.isfinite(curve.values).any()]
+    # SVG draws later elements on top
     worst_last = sorted(finite, key=lambda curve: -_final(curve))[-MOST_CURVES:]
     if not worst_last:
         return Html("")

@@ -69,6 +69,7 @@ def repository_path(file: str | Path) -> str:
     job = os.environ.get("GITHUB_WORKSPACE")
     above = next((folder for folder in (current, *current.parents) if (folder / ".git").exists()), current)
     for base in (Path(job) if job else above, above):
+        # as written first, because a link in the repository may lead outside
         for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
             if candidate.is_relative_to(root):
                 return candidate.relative_to(root).as_posix()
@@ -90,6 +91,7 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
         kind = (row["file"], row["spec"], verdict_word(row))
         ranks.append(kinds[kind])
         kinds[kind] += 1
+    # the first row of every kind comes before the second row of any kind
     order = sorted(range(len(rows)), key=lambda place: ranks[place])
     for row in (rows[place] for place in order[:_ANNOTATIONS]):
         about = requirement_of(row)

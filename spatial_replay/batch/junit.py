@@ -54,6 +54,7 @@ def write_junit(
         UsageError, OutputError: the file cannot be written.
     """
     text = ""
+    # the full report, then with short texts, then without passing test cases
     for limit, keeps in ((None, True), (_SHORT, True), (_SHORT, False)):
         text = "".join(_lines(table, name, reports or {}, limit, keeps))
         if len(text.encode()) <= largest:

@@ -186,6 +186,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
         high = low + 1.0
     width = (high - low) / _BINS
     below = math.ceil(-low / width) if low < 0.0 else 0
+    # one bin more than `_BINS`, because 0 is an edge
     edges = (np.arange(_BINS + 2) - below) * width
     counts, _ = np.histogram(numbers, edges)
     tallest, step = max(1, int(counts.max())), _WIDTH / len(counts)

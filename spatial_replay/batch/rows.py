@@ -184,6 +184,7 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
 def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
     """Return the rows of several logs. Short logs are evaluated together."""
     rows: list[TaskRows] = []
+    # tasks of a case are neighbours, which `groupby` needs
     for _, like_tasks in groupby(tasks, lambda task: (task.specs, task.conditions)):
         rows += _rows_of_like_tasks(list(like_tasks))
     return rows

@@ -513,6 +513,7 @@ def run_batch(
         by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
+        # before the evaluation, so that a killed batch need not hash the logs again
         folder.write_identities(by_state)
         lasting = {
             request.key for request in requests if request.key is not None and not request.file.has_plugins
@@ -615,6 +616,7 @@ def row_key(identity: str, conditions: Conditions, meaning: str) -> str:
 
 
 def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
+    # another version of the program may give other results
     parts = [FORMAT, __version__, identity, conditions, meaning]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:HASH_DIGITS]
 

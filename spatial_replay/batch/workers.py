@@ -109,6 +109,7 @@ def _results(
     waiting: dict[Future[_Result], _Task] = {}
     is_whole = True
     while True:
+        # a broken pool gets no further tasks
         for task in islice(tasks, ahead - len(waiting) if is_whole else 0):
             try:
                 # an interrupted `submit` could leave a process that `_pool` does not find

@@ -302,6 +302,7 @@ def batch(
         failing = failing_places(with_comparison(evaluated).table, None if is_exported else _WORST)
         # rows of gone results come last, and have no log to explain
         failing = [place for place in failing if place < len(evaluated.table)]
+        # the stored table gets the explanations, but not the comparison
         evaluated = explain_batch(evaluated, failing, workers, results=folder, progress=progress)
         result = with_comparison(evaluated)
         _write_outputs(outputs, suite, evaluated, result, workers)

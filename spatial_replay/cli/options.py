@@ -55,7 +55,7 @@ class ServingArguments:
 
 
 def serving_options(port: int, only_with: str = "") -> _Option:
-    """Add the options of a server for viewers. The command receives them as `serving`.
+    """Add the options of a server for viewers, which the command receives as `serving`.
 
     Args:
         port: default port.
@@ -319,7 +319,7 @@ _READING = (
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of reading a log. The command receives the given ones as `reading`."""
+    """Add the options of reading a log. The command receives the given options as `reading`."""
 
     @wraps(command)
     def gathering(*, read: dict[str, object], mapping: LogFile | None, **arguments: Any) -> Any:
@@ -398,7 +398,7 @@ _CONDITIONS = (
 
 
 def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add LOG and the options of an evaluation. The command receives them as `request`."""
+    """Add LOG and the options of an evaluation, which the command receives as `request`."""
     log = click.argument("log", type=LogPath())
     specs = specs_option("Specification; repeat for several.  [default: those in the log]")
     gathering = reading_options(gather("request", EvaluationArguments, command))
@@ -406,7 +406,7 @@ def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of an evaluation of many logs. The command receives them as `conditions`."""
+    """Add the options of an evaluation of many logs, which the command receives as `conditions`."""
     specs = specs_option("Specification file; repeat for several.")
     gathering = reading_options(gather("conditions", ConditionArguments, command))
     return add_options((specs, *_CONDITIONS), gathering)

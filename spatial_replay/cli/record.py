@@ -319,7 +319,7 @@ class SimulationArguments(TypedDict):
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a simulated world. The command receives them as `simulation`."""
+    """Add the options of a simulated world, which the command receives as `simulation`."""
     return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
 
 

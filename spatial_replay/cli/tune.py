@@ -63,6 +63,7 @@ def _one_by_one(arguments: list[str]) -> Iterator[str]:
             repeated = None
             yield argument
         else:
+            # an option of click takes one value, so its name is repeated before each further value
             if repeated is not None and not is_first:
                 yield repeated
             is_first = False

@@ -185,6 +185,7 @@ def annotate_data_set(
     except OSError as error:
         raise output_error(new, error) from error
     finally:
+        # after the rename, there is nothing to remove
         with suppress(OSError):
             shutil.rmtree(partial)
 

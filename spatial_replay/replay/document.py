@@ -64,7 +64,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         **json_fields(result, *RESULT_COLUMNS),
         "requirement": result.spec.id,
         "title": result.spec.title,
-        # the witness of headline, arrow and event
+        # the witness that headline, arrow and event show
         "worst": None if result.worst is None else witness_document(result.worst, first_ns),
         "causes": [_cause(cause, first_ns) for cause in result.causes],
         "violations": [_invariant(invariant) for invariant in result.violated_invariants],

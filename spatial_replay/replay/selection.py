@@ -589,7 +589,7 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
 
 
 def _last_before(source: Source, start_ns: int) -> Messages:
-    """Return the last message before a time of each topic except samples; for transforms, of each frame."""
+    """Return the last message of each topic before a time, or of each frame for transforms; no samples."""
     latest: dict[tuple[Channel, str], Messages] = {}
     frames: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
@@ -603,6 +603,7 @@ def _last_before(source: Source, start_ns: int) -> Messages:
                 message = select(messages, np.array([index]))
                 for frame in frames[channel](message.payloads[0]):
                     latest[channel, frame] = message
+    # one message may place several frames
     distinct = {id(message): message for message in latest.values()}
     return merge(list(distinct.values()))
 

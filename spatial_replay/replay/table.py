@@ -130,6 +130,7 @@ def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]
     """
     nodes: dict[_Node, str | None] = {}
     faults: list[str] = []
+    # the whole log is read first, because a node may appear in a later block
     for series, lost in _iter_series(source):
         faults += lost
         for part in series:

@@ -102,6 +102,7 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
         (signers_file := Path(folder) / "allowed_signers").write_text(allowed)
         files = ["-f", str(signers_file), "-s", str(signature.resolve())]
         principals = _ssh_keygen(["find-principals", *files], b"")
+        # ssh-keygen verifies a signature for one principal at a time
         for principal in principals.stdout.decode("utf-8", "replace").splitlines():
             arguments = ["verify", *files, "-n", NAMESPACE, "-I", principal]
             if _ssh_keygen(arguments, statement(certificate)).returncode == 0:
