@@ -257,6 +257,7 @@ class Automaton(Displayed):
         """Return the automaton with other names for its propositions."""
         result = replace(self, propositions=tuple(propositions))
         # names change no move, so cached properties of the moves stay valid
+        # functools.cached_property stores its values in __dict__
         result.__dict__.update({name: self.__dict__[name] for name in _OF_MOVES & self.__dict__.keys()})
         return result
 

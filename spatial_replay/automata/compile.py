@@ -130,6 +130,7 @@ _MAX_MOVES = 100_000
 _MAX_PROGRAM = 1_000_000
 """Maximum length of a MONA program, characters."""
 
+# lines of the output of `mona -w`
 _HEADER = re.compile(r"DFA for formula with free variables:(.*)")
 _ACCEPTING = re.compile(r"Accepting states:([ \d]*)")
 _COUNT = re.compile(r"Automaton has (\d+) states?")

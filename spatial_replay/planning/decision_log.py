@@ -117,6 +117,7 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
     grid, values = gradient.grid, gradient.values[turned.turn]
     colours = dict(zip(_COLOURS, np.moveaxis(cell_colours(values), -1, 0), strict=True))
     fields = {"robustness": values.astype("<f4"), **colours, **dict(_fields(turned, layers))}
+    # the schema foxglove.Grid packs all fields of a cell together
     cells = np.empty(values.shape, [(name, array.dtype.str) for name, array in fields.items()])
     for name, array in fields.items():
         cells[name] = array
@@ -346,6 +347,7 @@ class BlackBox:
         for channel, messages in zip(_CHANNELS, of_channels, strict=False):
             first = self._written[channel]
             self._written[channel] += len(messages)
+            # deterministic, because a log is verified by comparing bytes
             payloads = [message.SerializeToString(deterministic=True) for message in messages]
             times_ns = np.full(len(payloads), time_ns, np.int64)
             streams.append(messages_of(channel, times_ns, payloads, first))

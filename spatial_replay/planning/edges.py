@@ -442,6 +442,7 @@ def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
     """Return the state farthest from acceptance; None if no state can reach acceptance."""
     paths = {state: next(automaton.paths(state), None) for state in states}
     distances = {state: len(path) for state, path in paths.items() if path is not None}
+    # among states of equal distance, the one with the lowest number
     return max(distances, key=lambda state: (distances[state], -state), default=None)
 
 

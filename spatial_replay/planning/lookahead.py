@@ -273,6 +273,7 @@ class Arranger:
                         break
             if len(group) < most and group:
                 for name in self._in_the_way(group):
+                    # in the order of the settings, so that equal sets are equal tuples
                     wider = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if wider not in seen:
                         seen.add(wider)
@@ -344,6 +345,7 @@ class Arranger:
             *(demand.formula for demand in about),
             *(distance_between(name, neighbour) for neighbour in others),
         ]
+        # other movable objects are no obstacles in this map; `apart` has their distances
         free = replace(workspace, supports=workspace.supports | set(others))
         maps = proposition_maps(formulas, self._regions, self._sample, name, free)
         met = dict(zip(about, map(surplus, maps.lower, maps.upper, about), strict=True))
@@ -409,6 +411,7 @@ class Arranger:
         reach = (
             radius_of(first_object) + radius_of(second_object) + self._settings.workspace.clearance
         ) / size + 1.0
+        # without demands only contact matters, so the stencil ends where the objects cannot touch
         half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
         turns, side = self._fields[first].turns, 2 * half + 1
         cells = side * side * int(used[first].sum()) * int(used[second].sum())
@@ -499,6 +502,7 @@ class Arranger:
             # cells with too little room, and turns of pushed objects, come after all others
             is_last = room < settings.room
             is_last[1:] |= settings.workspace.keeps_yaw
+            # more than the range of all scores
             behind = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
             return score - np.where(is_last, behind, 0.0)
         if settings.skill == "place":
@@ -509,7 +513,6 @@ class Arranger:
     # ------------------------------------------------------------------------------------------ poses
 
     def _pose(self, name: str, cell: Cell) -> Pose:
-        """Return the pose of an object in a cell."""
         x, y = self._grid.centre(cell[1], cell[2])
         return x, y, float(self._fields[name].turns[cell[0]])
 
@@ -520,6 +523,7 @@ class Arranger:
         previous steps.
         """
         workspace, size = self._settings.workspace, self._grid.cell_size
+        # obstacles become objects, so that distances to them are demands like all others
         obstacles = {
             f"obstacle {number}": TrackedObject(obstacle)
             for number, obstacle in enumerate(workspace.obstacles)
@@ -532,6 +536,7 @@ class Arranger:
             for neighbour in others
             if name not in workspace.supports
         }
+        # sorted, because the order of a set of texts differs between processes, and plans must be equal
         apart = [
             Demand(distance_between(*sorted(pair)), True, workspace.clearance)
             for pair in sorted(pairs, key=sorted)
@@ -577,6 +582,7 @@ class Arranger:
             )
             nudges += ((name, tracked) for tracked in nudged)
         scene = with_objects(sample, objects)
+        # each sample gets a later time, because the times of a trace must increase
         samples = [
             scene,
             *(
@@ -804,6 +810,7 @@ class Lookahead:
         """Yield motions of several objects that take a whole path, or its first edge."""
         if self._settings.motions < 2:
             return
+        # the whole path first, then only its first edge
         for length in dict.fromkeys((len(path), 1)):
             aims = path[:length]
             if any((aim.source, aim.target) in self._ruled_out for aim in aims):
@@ -857,6 +864,7 @@ class Lookahead:
                 ways = alternatives(self._formulas[number], not value)
                 if len(ways) == 1:
                     safety_demands += (Demand(*literal, least) for literal in ways[0])
+        # at most eight combinations of cubes, because their number grows exponentially with the path
         for cubes in islice(product(*(aim.guard for aim in aims)), 8):
             literals = tuple(dict.fromkeys(literal for cube in cubes for literal in cube))
             if any((number, not value) in literals for number, value in literals):
@@ -1001,6 +1009,7 @@ class Lookahead:
         hopeless: list[tuple[int, bool]] = []
         budget = Budget(self._expected.budget.left * _HOPELESS_SHARE)
         for number, value in sorted(literals):
+            # a literal that holds now is not hopeless; `is`, because None is unknown
             if symbol[number] is (not value) and budget.left > 0:
                 why = self._why_hopeless(self._first.sample, number, value, budget)
                 if why:

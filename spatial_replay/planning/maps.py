@@ -107,6 +107,7 @@ class GradientMap(Displayed):
         Args:
             avoided: places (x, y) from which the poses are also at least two cells away.
         """
+        # stable, so that equally robust cells keep their order
         order = np.argsort(
             -np.where(self.blocked == FREE, self.robustness, -np.inf), axis=None, kind="stable"
         )

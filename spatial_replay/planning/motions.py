@@ -116,6 +116,7 @@ class Movables:
         """
         tracked, settings = self.sample.objects[name], self.settings
         gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)
+        # a failed motion may have lacked room, so its object keeps room from everything
         keeps_all = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
         room_from = None if keeps_all else later
         failed = self.attempts.places_of(name)
@@ -196,6 +197,7 @@ class Movables:
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
         """Return whether the last leg of a path, and the turn at its end, are free."""
+        # the progress set ((),) is always true, because only blocked cells matter
         gradient = self.gradient(target.name, ((),), constraints)
         size = gradient.grid.cell_size
         last = (gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], size / 2))
@@ -492,9 +494,11 @@ class MotionOrder:
     def find(self) -> Ordered | None:
         """Return the first order with the fewest parked objects; None if none is found."""
         for self._most_parked in range(_MOST_PARKED + 1):
+            # a dead end may be passable with more parked objects
             self._dead.clear()
             self._has_parked = self._most_parked == 0
             sequence = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
+            # if no object could be parked, a larger limit does not help
             if sequence is not None or not self._has_parked:
                 return sequence
         return None
@@ -809,6 +813,7 @@ class MotionOrder:
                 if isinstance(target, str):
                     break
                 yield target
+                # the next place to try is at least a diameter away
                 away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
                 free = free & away
                 good, roomy = good & away, roomy & away

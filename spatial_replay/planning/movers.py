@@ -296,6 +296,7 @@ class Lookout:
         about = sample, states, others, name, numbers
         # the start of the motion is not known, so several start times are tested
         ways = [_places(way, timing, share, numbers, skill) for share in _beginnings(way, timing, skill)]
+        # the last prospect is that of the object at rest
         *prospects, staying = self._prospects(*about, [*ways, np.tile(start, (len(numbers), 1))])
         going = Prospect(*map(min, zip(*prospects, strict=True)))
         if going.perhaps == math.inf:
@@ -363,6 +364,7 @@ class Lookout:
         """Return the paths that are free for an object."""
         settings = self._settings
         movables = Movables(self._formulas, self._regions, sample, settings, Attempts())
+        # without progress and constraints, cells are blocked only by objects, obstacles and reach
         gradient = movables.gradient(name, ((),), ())
         grid, free = gradient.grid, gradient.blocked[0] == FREE
         clear = []
@@ -440,6 +442,7 @@ def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Sk
     length = sum(math.dist(begin, end) for begin, end in pairwise(way))
     ended = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
     last = math.ceil(min(max(ended, AHEAD), MOST_AHEAD))
+    # every sample of the first second at 30 Hz, then every third up to `AHEAD`, then every ninth
     return (*range(1, 31), *range(33, AHEAD + 1, 3), *range(AHEAD + 9, last + 9, 9))
 
 
@@ -495,6 +498,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequenc
         tracked, column, length = sample.objects[name], now.names.index(name), len(course.places)
         rows[:, column] = len(footprints) + np.arange(count) % length
         turns = course.turn * np.array(numbers if course.turn else [0] * length, np.float64)
+        # a turning object has another orientation at each place, so poses are added one by one
         if course.turn:
             for place, turn in zip(course.places, turns, strict=True):
                 footprints = with_poses(footprints, tracked, place[None, :], np.array([turn]))

@@ -119,6 +119,7 @@ class Planner:
             refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
         self.automaton: Automaton = automaton_of(specification, name, rate_hz=rate_hz)
         formula = chosen_spec(specification, name).formula
+        # without bounds in seconds, the automaton does not depend on the rate
         self.rate_hz = rate_hz if counts_seconds(formula) else None
         self.bounds = "" if rate_hz is None else bounds_in_samples(formula, rate_hz)
         refuse_template(specification, self.automaton.name)
@@ -361,6 +362,7 @@ class Planner:
         self._times.end()
         # a concluded motion is over, so the object counts as standing
         self._motions.pop(step.target.name, None)
+        # a controller returns the stop reason unchanged
         is_stopped = not outcome.succeeded and outcome.reason == self._stop_reason
         if self._delayed is not None:
             # a motion aside is no attempt at an edge

@@ -367,6 +367,7 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
         waiting += planner_messages(block.messages)
         count = 0
         for sample in block.trace.samples():
+            # a message at the time of a sample belongs to this sample
             while count < len(waiting) and waiting[count].time_ns < sample.time_ns:
                 moment.messages.append(waiting[count])
                 count += 1

@@ -365,6 +365,7 @@ def text_from_settings(settings: Settings) -> str:
             "yaws": workspace.yaws,
             "base": workspace.base,
             "nearest": workspace.nearest,
+            # JSON has no infinity
             "farthest": workspace.farthest if math.isfinite(workspace.farthest) else None,
             "obstacles": [
                 [[part.vertices.tolist(), part.radius] for part in obstacle.parts]

@@ -211,6 +211,7 @@ def _without_corners(
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
     """Return the goals (rows, columns) in which an object can be turned to the orientation of a layer."""
+    # only the box around the goals is measured, instead of the whole grid
     able = np.zeros(goals.shape, np.bool_)
     if goals.any():
         low, left = np.argwhere(goals).min(axis=0).tolist()
@@ -251,6 +252,7 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
     least = workspace.clearance + grid.cell_size / math.sqrt(2.0)
     if all(gradient.clearance[0][grid.cell(*point)] > least for point in points):
         return True
+    # maps of one cell without propositions measure only the clearance
     about = gradient.made_of.now.about
     return all(
         proposition_maps(

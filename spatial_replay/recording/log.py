@@ -414,6 +414,7 @@ class FileLog(RecorderLog):
         Args:
             number: index of the planner's specification.
         """
+        # imported late, because a log without a planner does not need the planner's code
         from spatial_replay.planning.decision_log import plan_metadata
 
         self._plans.append(plan_metadata(planner, self._recording.files[number].filename))

@@ -150,6 +150,7 @@ def _draw(
     if (high <= low).any():
         return
     width, height = (high - low).tolist()
+    # coordinates count from the centre of the first pixel, so its outer corner is at -0.5
     edge = cells - 0.5
     outer = np.array([(-0.5, -0.5), (edge, -0.5), (edge, edge), (-0.5, edge)])
     matrix = fit_homography(outer, _OVERSAMPLED * (pixels - low + 0.5) - 0.5)
