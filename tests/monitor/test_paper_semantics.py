@@ -239,7 +239,9 @@ def test_other_operators_are_refused_with_their_place(formula):
         lambda: Monitor(specification, semantics="paper"),
         lambda: evaluate(specification, numbers(p=[1], q=[1]), semantics="paper"),
     ):
-        with pytest.raises(UsageError, match=rf"odd.spatial:2:\d+: .* has no {operator}, as odd has; write"):
+        with pytest.raises(
+            UsageError, match=rf"odd.spatial:2:\d+: .* has no {operator}, which odd uses; write"
+        ):
             refuse()
     assert evaluate(specification, numbers(p=[1], q=[1])).result("odd").name == "odd"
 
