@@ -781,7 +781,7 @@ class MotionOrder:
             after, _ = self._is_kept(final_sample, name, now.grid, *later)
             onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
             if name in self.places:
-                # the other objects are then at their places, and must not block its path to its own place
+                # the other objects will be at their places, and must not block the parked object's path
                 onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
             after &= onwards
             good &= after

@@ -296,7 +296,7 @@ class Lookout:
         about = sample, states, others, name, numbers
         # the start of the motion is not known, so several start times are tested
         ways = [_places(way, timing, share, numbers, skill) for share in _beginnings(way, timing, skill)]
-        # the last prospect is that of the object at rest
+        # the last prospect is for an object at rest
         *prospects, staying = self._prospects(*about, [*ways, np.tile(start, (len(numbers), 1))])
         going = Prospect(*map(min, zip(*prospects, strict=True)))
         if going.perhaps == math.inf:

@@ -1,1 +1,1 @@
-"""Recording: samples in, a log out, with the robustness of specifications beside them."""
+"""Recordings of samples in a log, with the robustness of specifications."""

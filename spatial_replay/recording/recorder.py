@@ -239,7 +239,7 @@ class SampleWriter:
         try:
             trace = Trace.from_samples(samples)
         except Exception as error:
-            # samples before the one that cannot be encoded are written
+            # only the samples before the faulty one are written
             sound = encodable(samples)
             self._try(lambda: self._log.add(sound, Trace.from_samples(sound), messages))
             self._fail(error)

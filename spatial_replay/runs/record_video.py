@@ -411,7 +411,7 @@ class _Picture:
         self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
         self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
         self._kept, self._copied = keep_mode, camera.channel
-        # a copied topic must not be one of the log's own topics
+        # a topic under /spatial/ would clash with the log's own topics
         if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
             self._kept = "none"
         self._encoder: H264Encoder | None = None

@@ -442,7 +442,7 @@ def carry(
     scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
 ) -> Generator[None, None, str]:
     """Move the held body along `via` to a position above `goal`; return the reason of a failure, or ""."""
-    # `travel` moves around the base, which hardly differs from a straight line between such close points
+    # `travel` moves around the base; between such close points its path is nearly straight
     way = (scene.place_of(name), *via, goal)
     for point in islice(points_along(way, _STRAIGHT), 1, None) if via else (goal,):
         x, y = _tool_for(scene, name, point, grasp.turn)
@@ -476,7 +476,7 @@ def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]
     """Lower the held body onto its support; return the reason of a failure, or ""."""
     arm = scene.arm
     x, y, above = arm.commanded
-    # measured now, because the body may hang in another pose than the one before the grasp
+    # measured now, because the grasp may have changed the pose of the body
     z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
     lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
     if lowered:
