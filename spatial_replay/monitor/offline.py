@@ -512,7 +512,7 @@ def windows_of(
         positions = indices if samples is None else samples
         edge = np.full(len(positions), count if is_ahead else 0, np.int64)
         return (positions, edge) if is_ahead else (edge, positions + 1)
-    # distances from the first sample, with bounds capped at the last sample: sums fit 64 bits
+    # sums fit 64 bits, because bounds are capped and times count from the first sample
     places = indices if bound.unit == "samples" else times_ns - times_ns[0]
     furthest = int(places[-1]) + 1
     near = min(bound.lower, furthest)

@@ -141,7 +141,7 @@ def _at_delay(delay: Delay, queue: deque[Sample], sample: Sample) -> Sample | No
 
 
 _NO_REPORT = ABSENT - 1
-"""Row number of a present object without an earlier report."""
+"""Row number of an object that is present, but has no earlier report."""
 
 Bindings = Mapping[str, TrackedName]
 """Objects by the names of variables."""

@@ -447,7 +447,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
 
 
 def _position(term: Term) -> Projection:
-    """Return a coordinate of a term, which is unknown if the term's position is unknown."""
+    """Return a coordinate of a term; it is unknown if the position of the term is unknown."""
     return Projection(term, "x", "min")
 
 

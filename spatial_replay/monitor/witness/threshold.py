@@ -205,7 +205,10 @@ The search is for dials that do not shift all samples equally. Each round reads 
 interval between a number that flips the verdict and one that does not.
 """
 _AT_FIRST = 64
-"""Number of first trials in both directions, where a larger change need not flip the verdict."""
+"""Number of candidates in the first pass of a search in both directions.
+
+There, a larger change need not flip the verdict, so bisection alone could miss the nearest number.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,7 +480,10 @@ class _Search:
         ]
 
     def _is_meant(self, atom: Atom) -> bool:
-        """Return whether an atom is varied: it has the constant, or the deciding atom's place in the text."""
+        """Return whether the search varies an atom.
+
+        A constant is varied in all its atoms, any other number in atoms from the deciding atom's place.
+        """
         if self._dial.constant:
             return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
         meant = self._deciding.atom
