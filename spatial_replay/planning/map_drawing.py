@@ -36,7 +36,7 @@ _THIN_PIXELS: Final = 1.5
 _INK: Final = (0.1, 0.1, 0.1)
 _WHITE: Final = (1.0, 1.0, 1.0)
 
-_FONT, _TICK, _GAP, _BAR = 0.028, 0.012, 0.03, 0.04
+_FONT, _TICK, _GAP, _BAR = 0.036, 0.012, 0.03, 0.04
 """Text height, tick length, and distance and width of the colour bar, as shares of the map's size."""
 
 _SHADES: Final = 17
