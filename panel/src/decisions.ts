@@ -1,7 +1,7 @@
 // The panel of a planner's decisions: candidates, the chosen map, and the edges given up.
 
 import {
-  element, inShort, makeDecision, nodeRow, numberText, printable, secondsText,
+  element, inShort, makeDecision, nodeRow, numberText, printable, secondsText, withCode,
   type DrawnBar, type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnOutline, type DrawnTarget,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
@@ -322,5 +322,5 @@ function degrees(radians: number): string {
 function givenUp(message: DecisionMessage): HTMLElement[] {
   if (!message.pruned.length) return [];
   return [element("h3", {}, "Edges given up so far"), element("ul", {}, ...message.pruned.map((edge) => element("li", {},
-    element("b", {}, `${edge.source ?? 0} → ${edge.target ?? 0}`), ` ${printable(edge.reason)}`)))];
+    element("b", {}, `${edge.source ?? 0} → ${edge.target ?? 0}`), " ", ...withCode(partsOf(edge.reason)))))];
 }

@@ -59,9 +59,16 @@ function drawAutomaton(automaton) {
     "aria-label": `Automaton with ${automaton.summary}`, class: wide < 6 * COLUMN ? "small" : null,
   }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
   svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
-  ...moves.map((move) => move.made), ...moves.map(pointerArea), ...states.values(), ...labelsOf(moves, places));
-  return {made, moves, states, set: null};
+  ...moves.map((move) => move.made), ...moves.map(pointerArea), ...states.values());
+  const labels = svg("g");
+  made.append(labels);
+  const isLarge = moves.length > MOST_LABELLED;
+  if (!isLarge) labels.replaceChildren(...labelsOf(moves, places));
+  return {made, moves, states, set: null, label: isLarge ? (ahead) => labels.replaceChildren(...labelsOf(ahead, places)) : null};
 }
+
+// Of more moves than these, only the present ones are labelled: others would lie on each other.
+const MOST_LABELLED = 16;
 
 // A wide and clear copy of a move, which is easy to point at.
 function pointerArea({made, guard}) {
@@ -81,17 +88,22 @@ const SHARES = [0.5, 0.4, 0.6, 0.32, 0.68, 0.25, 0.75];
 const LETTER = 5.6, LINE = 12;
 
 // The guards of the moves, with short names for long propositions, beside their curves: each at the first place where
-// it covers no state and no label before it. Without such a place, a move has its guard under the pointer alone.
+// it covers no state, no other of these curves and no label before it. Without such a place, a move has its guard under
+// the pointer alone.
 function labelsOf(moves, places) {
   const taken = [...places.values()].map(([x, y]) => [x - RADIUS, y - RADIUS, x + RADIUS, y + RADIUS]);
-  return moves.filter((move) => move.label).flatMap(({source, target, label, guard}) => {
+  const curves = moves.map(({source, target}) => pointsAlong(places.get(source), places.get(target)));
+  return moves.flatMap(({source, target, label, guard}, number) => {
+    if (!label) return [];
     const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
     const half = text.length * LETTER / 2;
     const boxes = SHARES.map((share) => {
       const [x, y] = alongCurve(places.get(source), places.get(target), share);
       return [x - half, y - LINE, x + half, y];
     });
-    const box = boxes.find((place) => taken.every((other) => overlapOf(place, other) === 0));
+    const isCrossed = ([left, top, right, bottom]) => curves.some((points, other) => other !== number
+      && points.some(([x, y]) => left < x && x < right && top < y && y < bottom));
+    const box = boxes.find((place) => taken.every((other) => overlapOf(place, other) === 0) && !isCrossed(place));
     if (!box) return [];
     taken.push(box);
     return svg("text", {class: "guard", x: (box[0] + box[2]) / 2, y: box[3], "text-anchor": "middle", dy: "-0.3em"},
@@ -103,6 +115,11 @@ function alongCurve([x0, y0], [x1, y1], share) {
   const [cx, cy] = controlOf([x0, y0], [x1, y1]), rest = 1 - share;
   const along = (from, by, to) => rest * rest * from + 2 * rest * share * by + share * share * to;
   return [along(x0, cx, x1), along(y0, cy, y1)];
+}
+
+function pointsAlong(begin, end) {
+  const steps = Math.ceil(Math.hypot(end[0] - begin[0], end[1] - begin[1]) / LETTER);
+  return Array.from({length: steps}, (_, step) => alongCurve(begin, end, (step + 0.5) / steps));
 }
 
 // From rim to rim; moves over several columns, back, or within a column go around what stands between.
@@ -136,6 +153,7 @@ function drawState(state, [x, y]) {
 function light(drawn, states) {
   for (const [number, made] of drawn.states) made.classList.toggle("here", states.includes(number));
   for (const move of drawn.moves) move.made.classList.toggle("ahead", states.includes(move.source));
+  drawn.label?.(drawn.moves.filter((move) => states.includes(move.source)));
 }
 
 // Scrolls a wide drawing sideways, so that a state shows.

@@ -73,7 +73,7 @@ function inShort({kind, target}) {
 
 function outcomeWords(outcome) {
   const how = outcome.succeeded ? "Done" : "Failed";
-  return `${how} at ${secondsText(outcome.time)}, in state ${outcome.states.join(", ")}: ${sentence(outcome.reason)}`;
+  return `${how} at ${secondsText(outcome.time)}, in state ${outcome.states.join(", ")}: ${minusWords(sentence(outcome.reason))}`;
 }
 
 function sentence(text) {
@@ -92,7 +92,7 @@ function makeEdge(clock, decision, edge, number) {
     edge.rules.length ? sentences(edge.rules) : null,
     element("div", {class: "candidates"},
       ...edge.candidates.map((candidate, place) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
-    edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);
+    edge.pruned ? element("p", {class: "pruned"}, `Given up: ${minusWords(sentence(edge.pruned))}`) : null);
 }
 
 function makeCandidate(clock, decision, candidate, maps, once) {

@@ -25,9 +25,9 @@ function body(name) {
   return document.getElementById(`${name}-body`);
 }
 
-// A sentence whose parts are text and code, in turn.
+// A sentence whose parts are text and code, in turn. Code keeps the sign that specifications have.
 function withCode(parts) {
-  return parts.map((part, number) => number % 2 ? element("code", {}, part) : part);
+  return parts.map((part, number) => number % 2 ? element("code", {}, part) : minusWords(part));
 }
 
 function secondsText(seconds) {
