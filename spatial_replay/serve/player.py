@@ -1,4 +1,4 @@
-"""Playing a log to viewers: what they share, and the thread that does what they request."""
+"""Playback of a log to viewers: the state that all viewers share, and the thread that performs requests."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from spatial_replay.logs.topics import (
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
 
 MOST_LATE_S: Final = 0.15
-"""The most time that passes between two turns; viewers can take what is played in that time at once."""
+"""Longest playing time of one turn, seconds; viewers lose messages in larger bursts."""
 
 
 class Pace:
-    """The seconds by which a log is played, turn by turn.
+    """The playing time of a log, counted turn by turn.
 
-    After a turn that took too long, at most `MOST_LATE_S` count: the playback falls behind the clock, so that
-    no turn has more to send than viewers can take.
+    A turn counts for at most `MOST_LATE_S`. After a longer turn the playback lags behind the clock, so that
+    no turn sends more than viewers can read.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -58,11 +58,11 @@ class Pace:
         self._turn = clock()
 
     def now(self) -> float:
-        """Return the seconds that have passed."""
+        """Return the playing time in seconds: the clock's time without the skipped parts of long turns."""
         return self._at(self._clock())
 
     def next_turn(self) -> float:
-        """Begin another turn; return the seconds of the last one, at most `MOST_LATE_S`."""
+        """Begin the next turn, and return the playing time of the last turn in seconds."""
         read = self._clock()
         now = self._at(read)
         elapsed_s = now - self._turn
@@ -89,8 +89,8 @@ class PlaybackState(NamedTuple):
     """The state of a playback, as viewers show it.
 
     Attributes:
-        speed: seconds of the log in a second.
-        did_seek: whether it jumped to this time, so that what viewers show is out of date.
+        speed: seconds of the log per second of the clock.
+        did_seek: whether playback jumped to this time, so that viewers must drop earlier messages.
     """
 
     status: Status
@@ -100,10 +100,10 @@ class PlaybackState(NamedTuple):
 
 
 class Transport:
-    """Play, pause and seek; callers pass the time of their clock, `now`, in seconds.
+    """The position of a playback. Callers pass the time of their clock as `now`, in seconds.
 
     Attributes:
-        start_ns, end_ns: first and last time.
+        start_ns, end_ns: first and last time of the log.
     """
 
     def __init__(self, start_ns: int, end_ns: int) -> None:
@@ -129,7 +129,7 @@ class Transport:
         return PlaybackState(status, time_ns, self._speed)
 
     def play(self, now: float) -> None:
-        """Play from the present time; at the end of the run, playing ends at once."""
+        """Play from the present time. Playback from the last time stays at that time."""
         self.move_to(self.time_ns(now), now)
         self._is_playing = True
 
@@ -139,36 +139,36 @@ class Transport:
         self._is_playing = False
 
     def move_to(self, time_ns: int, now: float) -> None:
-        """Go to another time, within the log."""
+        """Go to a time, clipped to the log."""
         self._from_ns, self._since = min(max(time_ns, self.start_ns), self.end_ns), now
 
     def set_speed(self, speed: float, now: float) -> None:
-        """Play at another speed, within limits; anything but a positive number changes nothing."""
+        """Set the speed, clipped to `SLOWEST` and `FASTEST`; ignore one that is not positive and finite."""
         if speed > 0.0 and not math.isinf(speed):
             self.move_to(self.time_ns(now), now)
             self._speed = min(max(speed, SLOWEST), FASTEST)
 
 
 Values = Mapping[str, float | str]
-"""Numbers and, as texts, durations, by the names of constants."""
+"""Values by name of constant. Durations are texts, all others numbers."""
 
 MOST_OPEN: Final = 8
-"""The most questions that may be open at once."""
+"""Limit of open questions."""
 
 _Answer = TypeVar("_Answer")
 
 
 @dataclass
 class PendingRequests:
-    """Requests that were made and are not done yet; of several of a kind the last one counts.
+    """Requests that the player has not performed yet. Except for topics, the last request of a kind counts.
 
     Attributes:
-        edited: the specifications with other constants, if those are to change.
-        is_controlled: whether to play, pause or change the speed.
-        seek_ns: another time to go to.
-        topics: topics that were subscribed to.
-        arrow: the title of the result to point at, if that is to change.
-        stop: whether the session is to end.
+        edited: changed specifications or constants; None for no change.
+        is_controlled: whether a viewer set play, pause or the speed.
+        seek_ns: time to seek to; None for no seek.
+        topics: newly subscribed topics.
+        arrow: title of the result that the arrow shall point at; None for no change.
+        stop: whether the session shall end.
     """
 
     edited: EditedFiles | None = None
@@ -183,13 +183,13 @@ class PendingRequests:
 
 
 class Questions:
-    """Answer one question after the other, on a thread of its own, so that no playback waits for them."""
+    """A queue of questions, answered one by one on a thread of its own, so that playback continues."""
 
     def __init__(self, wait_for_evaluation: Callable[[], Evaluated]) -> None:
-        """Begin without a question.
+        """Begin with an empty queue.
 
         Args:
-            wait_for_evaluation: returns what is shown; see `Session.wait_for_evaluation`.
+            wait_for_evaluation: returns the evaluation that viewers see; see `Session.wait_for_evaluation`.
         """
         self._wait_for_evaluation = wait_for_evaluation
         self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
@@ -198,10 +198,11 @@ class Questions:
         self._is_over = False
 
     def ask(self, work: Callable[[Evaluated], _Answer]) -> _Answer:
-        """Compute something from what is shown now, in turn; what `work` raises is raised here.
+        """Return `work` of the present evaluation, once earlier questions are answered.
 
         Raises:
             UsageError: too many questions are open, or the session is over.
+            Exception: any error of `work`.
         """
         evaluated, answer = self._wait_for_evaluation(), Future[_Answer]()
         with self._changing:
@@ -217,7 +218,7 @@ class Questions:
         """Answer questions until `stop`."""
         while (question := self._waiting.get()) is not None:
             answer, work = question
-            # it may be refused before it is computed, or while it is
+            # `stop` may refuse the question before or during its computation
             with suppress(InvalidStateError):
                 if not answer.done():
                     try:
@@ -228,7 +229,7 @@ class Questions:
                 self._open.remove(answer)
 
     def stop(self) -> None:
-        """Refuse all open questions, and any more."""
+        """Refuse all open and all later questions."""
         with self._changing:
             self._is_over = True
             for answer in self._open:
@@ -238,54 +239,57 @@ class Questions:
 
 
 def session_over() -> UsageError:
-    """Return the error of a request that comes too late."""
+    """Return the error of a request after the end of the session."""
     return UsageError("the server is stopping")
 
 
 PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
-"""Parameters of the playback for viewers without controls: seconds after the first sample, whether it plays,
-seconds of the log per second, whether it starts again at the end."""
+"""Parameters of the playback for viewers without controls.
+
+The time in seconds after the log's zero, whether the log plays, the seconds of the log per second, and
+whether the log starts again at its end."""
 
 ARROW: Final = "scene.arrow"
-"""The parameter with the title of the result whose violation the arrow points at; "" for the first one."""
+"""Name of the parameter that chooses the arrow: the title of a result, or "" for the first violated one."""
 
+# int64 nanoseconds reach 9.2e9 seconds
 _LONGEST_S: Final = 9e9
 
 
 class PlaySpan(NamedTuple):
-    """The next stretch to play: its end on the log's clock, and the duration of the last turn in seconds."""
+    """The next stretch to play: its end in the log's time, and the playing time of the last turn."""
 
     time_ns: int
     elapsed_s: float
 
 
 class Session:
-    """Collect viewers' requests, on any thread, and hand them to the thread that does them.
+    """Requests of viewers, collected on any thread for the thread of the player.
 
-    No method but `wait_for_evaluation` waits for work. If requests come faster than they are done, the last
-    one counts.
+    Only `wait_for_evaluation` waits for the player. If requests arrive faster than the player performs them,
+    the last one counts.
 
     Attributes:
         edited: the specifications with the constants as viewers set them.
         arrow: the value of `ARROW`.
-        failure: why the last change that could not be evaluated could not, or None.
+        failure: error of the last change that failed to evaluate, or None.
     """
 
     def __init__(
         self, loaded: LoadedLog, start_ns: int, end_ns: int, *, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Pause at the start, with constants as they are written.
+        """Pause at the start, with the constants of the files.
 
         Args:
-            start_ns, end_ns: first and last time.
-            clock: seconds by which it plays.
+            start_ns, end_ns: first and last time of the log.
+            clock: clock of the playback, in seconds.
         """
         self._log = loaded
         self._pace = Pace(clock)
         self._transport, self._zero_ns = Transport(start_ns, end_ns), loaded.first_ns
         self.edited = loaded.edit({})
         self._pending = PendingRequests()
-        # awaited from the next requests on, and from those that are being done
+        # `_awaited` gets the evaluation after the next requests, `_due` the one after the present requests
         self._awaited: Future[Evaluated] | None = None
         self._due: Future[Evaluated] | None = None
         self._requested = Condition()
@@ -302,7 +306,7 @@ class Session:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """First and last time."""
+        """First and last time of the log."""
         return self._transport.start_ns, self._transport.end_ns
 
     @property
@@ -318,7 +322,7 @@ class Session:
 
     @property
     def playback(self) -> Mapping[str, float | bool]:
-        """The values of `PLAYBACK`."""
+        """The values of the parameters in `PLAYBACK`, by name."""
         state = self.state
         seconds = round((state.time_ns - self._zero_ns) / 1e9, 3)
         is_playing = state.status is Status.PLAYING
@@ -327,16 +331,16 @@ class Session:
     # ------------------------------------------------------------------------ called for viewers
 
     def control(self, *, is_playing: bool, speed: float, seek_ns: int | None = None) -> PlaybackState:
-        """Play or pause at a speed, from another time on if one is given.
+        """Play or pause at a speed, after a seek if `seek_ns` is given.
 
-        At the end, playing begins again.
+        At the end of the log, playback starts again at the first time.
         """
         with self._requested:
             now = self._pace.now()
             status = self._transport.state(now).status
             if seek_ns is None and is_playing and status is Status.ENDED:
                 seek_ns = self._transport.start_ns
-            # what was played since the last turn is still to be sent
+            # the messages since the last turn are not sent yet
             is_behind = self._is_behind or status is Status.PLAYING
             self._is_behind = seek_ns is None and not is_playing and is_behind
             self._transport.set_speed(speed, now)
@@ -346,14 +350,14 @@ class Session:
             (self._transport.play if is_playing else self._transport.pause)(now)
             self._pending.is_controlled = True
             self._requested.notify()
-            # the player says that it jumped, right before it sends what is there
+            # without did_seek: the player reports the jump right before it sends the messages of that time
             return self._transport.state(now)
 
     def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
-        """Play, pause, seek, change the speed or begin again at the end, as some of `PLAYBACK` say.
+        """Set some parameters of `PLAYBACK`, and return the state.
 
         Raises:
-            UsageError: a value of another kind, or a number that is out of the question.
+            UsageError: a value has another type, or a number is outside its limits.
         """
         now = self.playback
         time, play, speed, loop = PLAYBACK
@@ -377,10 +381,10 @@ class Session:
         )
 
     def point_at(self, arrow: float | str | bool) -> None:
-        """Let the arrow point at the violation of one result, by its title, or at the first one for "".
+        """Point the arrow at the violation of the result with this title; "" for the first violated result.
 
         Raises:
-            UsageError: a value that is no text.
+            UsageError: the value is not a text.
         """
         if not isinstance(arrow, str):
             raise UsageError(f'{ARROW} cannot be {arrow!r}: give the title of a result, or "" for the first')
@@ -389,10 +393,10 @@ class Session:
             self._requested.notify()
 
     def set_constants(self, values: Values) -> None:
-        """Give constants other values; all of them or, with an error, none.
+        """Set the values of constants. An error changes none of them.
 
         Raises:
-            UsageError: no such constant, or a value of another kind.
+            UsageError: a constant does not exist, or its value has another type.
             SpecificationError: the specification is invalid with these values.
         """
         with self._requested:
@@ -403,7 +407,7 @@ class Session:
     def replace_log(self, loaded: LoadedLog) -> None:
         """Evaluate other specifications over the same log.
 
-        Constants that viewers changed keep their values, unless the text changed them, too.
+        A constant that a viewer changed keeps the viewer's value, unless its file changed, too.
         """
         with self._requested:
             before = self.edited
@@ -412,7 +416,7 @@ class Session:
                 name: value
                 for name, value in before.given.items()
                 if name in loaded.constants
-                # what a viewer set while a former value of it was being written is newer than the file
+                # `write_constants` wrote the viewer's earlier value; the present one may be newer
                 and (loaded.constants[name] == constants_before[name] or loaded.was_written(name))
             }
             try:
@@ -429,7 +433,7 @@ class Session:
             self._requested.notify()
 
     def wait_for_evaluation(self) -> Evaluated:
-        """Return what is shown, once the requests made so far are done.
+        """Return the evaluation that viewers see, once all earlier requests are performed.
 
         Raises:
             UsageError: the session is over.
@@ -442,7 +446,7 @@ class Session:
         return awaited.result()
 
     def stop(self) -> None:
-        """End the session, and let the player's thread know."""
+        """End the session, and wake the player's thread."""
         self.end()
         with self._requested:
             self._pending.stop = True
@@ -451,7 +455,12 @@ class Session:
     # -------------------------------------------------------------------------- called by the player
 
     def next_requests(self, patience_s: float, *, is_due: bool = False) -> PendingRequests:
-        """Return what was requested; wait for a request, but while it plays or work is due, only so long."""
+        """Wait for requests and return them.
+
+        Args:
+            patience_s: longest wait in seconds while the log plays or work is due; otherwise without limit.
+            is_due: whether the player has work that needs no request.
+        """
         with self._requested:
             is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
             self._requested.wait_for(
@@ -463,10 +472,12 @@ class Session:
             return pending
 
     def play_up_to(self, reach_ns: int) -> PlaySpan | None:
-        """Return what to play now, after a pause up to its time; None if nothing, or if it has to seek first.
+        """Return the next stretch to play; None if the log is paused or a seek is pending.
+
+        The first turn after a pause still plays the stretch up to the time of the pause.
 
         Args:
-            reach_ns: as far as can be played at once; it falls behind the clock rather than go farther.
+            reach_ns: latest time that one turn can reach. Playback then lags behind the clock.
         """
         with self._requested:
             elapsed_s = self._pace.next_turn()
@@ -481,16 +492,19 @@ class Session:
             return PlaySpan(min(state.time_ns, reach_ns), elapsed_s)
 
     def continue_from(self, time_ns: int) -> None:
-        """Play on from what was just shown, unless a seek is pending; showing it takes no playing time."""
+        """Continue at the time that was just shown, unless a seek is pending.
+
+        The duration of showing it is no playing time.
+        """
         with self._requested:
             if self._pending.seek_ns is None:
                 self._transport.move_to(time_ns, self._pace.now())
 
     def restore(self, edited: EditedFiles, failure: SpatialReplayError) -> Values:
-        """Go back to former specifications, unless a change is pending; return the present constants.
+        """Restore former specifications, unless a newer change is pending, and return the present constants.
 
         Args:
-            failure: why the latest ones could not be evaluated.
+            failure: error of the latest specifications.
         """
         with self._requested:
             self.failure = failure
@@ -499,7 +513,7 @@ class Session:
             return constant_values(self.edited.constants)
 
     def pause(self) -> PlaybackState:
-        """Stay at the present time, unless a seek is pending."""
+        """Pause, unless a seek is pending, and return the state."""
         with self._requested:
             now = self._pace.now()
             if self._pending.seek_ns is None:
@@ -507,20 +521,20 @@ class Session:
             return self._transport.state(now)
 
     def finish(self) -> PlaybackState:
-        """Pause at the end, or begin again."""
+        """Pause at the end, or start again if `playback.loop` is set."""
         if self._loops:
             return self.control(is_playing=True, speed=self.state.speed, seek_ns=self._transport.start_ns)
         return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
-        """Let `wait_for_evaluation` return where it was called before the last `next_requests`."""
+        """Answer the calls of `wait_for_evaluation` from before the last `next_requests`."""
         with self._requested:
             due, self._due = self._due, None
         if due is not None:
             due.set_result(evaluated)
 
     def end(self) -> None:
-        """Let `wait_for_evaluation` raise, now and from now on."""
+        """Make waiting and later calls of `wait_for_evaluation` raise."""
         with self._requested:
             self._is_over = True
             open_futures = [future for future in (self._awaited, self._due) if future is not None]
@@ -530,13 +544,15 @@ class Session:
 
 
 MOST_A_SECOND: Final = 600
-"""The most samples sent in a second, since viewers can take no more."""
+"""Rate limit of topics that the layout does not draw, samples per second; viewers read no more."""
 
 MOST_DRAWN_A_SECOND: Final = 50
-"""The most messages a second of a topic that the layout draws: as many as a second of a log has."""
+"""Rate limit of a topic that the layout draws, messages per second of wall time.
+
+It equals the rate of the scene in annotated logs, so that playback at speed 1 sends every message."""
 
 _MOST_AT_ONCE: Final = math.ceil(MOST_DRAWN_A_SECOND * MOST_LATE_S) + 1
-"""So many of them may come at once after a pause: at speed 1 all those of a late turn, and one by chance."""
+"""Burst allowance, messages: all of the longest turn at speed 1, and one more by its phase."""
 
 _NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
 _DRAWN: Final = (
@@ -555,20 +571,19 @@ _DRAWN: Final = (
 
 
 class PlaybackThinning:
-    """Thin the messages of a playback, turn by turn; in the thread of its player.
+    """Drops messages above the rate limits, turn by turn, on the player's thread.
 
     Topics that the layout draws send at most `MOST_DRAWN_A_SECOND` messages per second of wall time, and
-    fewer than 60 in any one second. Other topics send the messages of `MOST_A_SECOND` samples. The last of
-    each turn is always sent, and so is every event.
+    fewer than 60 in any one second. Other topics send the messages of `MOST_A_SECOND` samples per second.
+    The last message of each turn and all events are sent.
     """
 
     def __init__(self) -> None:
-        """Begin with as many messages left as may come at once."""
         self._passed_s = 0.0
         self._left: dict[str, tuple[float, float]] = {}
 
     def thin(self, messages: Messages, elapsed_s: float) -> Messages:
-        """Return what to send of the messages that came in a turn of so many seconds."""
+        """Return the messages to send from those of a turn that lasted `elapsed_s` seconds."""
         self._passed_s += elapsed_s
         most = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
         is_sent = np.ones(len(messages), np.bool_)
@@ -577,7 +592,7 @@ class PlaybackThinning:
             if channel.topic in _NEVER_THINNED:
                 continue
             times_ns, which = np.unique(messages.log_time_ns[rows], return_inverse=True)
-            # one time more than that comes by chance
+            # a turn at the limit has one sample more by its phase
             count = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most
             if len(times_ns) <= count + (not _is_drawn(channel)):
                 continue
@@ -597,7 +612,7 @@ class PlaybackThinning:
         )
 
     def _take(self, topic: str, count: int) -> int:
-        """Return how many messages of a topic that is drawn may be sent, at least the last one."""
+        """Return the limit of a drawn topic in this turn, at least 1, and charge up to `count` messages."""
         left, at_s = self._left.get(topic, (float(_MOST_AT_ONCE), self._passed_s))
         left = min(left + MOST_DRAWN_A_SECOND * (self._passed_s - at_s), _MOST_AT_ONCE)
         most = max(1, math.floor(left))
@@ -606,27 +621,28 @@ class PlaybackThinning:
 
 
 def _is_drawn(channel: Channel) -> bool:
-    # the frames of a video depend on those before
+    # frames of a video are decoded with the frames before them
     schema = "" if channel.schema is None else channel.schema.name
     return channel.topic in _DRAWN or (is_image_type(schema) and not schema.endswith("Video"))
 
 
 def _with_deletions(payloads: Sequence[bytes], places: Integers, is_kept: Booleans) -> dict[int, bytes]:
-    """Return scenes that are kept, each with what is deleted by those left out before it."""
+    """Return the kept scenes after dropped ones, by place, with the deletions of the dropped scenes added."""
     with_more = {}
     missed = SceneUpdate()
     for place in places.tolist():
         if not is_kept[place]:
             missed.deletions.extend(SceneUpdate.FromString(payloads[place]).deletions)
         elif missed.deletions:
-            # a viewer deletes before it draws
+            # parsers join the lists of concatenated messages; a viewer deletes before it draws:
+            # https://protobuf.dev/programming-guides/encoding/#last-one-wins
             with_more[place] = missed.SerializeToString(deterministic=True) + payloads[place]
             missed = SceneUpdate()
     return with_more
 
 
 class Note(NamedTuple):
-    """An error message of viewers; it replaces an earlier one about the same subject."""
+    """An error message for viewers. It replaces an earlier message about the same subject."""
 
     about: str
     text: str
@@ -638,26 +654,26 @@ SPECIFICATION = "specification"
 """The subjects of notes."""
 
 PERIOD_S: Final = 1 / 30
-"""The time between two turns."""
+"""Time between two turns, seconds."""
 
 _CURVES_EVERY: Final = 60
-"""Turns after which the curves are sent again: some viewers drop them while they open their panels."""
+"""Turns between two messages with the curves; some viewers drop the curves while they open their panels."""
 
 _PLAYBACK_EVERY: Final = 15
-"""Turns after which the parameters of the playback are sent again."""
+"""Turns between two updates of the playback's parameters."""
 
 _MOST_SAMPLES: Final = 4_096
-"""The most samples of one turn, so that a slow log does not block other requests."""
+"""Limit of samples in one turn, so that a slow log does not block other requests."""
 
 
 class Viewers(Protocol):
-    """The viewers of a playback, all at once."""
+    """All viewers of a playback."""
 
     def wants(self, topic: str) -> bool:
-        """Return whether any of them has subscribed to a topic."""
+        """Return whether a viewer has subscribed to a topic."""
 
     def publish(self, messages: Messages) -> None:
-        """Send messages to all."""
+        """Send messages to all viewers."""
 
     def send_time(self, time_ns: int) -> None:
         """Send the time of the log."""
@@ -679,7 +695,7 @@ class Viewers(Protocol):
 
 
 class Player:
-    """All the work of a session, on one thread: a playback needs no locks."""
+    """Does the work of a session on one thread, so that the playback needs no locks."""
 
     def __init__(self, playback: Playback, session: Session, viewers: Viewers) -> None:
         self._playback = playback
@@ -690,7 +706,7 @@ class Player:
         self._shows_again = False
 
     def run(self) -> None:
-        """Do what is requested until the session is stopped."""
+        """Perform requests until the session is stopped."""
         try:
             while not (requests := self._session.next_requests(PERIOD_S, is_due=self._shows_again)).stop:
                 try:
@@ -721,7 +737,10 @@ class Player:
             self._resend(requests.topics)
 
     def _evaluate(self, edited: EditedFiles) -> bool:
-        """Evaluate the whole log with other constants; after an error, restore the former values."""
+        """Evaluate the whole log with other constants, and return whether that succeeded.
+
+        After an error, viewers get the former values.
+        """
         before = self._playback.evaluated
         try:
             self._playback.evaluated = edited.loaded.evaluate(edited)
@@ -736,7 +755,7 @@ class Player:
         return True
 
     def _point_at(self, arrow: str) -> bool:
-        """Choose the result that the arrow is about; say whether there is such a one."""
+        """Point the arrow at a result, and return whether that result exists."""
         try:
             self._playback.evaluated.evaluation.check_arrow(arrow)
         except UsageError as error:
@@ -748,9 +767,9 @@ class Player:
         return True
 
     def _seek(self, time_ns: int) -> None:
-        """Send what is shown at a time, and go on from there.
+        """Show a time and continue from it.
 
-        A viewer that drops messages later than that is sent them once more while it is paused.
+        Some viewers drop messages only some time after a jump, so a paused playback sends them once more.
         """
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._show(time_ns)
@@ -758,9 +777,9 @@ class Player:
         self._shows_again = True
 
     def _show(self, time_ns: int) -> None:
-        """Send what is shown at a time, after viewers have dropped what they had.
+        """Send the messages of a time, after making viewers drop earlier ones.
 
-        They do so when time steps back, or at a state that says that it jumped. Times overtake messages.
+        Viewers drop messages when time steps back, or at a state with `did_seek`. Times overtake messages.
         """
         self._viewers.send_time(self._playback.start_ns)
         self._viewers.send_time(time_ns)
@@ -771,7 +790,7 @@ class Player:
         self._viewers.send_time(time_ns)
 
     def _resend(self, topics: Collection[str]) -> None:
-        """Send again what is shown of some topics."""
+        """Send the present messages of some topics again."""
         time_ns = self._playback.time_ns
         if CURVES_TOPIC in topics:
             self._send_curves(time_ns)
@@ -780,13 +799,13 @@ class Player:
         self._viewers.send_time(time_ns)
 
     def _send_curves(self, time_ns: int) -> None:
-        """Send the curves of the whole log; viewers drop them whenever they go to another time."""
+        """Send the curves of the whole log, which viewers drop at each jump."""
         if self._viewers.wants(CURVES_TOPIC):
             curves = [self._playback.evaluated.curves]
             self._viewers.publish(messages_of(CURVES_CHANNEL, np.array([time_ns]), curves, 0))
 
     def _play_on(self) -> None:
-        """Send what has come since the last turn, if it plays."""
+        """Send the messages since the last turn, if the log plays."""
         span = self._session.play_up_to(self._playback.reach_ns(_MOST_SAMPLES))
         if span is None:
             return

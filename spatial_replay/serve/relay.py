@@ -1,4 +1,4 @@
-"""Who may connect to a server, and the relay through which all do."""
+"""Access control of a server, and the relay through which all viewers connect."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from urllib.parse import parse_qs, urlsplit
 from spatial_replay.errors import UsageError
 
 VIEWERS: Final = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
-"""Where viewers come from: Foxglove in a browser, and programs whose pages lie on this machine."""
+"""Origins of viewers: Foxglove in a browser, and programs whose pages are local files."""
 
 _TOKEN_BYTES: Final = 16
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only programs on this machine reach a host."""
+    """Return whether a host is reachable only from this machine."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -33,11 +33,11 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Fields of requests.
+    """Access rules for requests.
 
     Attributes:
-        origins: of pages that may connect, besides those of this machine.
-        token: what requests have to carry, as in `?token=…`; None for nothing.
+        origins: origins of pages that may connect, in addition to pages of this machine.
+        token: token that each request must carry as `?token=…`; None if none is needed.
     """
 
     origins: frozenset[str]
@@ -48,7 +48,7 @@ class Gate:
         """Return the gate of a server, with a new token if other machines can reach it.
 
         Raises:
-            UsageError: a text that is no origin.
+            UsageError: an origin is malformed.
         """
         allowed = set(VIEWERS)
         for origin in origins:
@@ -61,17 +61,19 @@ class Gate:
         return cls(frozenset(allowed), None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES))
 
     def refusal(self, head: bytes) -> str | None:
-        """Return the status that answers a request that may not come in; None for one that may."""
+        """Return the HTTP status for a refused request; None for an accepted one."""
         request, *lines = head.decode("latin-1").split("\r\n")
         split = (line.partition(":") for line in lines)
         fields = [(name.strip().lower(), value.strip()) for name, _, value in split]
         words = request.split(" ")
         if len(words) != 3 or words[0] != "GET" or dict(fields).get("upgrade", "").lower() != "websocket":
             return "426 Upgrade Required"
+        # browsers name the origin of a page, other programs name none: RFC 6454, section 7
         if not all(self._is_allowed(value) for name, value in fields if name == "origin"):
             return "403 Origin Not Allowed"
         if self.token is not None:
             token = parse_qs(urlsplit(words[1]).query).get("token", [""])[0]
+            # in constant time, so that the response time tells nothing about the token
             if not hmac.compare_digest(token.encode(), self.token.encode()):
                 return "401 Token Missing Or Wrong"
         return None
@@ -94,10 +96,10 @@ _MOST_HEAD: Final = 1 << 16
 _PIECE: Final = 1 << 16
 _MOST_CONNECTIONS: Final = 64
 _PATIENCE_S: Final = 10.0
-"""How long a viewer may take for its request, and to read what is waiting for it."""
+"""Timeout of a viewer's request, and of each wait for a viewer that does not read, seconds."""
 
 _MOST_TEXT: Final = 1 << 20
-"""Bytes of a request that is read before it is passed on."""
+"""Limit of a text message that the relay decodes, bytes; longer ones pass unchanged."""
 
 # bits and opcodes in the first byte of a frame: RFC 6455, section 5.2
 _FINAL: Final = 0x80
@@ -105,9 +107,9 @@ _TEXT: Final = 1
 _BINARY: Final = 2
 _CONTROL_REQUEST: Final = 3
 _EXACT_DIGITS: Final = 15
-"""Digits of an integer that every float has exactly."""
+"""Digits up to which every integer is exact as a float."""
 _PLAYBACK_STATE: Final = 5
-"""The first byte of a viewer's request for playback, and of the message with its state."""
+"""First byte of the server's message with the state of the playback."""
 
 
 class Relay:
@@ -124,6 +126,8 @@ class Relay:
         Raises:
             OSError: nothing can listen there.
         """
+        # asyncio takes an empty host for all interfaces:
+        # https://docs.python.org/3/library/asyncio-eventloop.html#asyncio.loop.create_server
         if not host:
             raise OSError("it is empty")
         self._behind, self._gate = behind, gate
@@ -140,7 +144,7 @@ class Relay:
         self.port: int = self._server.sockets[0].getsockname()[1]
 
     def stop(self) -> None:
-        """Close all connections, and listen no more."""
+        """Close all connections and stop listening."""
         asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
         self._end()
 
@@ -162,7 +166,7 @@ class Relay:
         try:
             await self._connect(reader, writer)
         except (OSError, EOFError, TimeoutError, ValueError):
-            pass  # the viewer or the server is gone, or what came is no request
+            pass  # the viewer or the server disconnected, or the request is malformed
         finally:
             self._connections.discard(task)
             writer.transport.abort()
@@ -181,6 +185,7 @@ class Relay:
         offered = {
             protocol.strip() for header in _OFFER.findall(request) for protocol in header.decode().split(",")
         }
+        # the SDK accepts only the name of the newer protocol; an old viewer expects the name that it offered
         is_old = OLD_PROTOCOL in offered
         if is_old and PROTOCOL not in offered:
             request = _OFFER.sub(f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n".encode(), request)
@@ -193,7 +198,7 @@ class Relay:
             writer.write(response)
             viewer = _Viewer(understands_state=not is_old)
             await _until_one_ends(_from_viewer(reader, outer, viewer), _to_viewer(inner, writer, viewer))
-            # what the server said last, such as why it closes
+            # the server's last frames, such as the reason for closing
             await _drain(writer)
         finally:
             outer.transport.abort()
@@ -220,7 +225,7 @@ async def _until_one_ends(*both: Coroutine[Any, Any, None]) -> None:
 
 
 async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
-    """Pass on what a viewer sends, up to its end; numbers of parameters go on as exact texts."""
+    """Pass on a viewer's frames until it disconnects, with numbers of parameters as exact texts."""
     while True:
         frame = await _read_head(reader)
         viewer.understands_state |= frame.kind == (_BINARY, _CONTROL_REQUEST)
@@ -234,16 +239,20 @@ async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWrite
 
 
 def with_exact_numbers(text: bytes) -> bytes:
-    """Return a request with the numbers of its parameters in hexadecimal: the SDK rounds long decimals."""
+    """Return a request with numbers of parameters in hexadecimal, because the SDK rounds long decimals.
+
+    Of 200 random decimals with 16 or 17 digits, the SDK changed the last bit of 24.
+    """
     if b'"setParameters"' not in text:
         return text
     try:
         request = json.loads(text, parse_float=lambda number: float(number).hex(), parse_int=_exact_integer)
         for parameter in request["parameters"]:
+            # the hexadecimal number is a text, which the type would contradict
             if isinstance(parameter["value"], str) and parameter.get("type") == "float64":
                 del parameter["type"]
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        # the SDK says what is wrong with it
+        # the SDK answers with the fault
         return text
     return json.dumps(request).encode()
 
@@ -257,7 +266,7 @@ def _unmask(content: bytes, mask: bytes) -> bytes:
 
 
 def _text_frame(content: bytes) -> bytes:
-    """Return a frame of a client, masked with zeros."""
+    """Return an unsplit text frame of a client, masked with zeros: RFC 6455, sections 5.2 and 5.3."""
     size = len(content)
     if size < 126:
         length = bytes([0x80 | size])
@@ -269,7 +278,10 @@ def _text_frame(content: bytes) -> bytes:
 
 
 async def _to_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
-    """Pass on what the server sends, up to its end."""
+    """Pass on the server's frames until it disconnects.
+
+    States of the playback are skipped until the viewer understands them.
+    """
     while not viewer.understands_state:
         frame = await _read_head(reader)
         is_known = viewer.understands_state or frame.kind != (_BINARY, _PLAYBACK_STATE)
@@ -278,10 +290,12 @@ async def _to_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
 
 
 class _Frame(NamedTuple):
-    """The beginning of a WebSocket frame, and how many bytes follow; neither side splits its messages.
+    """The head of a WebSocket frame. Neither side splits its messages.
 
     Attributes:
-        kind: its opcode, and the first byte of its content, -1 if it has none.
+        begin: bytes of the frame up to the first byte of its content.
+        rest: number of bytes after `begin`.
+        kind: opcode and first byte of the content, -1 for empty content.
     """
 
     begin: bytes
@@ -290,7 +304,7 @@ class _Frame(NamedTuple):
 
     @property
     def is_whole_text(self) -> bool:
-        """Whether it is a text of a client that is not split, and not empty."""
+        """Whether the frame is an unsplit text of a client and is not empty."""
         return self.begin[0] == _FINAL | _TEXT and self.begin[1] & 0x80 > 0 and self.kind[1] >= 0
 
 
@@ -308,7 +322,7 @@ async def _read_head(reader: asyncio.StreamReader) -> _Frame:
 
 
 async def _pass_on(frame: _Frame, reader: asyncio.StreamReader, writer: asyncio.StreamWriter | None) -> None:
-    """Pass on a frame, or leave it out."""
+    """Pass on a frame; without a writer, skip it."""
     if writer is not None:
         writer.write(frame.begin)
     left = frame.rest

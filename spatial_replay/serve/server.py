@@ -1,4 +1,4 @@
-"""The WebSocket server, from its start to its end: the only module that knows the Foxglove SDK."""
+"""The WebSocket server. Only this module uses the Foxglove SDK."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[st
 
 
 def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Replay with other constants; what is shown stays as it is."""
+    """Replay with other constants. Viewers keep the present evaluation."""
     changed = _constants_in(request, evaluated)
     if changed:
         evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed})
@@ -98,7 +98,7 @@ def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, A
 
 
 def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Write what viewers changed, and what the request gives, into the files of the specifications."""
+    """Write constants from viewers and from the request into the specification files."""
     values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
     changed_names = evaluated.loaded.write_constants(values)
     return {
@@ -225,18 +225,18 @@ logging.getLogger("foxglove").addHandler(logging.NullHandler())
 
 _LONGEST_TEXT: Final = 64
 _LONGEST_NOTE: Final = 2_000
-"""The most characters of a duration, and of a note."""
+"""Limits of a parameter's text and of a note, characters."""
 
 _REJECTED: Final = "rejected"
-"""The parameter that says which value was rejected, and why; "" once another one is accepted."""
+"""Name of the parameter with the last rejected value and the reason; "" after an accepted value."""
 
 _HEXADECIMAL: Final = re.compile(r"-?0x[01]\.[0-9a-f]+p[+-][0-9]+")
 
 _MOST_S: Final = 9e9
-"""Seconds of a duration, at most."""
+"""Limit of a duration, seconds; int64 nanoseconds reach 9.2e9 s."""
 
 _STOP_S: Final = 1.0
-"""How long the SDK, which waits for every viewer, may take to stop."""
+"""Timeout of the SDK's `stop`, which waits for every viewer, seconds."""
 
 _STATUS: Final = MappingProxyType(
     {
@@ -254,10 +254,10 @@ _CAPABILITIES: Final = (
 
 
 class PublishingServer:
-    """A server that viewers connect to over WebSocket, for messages while they are made.
+    """A WebSocket server that sends new messages to viewers.
 
-    No method waits for a viewer, or fails because of one. A viewer that reads too slowly loses the oldest
-    messages; one that reads nothing is disconnected.
+    No method waits for a viewer or fails because of one. A slow viewer loses the oldest messages. A viewer
+    that reads nothing is disconnected.
     """
 
     def __init__(
@@ -266,12 +266,12 @@ class PublishingServer:
         """Listen.
 
         Args:
-            channels: those known before; others are added with their first message.
-            port: 0 for any that is free.
-            origins: of pages that may connect, besides viewers' own and those of this machine.
+            channels: channels that are known at the start; others are added with their first message.
+            port: TCP port; 0 for any free port.
+            origins: origins of pages that may connect, in addition to `VIEWERS` and pages of this machine.
 
         Raises:
-            UsageError: nothing can listen there, or a text that is no origin.
+            UsageError: the address cannot be used, or an origin is malformed.
         """
         self._gate = Gate.of(host, origins)
         self._context = foxglove.Context()
@@ -305,12 +305,12 @@ class PublishingServer:
 
     @property
     def address(self) -> str:
-        """The address that viewers connect to, with the token that it takes from other machines."""
+        """The address that viewers connect to, with its token if other machines can reach the server."""
         token = "" if self._gate.token is None else f"/?token={self._gate.token}"
         return f"ws://{self._host}:{self._relay.port}{token}"
 
     def stop(self) -> None:
-        """Disconnect all viewers; one that does not respond is waited for only briefly."""
+        """Disconnect all viewers, and wait at most `_STOP_S` for their responses."""
         stopping = Thread(target=self._server.stop, daemon=True)
         stopping.start()
         stopping.join(_STOP_S)
@@ -319,7 +319,7 @@ class PublishingServer:
             channel.close()
 
     def wants(self, topic: str) -> bool:
-        """Say whether a viewer has subscribed to a topic."""
+        """Return whether a viewer has subscribed to a topic."""
         return any(sent.has_sinks() for channel, sent in self._channels.items() if channel.topic == topic)
 
     def publish(self, messages: Messages) -> None:
@@ -339,7 +339,7 @@ class PublishingServer:
         self._server.broadcast_time(time_ns)
 
     def send_note(self, note: Note) -> None:
-        """Send a note."""
+        """Send a note, shortened to `_LONGEST_NOTE`."""
         self._server.publish_status(note.text[:_LONGEST_NOTE], foxglove.StatusLevel.Error, note.about)
 
     def remove_note(self, about: str) -> None:
@@ -348,11 +348,11 @@ class PublishingServer:
 
     @property
     def _server(self) -> protocol.WebSocketServer:
-        """The server; a fast viewer may send a request before the SDK has returned it."""
+        """The SDK's server. A fast viewer may send a request before `start_server` returns it."""
         return self._started.result()
 
     def _options(self) -> dict[str, Any]:
-        """Return what distinguishes the server from others, as the SDK takes it."""
+        """Return the keyword arguments of `foxglove.start_server` that differ between servers."""
         raise NotImplementedError
 
     def _advertise(self, channel: Channel) -> None:
@@ -376,7 +376,7 @@ class PublishingServer:
 
 
 class LiveServer(PublishingServer, protocol.ServerListener):
-    """A session that viewers connect to; their requests come on threads of the SDK."""
+    """The server of a session. Viewers' requests arrive on threads of the SDK."""
 
     def __init__(
         self,
@@ -390,19 +390,19 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         """Listen.
 
         Args:
-            questions: those of viewers to the services.
+            questions: queue of requests to the services.
             channels: all channels that may have messages.
-            port: 0 for any that is free.
+            port: TCP port; 0 for any free port.
 
         Raises:
-            UsageError: nothing can listen there.
+            UsageError: the address cannot be used, or an origin is malformed.
         """
         self._session, self._questions = session, questions
         self._rejected = ""
         super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
 
     def send_note(self, note: Note) -> None:
-        """Send a note. Some viewers keep notes, so rejected values are in a parameter."""
+        """Send a note. Some viewers keep notes, so a rejected value is sent as the parameter `rejected`."""
         if note.about not in (CONSTANTS, ARROW):
             super().send_note(note)
         elif note.text != self._rejected:
@@ -418,20 +418,20 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
-        """Send the state of the playback, if it is not the reply to a viewer."""
+        """Send the state of the playback to all viewers; replies to a request take another way."""
         self._server.broadcast_playback_state(_playback_state(state, None))
 
     def send_values(self, values: Values) -> None:
-        """Send the constants, if they are not the reply to a viewer."""
+        """Send the constants to all viewers; replies to a request take another way."""
         self._server.publish_parameter_values(_constants(values))
 
     def send_playback(self) -> None:
-        """Send the parameters of the playback, if they are not the reply to a viewer."""
+        """Send the parameters of the playback to all viewers; replies to a request take another way."""
         self._server.publish_parameter_values(_parameters(self.steering))
 
     @property
     def steering(self) -> Mapping[str, float | str | bool]:
-        """The parameters that are no constants."""
+        """All parameters except constants."""
         return {**self._session.playback, ARROW: self._session.arrow, _REJECTED: self._rejected}
 
     def ask(
@@ -439,7 +439,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         compute: Callable[[Evaluated, Mapping[str, Any]], Mapping[str, Any]],
         request: Mapping[str, Any],
     ) -> Mapping[str, Any]:
-        """Compute something from what is shown, in its turn among the questions of all viewers."""
+        """Compute a response from the present evaluation, after the earlier questions of all viewers."""
         return self._questions.ask(lambda evaluated: compute(evaluated, request))
 
     def steer(self, name: str, value: float | bool) -> Mapping[str, float | bool]:
@@ -519,7 +519,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
 
 
 class RunServer(PublishingServer, protocol.ServerListener):
-    """A server of a run that goes on: late viewers get the last message of a topic, and a service fires."""
+    """A server of a live run. Late viewers get each topic's last message, and a service fires triggers."""
 
     def __init__(
         self,
@@ -532,7 +532,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
         """Listen; see `PublishingServer`.
 
         Args:
-            fire: what the service `trigger` calls with a reason; None for no service.
+            fire: function that the service `trigger` calls with a reason; None for no service.
         """
         self._fire = fire
         self._latest: dict[int, tuple[foxglove.Channel, int, list[bytes]]] = {}
@@ -540,7 +540,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
         super().__init__("spatial-replay: live", channels, host, port, origins)
 
     def publish(self, messages: Messages) -> None:
-        """Send messages; channels that are new are offered first."""
+        """Send messages, after offering their new channels."""
         for channel in messages.channels.values():
             if channel not in self._channels:
                 self._advertise(channel)
@@ -560,7 +560,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
         """Send the last messages of a channel again, at the time of the newest sample if there is one."""
         latest = None
-        # newer ones may come while these are sent
+        # `publish` may store newer messages on another thread while these are sent
         while latest is not self._latest.get(channel.id):
             latest = self._latest[channel.id]
             sent, time_ns, payloads = latest
@@ -576,7 +576,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
 
 
 def _is_state(channel: Channel) -> bool:
-    """Return whether the last message of a channel says all; no event and no frame of a video does."""
+    """Return whether a channel's last message is its whole state, unlike an event or a frame of a video."""
     schema = "" if channel.schema is None else channel.schema.name
     return channel.topic not in (EVENTS, EVENT_LOG) and not schema.endswith("Video")
 
@@ -627,7 +627,7 @@ def _json_service(
 
 
 class _FailureError(Exception):
-    """Why a service fails; viewers are shown the name of the class before the reason."""
+    """The failure of a service. The SDK writes the qualified name of the class before the reason."""
 
     __qualname__ = "failed"
 
@@ -645,7 +645,7 @@ def _constants(values: Values) -> list[Parameter]:
 
 
 def _in_seconds(values: Values) -> dict[str, float]:
-    """Return constants as viewers have them, who type no quotes: durations are seconds."""
+    """Return constants with durations as numbers of seconds, because viewers type no quotes."""
     return {
         name: duration_ns_from_text(value) / 1e9 if isinstance(value, str) else value
         for name, value in values.items()
@@ -656,11 +656,11 @@ def _value(parameter: Parameter) -> float | str | bool:
     """Return the value that a viewer sets.
 
     Raises:
-        UsageError: neither a number nor a short text, true or false.
+        UsageError: the value is not a number, a short text, true or false.
     """
     value = parameter.get_value()
     if isinstance(value, str) and _HEXADECIMAL.fullmatch(value):
-        # the relay sends numbers so
+        # the relay sends numbers in hexadecimal, see `with_exact_numbers`
         return float.fromhex(value)
     if isinstance(value, bool) or (isinstance(value, str) and len(value) <= _LONGEST_TEXT):
         return value
@@ -670,10 +670,10 @@ def _value(parameter: Parameter) -> float | str | bool:
 
 
 def _stored_values(values: Mapping[str, float | str | bool], present: Values) -> Values:
-    """Return values of constants as a specification has them: seconds of a duration as a text.
+    """Return values of constants as in a specification, with durations as texts instead of seconds.
 
     Raises:
-        UsageError: one is true or false.
+        UsageError: a value is true or false.
     """
     values_by_name: dict[str, float | str] = {}
     for name, value in values.items():
@@ -692,9 +692,9 @@ def _misfit(name: str, value: object) -> UsageError:
 
 
 def _inner_host() -> str:
-    """Return an address for the SDK behind the relay, where no page that tries ports finds it."""
+    """Return a random loopback address for the SDK, so that no web page finds its port by trying."""
     address = f"127.{'.'.join(str(1 + secrets.randbelow(254)) for _ in range(3))}"
-    # of the loopback network, some systems have one address alone
+    # some systems, such as macOS, have only one loopback address
     return address if _is_own(address) else "127.0.0.1"
 
 
@@ -706,7 +706,7 @@ def _is_v6(host: str) -> bool:
 
 
 def _is_own(host: str) -> bool:
-    """Say whether an address belongs to this machine: a server could listen there, at some port."""
+    """Return whether an address belongs to this machine, by binding a socket to it."""
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, number) as probe:
@@ -718,10 +718,10 @@ def _is_own(host: str) -> bool:
 
 LOOPBACK = "127.0.0.1"
 PORT = 8765
-"""The port that viewers connect to by default."""
+"""Default port of viewers and servers."""
 
 _LAST_S = 0.25
-"""How long a running evaluation is waited for at the end."""
+"""Timeout of a running evaluation at the end, seconds."""
 
 
 @dataclass(frozen=True)
@@ -729,7 +729,7 @@ class Serving:
     """A running server.
 
     Attributes:
-        address: the address that viewers connect to: ws://127.0.0.1:8765.
+        address: address that viewers connect to, such as ws://127.0.0.1:8765.
     """
 
     address: str
@@ -738,7 +738,7 @@ class Serving:
     _server: LiveServer
 
     def wait(self) -> None:
-        """Wait until the server ends, which happens only through an error, and raise that."""
+        """Wait for the error that ends the server, and raise it."""
         self._loop.result()
 
     def check(self) -> None:
@@ -752,13 +752,13 @@ class Serving:
         return self._session.edited
 
     def show_specifications(self, files: Sequence[Specification]) -> Evaluated:
-        """Evaluate specifications that were saved, show viewers what they give, and return it.
+        """Evaluate saved specifications, show viewers the evaluation, and return it.
 
-        Constants that viewers changed keep their values, unless the text changed them, too. After an error
-        what was shown before stays, and viewers are shown the error.
+        A constant that a viewer changed keeps the viewer's value, unless its file changed, too. After an
+        error, viewers keep the former evaluation and see the error.
 
         Raises:
-            SpatialReplayError: it cannot be evaluated over this log.
+            SpatialReplayError: the specifications cannot be evaluated over this log.
         """
         try:
             loaded = self.edited.loaded.with_files(files)
@@ -773,7 +773,7 @@ class Serving:
         return evaluated
 
     def show_error(self, error: SpatialReplayError) -> None:
-        """Show viewers why a specification that was saved cannot be evaluated."""
+        """Show viewers the error of a saved specification."""
         self._server.send_note(Note(SPECIFICATION, str(error)))
 
 
@@ -789,14 +789,14 @@ def open_server(
     """Serve a log to viewers, which play it and change the constants of its specifications.
 
     Args:
-        evaluated: the evaluation to show first, with the constants as they are written.
-        host: the address to listen at; from beyond this machine, the address with its token is needed.
-        port: 0 for any that is free.
-        play: play at once; otherwise wait at the start for a viewer to do so.
-        origins: of web pages that may connect, besides those of Foxglove and of this machine.
+        evaluated: the evaluation to show first, with the constants of the files.
+        host: address to listen at. Viewers on other machines need the token in the printed address.
+        port: TCP port; 0 for any free port.
+        play: whether to play at once; otherwise a viewer starts the playback.
+        origins: origins of web pages that may connect, in addition to Foxglove and pages of this machine.
 
     Raises:
-        UsageError: nothing can listen there, or a text that is no origin.
+        UsageError: the address cannot be used, or an origin is malformed.
         LogError: the log cannot be read.
     """
     playback = Playback(evaluated)
@@ -818,7 +818,7 @@ def open_server(
 
 
 def _in_background(work: Callable[[], None], name: str) -> Future[None]:
-    """Do work on a daemon thread, which the end of the process does not wait for."""
+    """Do work on a daemon thread, so that the end of the process does not wait for it."""
     ended: Future[None] = Future()
 
     def run() -> None:
