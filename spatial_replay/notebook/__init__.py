@@ -1,7 +1,7 @@
-"""Values in notebooks: `html` shows one as a cell's output, `plot` draws one with matplotlib.
+"""Values in notebooks: `html` returns a cell's output, `plot` draws with matplotlib.
 
-Both dispatch on the type of the value. A view is imported when a value of its type is shown for the first
-time, so that showing a formula loads neither the planner nor matplotlib.
+Both dispatch on the type of the value. Each view is imported with the first value of its types. So a
+formula as HTML loads neither the planner nor matplotlib.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.tuning.tuned": "study_view",
     }
 )
-"""The view that registers the types of a module, relative to this package; a room above has its own."""
+"""Views by the module whose types they register, relative to this package.
+
+Packages that import this one register their own views."""
 
 
 @singledispatch
@@ -37,7 +39,7 @@ def html(value: Any) -> str:
     """Return a value as HTML for a notebook's cell.
 
     Raises:
-        UsageError: there is no view of values of that type.
+        UsageError: the type has no view.
     """
     return str(_after_loading_view(html, value)(value))
 
@@ -52,7 +54,7 @@ def plot(value: Any, *args: Any, **options: Any) -> Any:
     """Draw a value with matplotlib and return the axes.
 
     Raises:
-        UsageError: there is no view of values of that type, or matplotlib is not installed.
+        UsageError: the type has no view, or matplotlib is not installed.
     """
     return _after_loading_view(plot, value)(value, *args, **options)
 

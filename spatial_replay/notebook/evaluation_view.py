@@ -1,4 +1,4 @@
-"""Formulas, traces, evaluations and automata in notebooks: as HTML, as figures and as tables."""
+"""Formulas, traces, evaluations and automata in notebooks, as HTML, figures and tables."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MOST_FORMULAS: Final = 200
-"""The most nodes in a table."""
+"""Limit of nodes in a table."""
 _MOST_DRAWN: Final = 60
-"""The most nodes in a figure."""
+"""Limit of nodes in a figure."""
 _DEEPEST: Final = 40
-"""The most levels that a table indents."""
+"""Limit of indented levels in a table."""
 _ROW_GAP: Final = 0.6
-"""Distance of two trees in a figure, in rows."""
+"""Gap between two trees in a figure, rows."""
 _PAPER: Final = (0.95, 0.95, 0.95)
 
 
 @html.register(Specification)
 def specification_html(specification: Specification) -> Html:
-    """Return the declarations of a specification, and the trees of its results."""
+    """Return a specification's declarations, the trees of its results and its first five warnings."""
     title = element("b", specification.filename)
     results = specification.results
     about = quiet(f" {plural(len(results), 'result')}, profile {specification.profile}")
@@ -65,7 +65,7 @@ def specification_html(specification: Specification) -> Html:
 
 
 def _formula_trees(results: Sequence[NamedSpec]) -> Html:
-    """Return the trees one below the other, up to the most nodes."""
+    """Return the trees one below the other, with `_MOST_FORMULAS` nodes at most."""
     left = _MOST_FORMULAS
     rows: list[tuple[str]] = []
     for spec in results:
@@ -88,7 +88,13 @@ def _left_out(results: Sequence[NamedSpec], rows: int) -> Html:
 
 
 class _Place(NamedTuple):
-    """The position of a node, in levels to the right and rows down, and that of its parent."""
+    """A node in a drawing.
+
+    Attributes:
+        x: level from the left.
+        y: row from the top.
+        above: x and y of its parent; None for a root.
+    """
 
     node: Formula
     x: float
@@ -98,7 +104,7 @@ class _Place(NamedTuple):
 
 @plot.register(Specification)
 def draw_specification(specification: Specification, ax: Axes | None = None) -> Axes:
-    """Draw the trees of a specification's results, roots to the left.
+    """Draw the trees of a specification's results, with the roots on the left.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -123,7 +129,7 @@ def draw_specification(specification: Specification, ax: Axes | None = None) -> 
 
 
 def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
-    """Iterate over the positions of the first nodes, one tree below the other."""
+    """Yield the first `_MOST_DRAWN` nodes with their positions, one tree below the other."""
     left, first_row = _MOST_DRAWN, 0.0
     for spec in results:
         nodes = list(islice(iter_nodes(spec.formula), left))
@@ -138,7 +144,10 @@ def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
 
 
 def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float], int]:
-    """Return the row of each node, leaves one by one and parents amid their children; and how many rows."""
+    """Return the row of each node, and the number of rows.
+
+    Each leaf has its own row. Parents are halfway between their first and their last child.
+    """
     below: list[list[int]] = [[] for _ in parents]
     for identifier, parent in enumerate(parents):
         if parent is not None:
@@ -147,7 +156,7 @@ def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float],
     leaves = [identifier for identifier, operands in enumerate(below) if not operands]
     for number, leaf in enumerate(leaves):
         rows[leaf] = first_row + number
-    # parents come before their children, so that in reverse all children have their row
+    # `iter_nodes` yields parents first, so that the reverse order places children before their parents
     for identifier in reversed(range(len(parents))):
         if below[identifier]:
             rows[identifier] = (rows[below[identifier][0]] + rows[below[identifier][-1]]) / 2
@@ -175,18 +184,18 @@ def _size(results: Sequence[NamedSpec]) -> int:
 
 _MOST_ROWS: Final = 40
 _MOST_POINTS: Final = 2_000
-"""The most objects of a cell's table, and points of a trail."""
+"""Limits of objects in a table, and of points in a trail."""
 
 _MOST_LABELS: Final = 25
 _NAME_SIZE: Final = 8.0
-"""Font size of object names, in points."""
+"""Font size of object names, points."""
 _STEPS: Final = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6, 4.8, -4.8)
-"""How far a name may be above its place, in multiples of its size."""
+"""Offsets of a name above its object, in the order of preference, as multiples of the font size."""
 
 
 @html.register(Trace)
 def trace_html(trace: Trace) -> Html:
-    """Return how long a trace is, and in how many samples each object is."""
+    """Return the length of a trace, and the number of samples of each object."""
     counts = (trace.rows >= 0).sum(axis=0).tolist()
     rows = [(name, f"{count:,}") for name, count in zip(trace.names, counts, strict=True) if count]
     more = [quiet(f"… and {len(rows) - _MOST_ROWS:,} objects more")] if len(rows) > _MOST_ROWS else []
@@ -197,11 +206,11 @@ def trace_html(trace: Trace) -> Html:
 
 @plot.register(Trace)
 def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specification | None = None) -> Axes:
-    """Draw the scene from above: each object's outline at its start (dashed) and end (filled), and its trail.
+    """Draw each object's trail from above, with its outlines at the start (dashed) and at the end (filled).
 
     Args:
-        ax: axes to draw into; new ones without.
-        specification: whose regions are drawn, too.
+        ax: axes to draw into; None for a new figure.
+        specification: specification whose regions are drawn, too.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -237,12 +246,14 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
 
 
 def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
-    """Write names at places (x, y, name), each above or below its place if another one is there already."""
+    """Write names at ends (x, y, name). A name moves up or down if an earlier name is in its way."""
+    # the transformation is final only after the aspect is applied
     ax.apply_aspect()
     inches = ax.transData + ax.figure.dpi_scale_trans.inverted()
     labels: list[tuple[float, float, float]] = []
     for x, y, name in ends:
         across, up = (72.0 * inches.transform((x, y))).tolist()
+        # estimated half width: 0.6 of the font size per character
         half = 0.3 * _NAME_SIZE * len(name)
         for step in _STEPS:
             is_free = all(
@@ -272,12 +283,12 @@ def _trace_title(trace: Trace) -> str:
 
 
 def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
-    """Return the outlines of one observation."""
+    """Return the outlines of the observation in the only row."""
     return rings_of(trace.footprints.select(rows), 0.0).rings_of(0)
 
 
 def _centres(trace: Trace, rows: Integers) -> Floats:
-    """Return (R, 2) the middle of each observation's bounding box."""
+    """Return (R, 2), the centre of each observation's bounding box."""
     rings = rings_of(trace.footprints.select(rows), 0.0)
     begins = np.asarray(rings.start)[: len(rows)]
     low, high = (reduce.reduceat(rings.points, begins, axis=0) for reduce in (np.minimum, np.maximum))
@@ -289,7 +300,7 @@ def data_frame(value: Any) -> Any:
     """Return a value as a DataFrame.
 
     Raises:
-        UsageError: pandas is not installed, or what it would hold was not kept.
+        UsageError: the type has no DataFrame, its series were not stored, or pandas is not installed.
     """
     raise UsageError(f"there is no DataFrame of a {type(value).__name__}")
 
@@ -303,13 +314,13 @@ def _of_evaluation(evaluation: Evaluation) -> Any:
         for result in evaluation.results
     ]
     frame = pandas.DataFrame(rows, columns=[*RESULT_COLUMNS, "doubts"])
-    # times are whole numbers, or missing
+    # pandas' nullable integers: a missing time would turn the other times into floats, which lose nanoseconds
     return frame.astype({"verdict": str} | dict.fromkeys(RESULT_TIMES, "Int64"))
 
 
 @data_frame.register
 def _of_result(result: SpecResult) -> Any:
-    """Return a row for each sample, and four columns for each node."""
+    """Return a row for each sample, with four columns for each node."""
     pandas = _pandas()
     if not result.has_series:
         raise UsageError(
@@ -332,22 +343,22 @@ def _pandas() -> Any:
 
 _MOST_RESULTS: Final = 50
 _MOST_NODES: Final = 300
-"""The most nodes in the trees of all results together."""
+"""Limit of nodes in the trees of all results together."""
 _MOST_PANELS: Final = 8
 _MOST_CURVES: Final = 6
-"""The most curves in a panel, including that of the result."""
+"""Limit of curves in a panel, including the result's curve."""
 _WIDTH, _HEIGHT = 8.0, 2.4
-"""Size of a panel, in inches."""
+"""Size of a panel, inches."""
 _LONGEST_NAME: Final = 24
 _SHADE: Final = 0.15
-"""Opacity of the band."""
+"""Opacity of the robustness interval."""
 _GAP: Final = 0.11
-"""Least distance of two labels, as a fraction of the height of a panel."""
+"""Least distance of two labels, fraction of the panel's height."""
 
 
 @html.register(Evaluation)
 def evaluation_html(evaluation: Evaluation) -> Html:
-    """Return the verdict, a table of results, and a tree of each with its final numbers."""
+    """Return the verdict, the table of results, and each result's tree with its final numbers."""
     name = element("b", evaluation.specification.filename)
     title = element("div", name, " ", verdict_mark(evaluation.verdict))
     worst = _worst_of(evaluation.results, _MOST_RESULTS)
@@ -358,7 +369,7 @@ def evaluation_html(evaluation: Evaluation) -> Html:
 
 @html.register(SpecResult)
 def result_html(result: SpecResult) -> Html:
-    """Return a result as a table, and its tree with the final numbers."""
+    """Return a result's row in a table, and its tree with the final numbers."""
     return element("div", _results_table([result]), *_trees([result]))
 
 
@@ -381,7 +392,7 @@ def _first_satisfied_text(result: SpecResult) -> str:
 
 
 def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
-    """Iterate over the trees of results, up to the most nodes."""
+    """Yield the trees of results, with `_MOST_NODES` nodes at most."""
     left = _MOST_NODES
     for result in results:
         if left <= 0:
@@ -403,7 +414,7 @@ def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
 
 
 def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
-    """Return the results, or the `most` worst ones if there are more."""
+    """Return the `most` worst results, or all results in their order if they are fewer."""
     if len(results) <= most:
         return results
     return [results[place] for place in worst_first(results)[:most]]
@@ -419,13 +430,13 @@ class _Curve(NamedTuple):
 
 @plot.register(Evaluation)
 def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = None) -> tuple[Axes, ...]:
-    """Draw each result in its own axes, one below the other; of many results, the worst ones.
+    """Draw each result in its own axes, one below the other.
 
     Args:
-        ax: axes to draw into, one for each result.
+        ax: axes to draw into, one for each result; None for a new figure with the eight worst results.
 
     Raises:
-        UsageError: more or fewer axes than results, or matplotlib is not installed.
+        UsageError: the number of axes differs from the number of results, or matplotlib is not installed.
     """
     if ax is not None:
         axes = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
@@ -444,7 +455,6 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
 
 
 def _draw_results(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tuple[Axes, ...]:
-    """Draw each result in its axes."""
     if len(results) != len(panels):
         count = plural(len(results), "result")
         raise UsageError(f"ax has {len(panels)} axes for {count}; give one for each, or draw one result")
@@ -455,7 +465,7 @@ def _draw_results(results: Sequence[SpecResult], panels: tuple[Axes, ...]) -> tu
 
 @plot.register(SpecResult)
 def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
-    """Draw the robustness of a result over time, its interval of possible values, and that of named parts.
+    """Draw a result's robustness over time, its interval of possible values, and curves of named specs.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -474,7 +484,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
         color=curves[0].colour, alpha=_SHADE, linewidth=0,
     )  # fmt: skip
     for number, curve in enumerate(curves):
-        # the result's curve is thicker, so that it shows below an equal one of a part
+        # the result's curve is thicker, so that it stays visible below an equal curve of a named spec
         ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 3.0)
     _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
@@ -485,12 +495,12 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
 
 
 def _curves(result: SpecResult) -> list[_Curve]:
-    """Return the curve of a result, and those of the first named specs in it."""
+    """Return the curves of a result and of the first named specs in it."""
     colours = {Verdict.SATISFIED: POSITIVE, Verdict.VIOLATED: NEGATIVE}
     verdict_colour = hexadecimal(colours.get(result.verdict, NEUTRAL))
     named = {node.name: number for number, _, node in reversed(list(iter_nodes(result.formula))) if node.name}
     parts = sorted((number, name) for name, number in named.items() if number)
-    # the first two colours stand for satisfied and violated
+    # the first two colours mean satisfied and violated
     others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
     return [
         _Curve(result.title, _finite(result, 0), verdict_colour),
@@ -499,13 +509,13 @@ def _curves(result: SpecResult) -> list[_Curve]:
 
 
 def _finite(result: SpecResult, node: int) -> Floats:
-    """Return the value of a node, NaN where it is infinite."""
+    """Return the values of a node, with NaN instead of infinite ones."""
     values = result.series[node, 0]
     return np.where(np.isfinite(values), values, np.nan)
 
 
 def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
-    """Return the least and the greatest robustness of a panel, which always shows 0."""
+    """Return the limits of a panel's robustness axis, which always includes 0."""
     values = np.concatenate([[0.0], *(curve[~np.isnan(curve)] for curve in curves)])
     low, high = float(values.min()), float(values.max())
     margin = 0.1 * (high - low) or 1.0
@@ -513,7 +523,7 @@ def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
 
 
 def _name_curves(ax: Axes, curves: Sequence[_Curve], has_band: bool) -> None:
-    """Write the name of each curve to its right, and that of the band below, without overlap."""
+    """Write each curve's name to its right, and the name of the interval at the bottom, without overlap."""
     low, high = ax.get_ylim()
     ends = [(_last(curve.values) - low) / (high - low) for curve in curves]
     *places, bottom = _apart([*ends, 0.0])
@@ -537,13 +547,13 @@ def _draw_key(
 
 
 def _last(values: Floats) -> float:
-    """Return the last number of a curve; 0 without one."""
+    """Return the last finite number of a curve; 0 if it has none."""
     finite = values[~np.isnan(values)]
     return float(finite[-1]) if len(finite) else 0.0
 
 
 def _apart(places: Sequence[float]) -> list[float]:
-    """Return places moved apart, in their order, by at least the gap, and none above 1."""
+    """Move places apart to a distance of at least `_GAP`, keeping their order and staying below 1."""
     apart = list(places)
     order = sorted(range(len(places)), key=places.__getitem__)
     below = -np.inf
@@ -562,19 +572,19 @@ def _title(result: SpecResult) -> str:
 
 _MOST_STATES: Final = 40
 _MOST_CUBES: Final = 100
-"""The most states, and cubes on arrows, of an automaton that a cell's output draws."""
+"""Limits of states and of cubes on arrows, up to which a cell's output draws an automaton."""
 _MOST_LINES: Final = 200
-"""The most lines of the list of transitions."""
+"""Limit of lines in the list of transitions."""
 _ARROW: Final = hexadecimal(NEUTRAL)
 _INCH: Final = 72.0
-"""Points of Graphviz in an inch."""
+"""Graphviz' points per inch: https://graphviz.org/docs/outputs/json/"""
 _LONGEST_SIDE: Final = 40.0
-"""The longest side of a figure, in inches."""
+"""Limit of a figure's sides, inches."""
 
 
 @html.register(Automaton)
 def automaton_html(automaton: Automaton) -> Html:
-    """Return the size of an automaton; if it is small, also a drawing and its transitions as text."""
+    """Return the size of an automaton, and for a small one its drawing and its transitions as text."""
     title = element("div", element("b", automaton.name), quiet(f" {size_words(automaton)}"))
     if _is_large(automaton):
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
@@ -588,19 +598,19 @@ def automaton_html(automaton: Automaton) -> Html:
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
-    """Return an automaton as SVG; None if it is large or Graphviz cannot draw it here."""
+    """Return an automaton as SVG; None if it is large, or Graphviz is missing or fails."""
     if _is_large(automaton):
         return None
     try:
         drawing = svg_text(automaton)
     except (UsageError, OutputError):
         return None
-    # the XML declaration and document type before it belong in files, not in pages
+    # a page must not contain the XML declaration and document type that precede the element
     return drawing[drawing.index("<svg") :]
 
 
 def _is_large(automaton: Automaton) -> bool:
-    # the transitions of an automaton with very many states take long to find
+    # listing the transitions of an automaton with very many states takes long
     if len(automaton.states) > _MOST_STATES or not automaton.is_listable:
         return True
     return sum(len(transition.guard) for transition in automaton.transitions) > _MOST_CUBES
@@ -612,7 +622,7 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
 
     Raises:
         UsageError: Graphviz or matplotlib is not installed.
-        OutputError: Graphviz fails, or takes too long.
+        OutputError: Graphviz fails or reaches its timeout.
     """
     short = abbreviate(automaton)
     layout = json.loads(layout_text(short))
@@ -638,7 +648,7 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
 
 
 def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None:
-    """Draw a circle with the number of a state, or the point before the first state, which has none."""
+    """Draw a circle with the number of a state, or the unnumbered point before the initial state."""
     x, y = _point(node["pos"])
     radius = float(node["width"]) * _INCH / 2
     is_state = node["name"].isdecimal()
@@ -651,7 +661,8 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
 
 
 def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
-    """Draw a curve with a head, and the guard beside it."""
+    """Draw a curve with an arrow head, and the guard next to it."""
+    # Graphviz gives the tip of the head first, as e,X,Y: https://graphviz.org/docs/attr-types/splineType/
     head, *points = (_point(point.removeprefix("e,")) for point in edge["pos"].split())
     draw_curve(ax, points, _ARROW)
     ax.annotate(

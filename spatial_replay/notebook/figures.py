@@ -1,4 +1,4 @@
-"""Figures for notebooks, drawn by matplotlib, which loads with the first of them."""
+"""Figures for notebooks. The first figure imports matplotlib."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
 
 INK: Final = "#24292f"
-"""Colour of text on light colours, in any style of page."""
+"""Colour of text on light backgrounds, in light and dark pages."""
 
 
 def new_panels(
@@ -37,7 +37,10 @@ def new_panels(
 
 
 def new_panel(size: tuple[float, float]) -> Axes:
-    """Return the only axes of a new figure with this width and height in inches.
+    """Return the axes of a new figure with one panel.
+
+    Args:
+        size: width and height of the figure in inches.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -46,14 +49,15 @@ def new_panel(size: tuple[float, float]) -> Axes:
 
 
 def picture(ax: Axes, kind: Literal["png", "svg"]) -> bytes:
-    """Return the figure of some axes as a file, and close it; equal figures give equal bytes."""
+    """Close the figure of some axes, and return it as the bytes of a file. Equal figures give equal bytes."""
     from matplotlib import pyplot, rc_context
 
     stream, figure = BytesIO(), ax.get_figure(root=True)
     if figure is None:
         raise UsageError("these axes are in no figure; draw into new ones")
+    # ids in an SVG are random without a salt, and its metadata has the time of writing:
+    # https://matplotlib.org/stable/users/explain/customizing.html
     with rc_context({"svg.hashsalt": "spatial-replay"}):
-        # without the time of writing
         figure.savefig(stream, format=kind, dpi=144, metadata={"Date": None} if kind == "svg" else None)
     pyplot.close(figure)
     return stream.getvalue()
@@ -67,7 +71,7 @@ def signed_colours() -> Colormap:
 
 
 def draw_curve(ax: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:
-    """Draw a chain of n cubic Bézier curves, given by 1 + 3n points."""
+    """Draw n joined cubic Bézier curves through 1 + 3n points."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -83,5 +87,5 @@ def draw_disc(ax: Axes, centre: tuple[float, float], radius: float, colour: str)
 
 
 def plain(text: str, longest: int = 72) -> str:
-    """Return text without special meaning for matplotlib, cut after `longest` characters."""
+    """Return text without control characters or formulas of matplotlib, cut after `longest` characters."""
     return printable(text, longest).replace("$", r"\$")

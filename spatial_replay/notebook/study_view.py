@@ -1,4 +1,4 @@
-"""Tuned specifications, differences and decisions of a planner in notebooks, as pages and figures."""
+"""Tuned specifications, comparisons and planner decisions in notebooks, as HTML and figures."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Target
 
 _MOST_RUNS: Final = 50
-"""The most runs in a table."""
+"""Limit of runs in a table."""
 _MOST_LINES: Final = 40
-"""The most runs whose change of verdict is drawn as a line of its own."""
+"""Limit of runs with a line at their change of verdict."""
 _MOST_MARGINS: Final = 10_000
-"""Margins that a picture may take, unless its least resolution takes more."""
+"""Margins that set the resolution of a picture with many runs; the least resolution is 25 values."""
 
 
 @html.register(Tuning)
 def tuning_html(tuning: Tuning) -> Html:
-    """Return the values found, or why there are none, and the runs, the closest first."""
+    """Return the constants found with the runs by margin, or the reason why no constants fit."""
     name = element("b", tuning.specification.filename)
     if tuning.conflict is not None:
         none = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
@@ -81,13 +81,14 @@ def tuning_html(tuning: Tuning) -> Html:
 
 @plot.register(Tuning)
 def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the margins over one or two constants; without names over the first two.
+    """Draw the margins over one or two constants.
 
     Args:
-        points: how many values of each constant; without it as few runs allow, 25 to 60.
+        names: the constants; without names, the first two.
+        points: number of values of each constant; None for 25 to 60, more for fewer runs.
 
     Raises:
-        UsageError: a constant that was not varied; matplotlib is not installed.
+        UsageError: a constant was not varied, or matplotlib is not installed.
     """
     if points is None:
         points = int(np.clip(math.sqrt(_MOST_MARGINS / len(tuning.runs)), 25, 60))
@@ -96,10 +97,10 @@ def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes
 
 @plot.register(Surface)
 def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
-    """Draw where which runs have the right verdict.
+    """Draw the values of constants for which runs have the right verdict.
 
-    One constant gives a curve for each run. Two give the least margin as colours, and for each run a line
-    where its verdict changes, dashed for bad runs. A circle marks the values found.
+    One constant gives a curve for each run. Two constants give the least margin as colours, and a line for
+    each run where its verdict changes. Lines of bad runs are dashed. A circle marks the values found.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -112,7 +113,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
 
 
 def write_surface(tuning: Tuning, output: Path) -> None:
-    """Write the margins over the first two constants as a picture (.png, .svg), or as a page with the values.
+    """Write a picture (.png, .svg) of the margins over the first two constants, or a page (.html) of them.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -144,7 +145,7 @@ def _draw_curves(surface: Surface, ax: Axes) -> None:
 def _draw_colours(surface: Surface, ax: Axes) -> None:
     least = _finite(surface.least)
     most = float(np.abs(least).max()) or 1.0
-    # margins far below 0 would fade what fits, which is often little above
+    # values that fit often have margins little above 0, which margins far below 0 would fade
     most = min(most, 3 * float(least.max())) if least.max() > 0 else most
     mesh = ax.pcolormesh(
         surface.x,
@@ -175,7 +176,7 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
 
 
 def _axis_label(surface: Surface, axis: int) -> str:
-    """Return the label of an axis: the constant, and in which unit it is; numbers are as in the file."""
+    """Return the label of an axis: the constant, with the unit of a duration."""
     return plain(f"{surface.names[axis]} (s)" if surface.durations[axis] else surface.names[axis])
 
 
@@ -187,7 +188,7 @@ def _name_runs(surface: Surface, ax: Axes) -> None:
 
 
 def _finite(margins: Floats) -> Floats:
-    """Return margins with infinite ones in place by the largest finite one."""
+    """Return margins, with infinite ones replaced by the largest finite magnitude."""
     finite = np.abs(margins[np.isfinite(margins)])
     most = float(finite.max()) if len(finite) else 1.0
     clipped: Floats = np.clip(margins, -most, most)
@@ -196,11 +197,11 @@ def _finite(margins: Floats) -> Floats:
 
 _MOST_PANELS: Final = 8
 _WIDTH, _HEIGHT = 8.0, 2.4
-"""Size of a panel, in inches."""
+"""Size of a panel, inches."""
 
 
 class _Pair(NamedTuple):
-    """Two curves, each with its name, over the same time axis."""
+    """Two named curves over the same time axis."""
 
     title: str
     names: tuple[str, str]
@@ -210,14 +211,14 @@ class _Pair(NamedTuple):
 
 @html.register(SpecDiff)
 def spec_diff_html(diff: SpecDiff) -> str:
-    """Return what changed of one spec, in sentences."""
+    """Return the changes of one spec in sentences."""
     first_ns = diff.old.evidence.first_ns()
     return page_of([diff.title, *(f"  {sentence}" for sentence in diff.sentences(first_ns))])
 
 
 @plot.register(SpecificationDiff)
 def draw_specifications(diff: SpecificationDiff) -> tuple[Axes, ...]:
-    """Draw the robustness of each changed spec before and after, one panel each, at most eight.
+    """Draw the robustness of changed specs before and after the edit, in at most eight panels.
 
     Raises:
         UsageError: no spec changed, or matplotlib is not installed.
@@ -238,7 +239,7 @@ def draw_spec(diff: SpecDiff) -> Axes:
 
 @plot.register(LogDiff)
 def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
-    """Draw the robustness of each spec in both runs, as they are aligned, one panel each, at most eight.
+    """Draw the robustness of specs in both aligned runs, in at most eight panels.
 
     Raises:
         UsageError: no spec was evaluated, or matplotlib is not installed.
@@ -272,7 +273,7 @@ def _draw(pairs: Sequence[_Pair]) -> tuple[Axes, ...]:
         ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
         for number in range(2):
             values = np.where(np.isfinite(pair.values[number]), pair.values[number], np.nan)
-            # the first curve is thicker, so that it shows below an equal one
+            # the first curve is thicker, so that it stays visible below an equal second curve
             ax.plot(
                 pair.seconds[number],
                 values,
@@ -289,20 +290,20 @@ def _draw(pairs: Sequence[_Pair]) -> tuple[Axes, ...]:
 
 
 _HATCHES: Final = ("", "////", "xxxx", "....", "oooo")
-"""Hatches of blocked cells, by the number of the reason."""
+"""Hatches of blocked cells, by index in `REASONS`."""
 _BLOCKED: Final = "#e4e4e4"
 _HATCH: Final = "#9a9a9a"
 _MOST_EDGES: Final = 4
 _MOST_CANDIDATES: Final = 4
 _PANEL: Final = 3.4
-"""Side of a panel, in inches."""
+"""Side of a panel, inches."""
 _LINE: Final = 40
-"""Characters in a line of a title."""
+"""Length of a title's line, characters."""
 
 
 @html.register(GradientMap)
 def map_html(gradient: GradientMap) -> Html:
-    """Return the size of a map, its best robustness, and how many cells are blocked for each reason."""
+    """Return the size of a map, its best robustness, and the number of blocked cells by reason."""
     grid = gradient.grid
     size = f"{grid.columns} x {grid.rows} cells of {grid.cell_size:g}"
     turned = f", {plural(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
@@ -324,13 +325,13 @@ def draw_map(
     target: Target | None = None,
     margin: float | None = None,
 ) -> Axes:
-    """Draw a map: blue where the progress set would hold, vermillion where not, blocked cells hatched.
+    """Draw a map: blue where the progress set would hold, vermillion elsewhere, blocked cells hatched.
 
     Args:
-        turn: index of the orientation; by default that of the target or of the best free cell.
-        sample: the sample with objects to draw over the map.
-        target: where the object is to go; its path is drawn too.
-        margin: the robustness that a target needs; a line is drawn there.
+        turn: index of the orientation; None for the orientation of the target, or of the best free cell.
+        sample: sample whose objects are drawn over the map.
+        target: target of the object, drawn with its path.
+        margin: robustness that a target needs, drawn as a line.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -353,7 +354,7 @@ def draw_map(
 
 
 def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
-    """Return the index of the target's orientation, or of that of the best free cell."""
+    """Return the index of the target's orientation, or without a target that of the best free cell."""
     if target_turn is not None:
         return int(np.abs(gradient.turns - target_turn).argmin())
     best = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
@@ -361,7 +362,7 @@ def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
 
 
 def _reach_of(maps: Sequence[GradientMap]) -> float:
-    """Return the greatest absolute robustness in the free cells of some maps, the range of the colours."""
+    """Return the greatest absolute robustness in some maps, which gets the full colours."""
     values = np.abs(np.concatenate([gradient.values.ravel() for gradient in maps]))
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
@@ -370,8 +371,8 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin
     """Draw the cells of one orientation.
 
     Args:
-        reach: the absolute robustness that gets the full colours.
-        margin: the robustness at which a line is drawn.
+        reach: absolute robustness that gets the full colours.
+        margin: robustness at which a line is drawn.
     """
     grid = gradient.grid
     right, top = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
@@ -393,7 +394,7 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin
 
 
 def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
-    """Draw the objects of a sample, the one to be moved with bolder lines."""
+    """Draw the objects of a sample, with bold lines for the object to be moved."""
     for object_name, tracked in (sample.objects if sample is not None else {}).items():
         _draw_footprint(ax, tracked.footprint, 2.0 if object_name == name else 1.0)
         x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
@@ -416,7 +417,7 @@ def _draw_target(ax: Axes, target: PlanTarget, sample: Sample | None) -> None:
 
 
 def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
-    """Return the legend's entries for the hatches in some maps."""
+    """Return the legend's entries for the reasons that block cells in some maps."""
     reasons = np.unique(np.concatenate([gradient.blocked.ravel() for gradient in maps])).tolist()
     style: dict[str, Any] = {"facecolor": _BLOCKED, "edgecolor": _HATCH}
     filled = (ax.fill([], [], hatch=_HATCHES[r], label=REASONS[r], **style) for r in reasons if r != FREE)
@@ -430,20 +431,20 @@ def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "
 
 @html.register(Step)
 def step_html(step: Step) -> str:
-    """Return the decision, with the edges and objects considered."""
+    """Return a decision with the edges and objects that the planner considered."""
     return page_of(decision_lines(decision_message(step)))
 
 
 @plot.register(Step)
 def draw_step(step: Step, sample: Sample | None = None, *, margin: float | None = None) -> tuple[Axes, ...]:
-    """Draw the maps of a step: a row for each edge considered, a column for each object.
+    """Draw the maps of a step, with a row for each considered edge and a column for each object.
 
     Args:
-        sample: the sample of the decision; its objects are drawn over the maps.
-        margin: the robustness that a target needs; a line is drawn there.
+        sample: sample of the decision, whose objects are drawn over the maps.
+        margin: robustness that a target needs, drawn as a line.
 
     Returns:
-        The axes of each map; none if the step has no map.
+        The axes of each map; an empty tuple if the step has no map.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -452,7 +453,7 @@ def draw_step(step: Step, sample: Sample | None = None, *, margin: float | None 
 
 
 def _maps_of(step: Step) -> list[list[GradientMap]]:
-    """Return the maps of each edge that a step considered."""
+    """Return the maps of a step by considered edge."""
     return [[candidate.map for candidate in edge.candidates] for edge in step.considered]
 
 
@@ -501,7 +502,7 @@ def _draw_candidate(
     reach: float,
     margin: float | None,
 ) -> AxesImage:
-    """Draw one map, titled with the choice made on it."""
+    """Draw one map, with the planner's choice in its title."""
     target = candidate.target if candidate.HasField("target") else None
     ax.set_axis_on()
     turn = _best_turn(gradient, None if target is None else target.turn)
@@ -516,7 +517,7 @@ def _draw_candidate(
 
 
 def _choice_text(candidate: PlanCandidate) -> str:
-    """Return whether a candidate is chosen, with its robustness, or why it was rejected."""
+    """Return a candidate's choice and robustness in words, or the reason for its rejection."""
     if not candidate.HasField("target"):
         return "\n".join(wrap(plain(f"no: {candidate.rejected}", 90), _LINE))
     choice = "chosen" if candidate.chosen else "possible"
