@@ -1,4 +1,4 @@
-"""The content of a report: what it keeps of a run, and its facts as JSON."""
+"""The content of a report: a run with its results, and the facts of the page as JSON."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ from spatial_replay.text import Sentence, json_fields, json_number, with_unit
 from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
-"""More results are counted, sorted and can be filtered; only the explanation of the first is unfolded."""
+"""Limit of results on a page without counts and filters; pages with more unfold only one explanation."""
 _MOST_MARKED: Final = 200
-"""Events whose samples are drawn in any case: the first ones."""
+"""Limit of events whose samples are always drawn; the earliest events come first."""
 MOST_DRAWN: Final = 24
-"""Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
+"""Limit of results with explanation, tree and curves; the worst come first. All results have a verdict."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +63,13 @@ class ReportedResult:
     """One result of a run, with its explanation and its path through its automaton.
 
     Attributes:
-        tree: under which it is reported.
-        file: that it comes from.
-        sentences: the explanation of its verdict; none if the page does not explain it.
-        witness: what decided it; None without an explanation.
-        unit: that of its robustness, if it is declared, or "".
-        compiled: its automaton, or why it has none.
-        path: the states of the run.
+        tree: the reported tree with the result's name.
+        file: the specification of the result.
+        sentences: explanation of the verdict; empty if the page does not explain it.
+        witness: deciding path and atom; None without an explanation.
+        unit: declared unit of the robustness; "" if none is declared.
+        compiled: the automaton, or the reason why there is none.
+        path: states of the automaton over the run.
     """
 
     result: SpecResult
@@ -83,7 +83,7 @@ class ReportedResult:
 
     @property
     def specs(self) -> Iterator[NodeResult]:
-        """Yield the root of each named spec within the formula, once, in the order of the text."""
+        """Yield the first node of each named spec within the formula, in the order of the text."""
         names = {self.result.nodes[0].name}
         for node in self.result.nodes[1:]:
             if node.name is not None and node.name not in names:
@@ -92,9 +92,11 @@ class ReportedResult:
 
     @property
     def decided(self) -> WitnessStep | None:
-        """The step to look at: the one that decided or, of a missed response, came nearest.
+        """The step that the page opens at; None without an explanation.
 
-        Where an operator took its number from the past, that is the operator: it failed then, and not before.
+        It is the end of the deciding path, or of the path to the atom closest to a missed response. If an
+        operator on the path takes its number from an earlier sample, it is that operator, because it did not
+        fail before.
         """
         if self.witness is None:
             return None
@@ -103,20 +105,20 @@ class ReportedResult:
 
     @property
     def deciding(self) -> DecidingAtom | None:
-        """The atom that decided it or, of a response that was missed, came nearest."""
+        """The deciding atom, or for a missed response the atom that came closest."""
         if self.witness is None:
             return None
         return self.witness.deciding if self.witness.closest is None else self.witness.closest[0]
 
     @property
     def fault_ns(self) -> int | None:
-        """The sample that made it violated or unknown."""
+        """Time of the step that made the result violated or unknown; None for a satisfied result."""
         decided = self.decided
         return None if decided is None or self.result.verdict is Verdict.SATISFIED else decided.time_ns
 
     @property
     def robustness_text(self) -> str:
-        """The root's robustness with its unit, or between which numbers it lies."""
+        """The root's robustness with its unit, or the ends of its interval."""
         return final_text(self.result.robustness, self.result.lower, self.result.upper, self.unit)
 
 
@@ -125,12 +127,12 @@ class RunReport:
     """A run with its results.
 
     Attributes:
-        axes: those of the source, as opposed to those of the samples.
-        results: those of `replayed`.
-        gaps: sentences on what unknown results lack before or after a time.
-        redone: what would have been decided otherwise, if the log has that.
-        pictures: see `pictures_of`.
-        planned_for: the file that decisions were made for, if another one is evaluated; else "".
+        axes: axes of the source; samples are always y-up.
+        results: the results of `replayed`.
+        gaps: sentences about gaps of unknown results before or after a time.
+        redone: decisions of `plan --redo` that differ from the recorded ones; empty without any.
+        pictures: pictures of the camera, see `pictures_of`.
+        planned_for: specification file of the decisions, if the report evaluates another one; else "".
         ticks: messages of the robot's behaviour tree.
     """
 
@@ -149,22 +151,22 @@ class RunReport:
 
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
-        """The results that have a tree and curves on the page, in order."""
+        """The results with a tree and curves, in the order of the page."""
         return tuple(self.results[number] for number in self.drawn_numbers)
 
     @property
     def drawn_numbers(self) -> list[int]:
-        """The places of those results."""
+        """The indices of the drawn results in `results`."""
         return worst_results(self.replayed.results)
 
     @property
     def decided_ns(self) -> list[int]:
-        """The samples that decided the drawn results."""
+        """The times of the samples that decided the drawn results."""
         return [reported.decided.time_ns for reported in self.drawn if reported.decided is not None]
 
     @property
     def marked_ns(self) -> list[int]:
-        """The samples that sentences are about: that decided a result or are its least, or begin an event."""
+        """The times in sentences: deciding samples, samples of least robustness, and starts of events."""
         least_ns = (reported.result.least_at_ns for reported in self.drawn)
         events_ns = sorted(set(map(start_of, self.events)))[:_MOST_MARKED]
         return sorted(
@@ -173,12 +175,12 @@ class RunReport:
 
 
 def worst_results(results: Sequence[SpecResult]) -> list[int]:
-    """Return which results are explained and drawn, in the order of `worst_first`: `MOST_DRAWN` at most."""
+    """Return the indices of the results to draw: the first `MOST_DRAWN` of `worst_first`."""
     return worst_first(results)[:MOST_DRAWN]
 
 
 class NodeSeries(NamedTuple):
-    """The numbers of some nodes, which the chosen samples must represent.
+    """Curves of some nodes, whose shape the chosen samples must keep.
 
     Attributes:
         times_ns: (T,) int64, consecutive samples of the run.
@@ -190,15 +192,15 @@ class NodeSeries(NamedTuple):
 
 
 def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) -> Integers:
-    """Return the indices of the samples to keep, in order: all of them, or at most `most`.
+    """Return the sorted indices of at most `most` samples that represent a run.
 
-    Samples of a run that is too long are chosen in this order, as long as there is room: the first and the
-    last of all and of each curve, others at equal distances, those around changes of sign, and the extrema of
-    each curve within a stretch. If the room does not suffice, they are spread over the run.
+    A quarter of `most` is spread evenly, and the first and last samples of all curves are added. Samples
+    around changes of sign follow, up to five eighths of `most`. Then each curve adds its extrema within even
+    stretches. Where the limit leaves samples out, the added ones are spread evenly.
 
     Args:
-        times_ns: (T,) int64, of all samples.
-        most: at least 8, and 4 for each of the curves.
+        times_ns: (T,) int64, times of all samples.
+        most: limit, at least 8 and at least 4 per curve.
     """
     count = len(times_ns)
     if count <= most:
@@ -216,7 +218,7 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
 
 
 def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
-    """Add samples as long as no more than `most` are chosen."""
+    """Mark samples as chosen, up to `most` in all; if there are too many, mark evenly spread ones."""
     new = samples[~chosen[samples]]
     room = max(0, most - int(np.count_nonzero(chosen)))
     if len(new) > room:
@@ -225,7 +227,7 @@ def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
 
 
 def _turns(series: Floats) -> Integers:
-    """Return the samples on both sides of a change of sign: of a number, or of an end of its interval."""
+    """Return the samples on both sides of each change of sign of a value, `now`, or end of an interval."""
     turns = [np.empty(0, np.int64)]
     for numbers in series.reshape(-1, series.shape[-1]):
         sign = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
@@ -235,7 +237,7 @@ def _turns(series: Floats) -> Integers:
 
 
 def _extremes(series: Floats, stretches: int) -> Integers:
-    """Return where value and now are least and greatest within each of so many stretches."""
+    """Return the samples with the least and the greatest value and `now` within each stretch."""
     count = series.shape[-1]
     starts = np.unique(np.linspace(0, count, stretches, endpoint=False).astype(np.int64))
     extremes = [np.empty(0, np.int64)]
@@ -244,14 +246,14 @@ def _extremes(series: Floats, stretches: int) -> Integers:
             comparable = np.where(np.isnan(numbers), infinite, numbers)
             best = np.repeat(extreme.reduceat(comparable, starts), np.diff([*starts, count]))
             hits = np.flatnonzero(comparable == best)
-            # the first in each stretch
+            # the first sample with the extreme number in each stretch
             _, first = np.unique(np.searchsorted(starts, hits, side="right"), return_index=True)
             extremes.append(hits[first])
     return np.unique(np.concatenate(extremes))
 
 
 MOST_VALUES: Final = 4_000_000
-"""Numbers of nodes at samples in a page, at most; a longer run keeps fewer samples."""
+"""Limit of a page's numbers, 4 per node and sample; a longer run keeps fewer samples."""
 _FEWEST_SAMPLES: Final = 200
 
 
@@ -260,7 +262,7 @@ class PageData:
     """Data of the page: facts in JSON, numbers, and notes on omissions.
 
     Attributes:
-        numbers: of `Packing.text`.
+        numbers: the text of `Packing.text`.
         omissions: sentences on what is left out to limit the size of the page.
     """
 
@@ -270,7 +272,7 @@ class PageData:
 
 
 def page_data(report: RunReport) -> PageData:
-    """Return everything that the page draws; equal reports give equal data."""
+    """Return all data of the page. Equal reports give equal data."""
     packing = Packing()
     reported_results, first_ns = report.drawn, report.replayed.first_ns
     times_ns = np.unique(
@@ -293,7 +295,7 @@ def page_data(report: RunReport) -> PageData:
         "times": packing.add((page_ns - first_ns) / 1e9, "f8"),
         "palette": {
             **SIGNS,
-            # without those of the signs
+            # without the two colours of the signs
             "curves": CURVES[2:],
         },
         "results": [_result_value(reported, page_ns, report, packing) for reported in reported_results],
@@ -308,7 +310,7 @@ def page_data(report: RunReport) -> PageData:
 
 
 def _room(results: Sequence[ReportedResult], samples: int) -> int:
-    """Return how many samples fit."""
+    """Return the limit of samples in the page."""
     values = sum(
         4 * len(shown_nodes(reported.result.formula)) * len(reported.result.times_ns) for reported in results
     )
@@ -316,7 +318,7 @@ def _room(results: Sequence[ReportedResult], samples: int) -> int:
 
 
 def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
-    """Return the places on the page of the run's results and their nodes, as far as it shows them."""
+    """Return the indices on the page of (result, node), for all drawn results and shown nodes."""
     return {
         (number, node): (index, place)
         for index, number in enumerate(report.drawn_numbers)
@@ -325,10 +327,10 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
 
 
 def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
-    """Return samples that the page has whatever else it leaves out: `most` at most, but what decided.
+    """Return times that the page always has: those in sentences, of further events, and of the scene.
 
-    They are the samples that sentences are about, those of further events and, if there is room, samples of
-    the scene at equal distances. At one cursor, the page shows one sample.
+    They are at most `most`, unless the times in sentences alone exceed it. Frames of the scene are evenly
+    spaced. All panels have these times, because a cursor shows one sample.
     """
     events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: most // 2]
     shown_ns = np.array(sorted({*report.marked_ns, *events_ns}), np.int64)
@@ -344,7 +346,7 @@ def _result_value(
     relations = RELATION_NAMES | reported.file.relations
     samples = np.flatnonzero(np.isin(reported.result.times_ns, page_ns))
     times_ns = reported.result.times_ns[samples]
-    # (nodes, 4, samples), of the shown nodes
+    # (shown nodes, 4, samples)
     series = reported.result.series[list(shown_nodes(reported.result.formula))][:, :, samples]
     value: dict[str, Any] = {
         **json_fields(reported.result, "title", "name", "object", "verdict"),
@@ -374,13 +376,13 @@ def _result_value(
 
 
 def _place_of(reported: ReportedResult) -> int | None:
-    """Return the place on the page of the node that decided a result."""
+    """Return the index on the page of the node that decided a result; None if the page lacks it."""
     nodes = shown_nodes(reported.result.formula)
     return nodes.index(reported.decided.node) if reported.decided and reported.decided.node in nodes else None
 
 
 def _decided_text(reported: ReportedResult) -> str:
-    """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
+    """Return the atom with the objects that decided a quantifier; "" if no quantifier decided."""
     if reported.decided is None or reported.deciding is None:
         return ""
     nodes = {identifier: node for identifier, _, node in iter_nodes(reported.result.formula)}
@@ -388,12 +390,12 @@ def _decided_text(reported: ReportedResult) -> str:
 
 
 def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
-    """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
+    """Return the arrow at the deciding atom of a result that is not satisfied, with its time."""
     witness, deciding = reported.witness, reported.deciding
     if reported.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None
     if reported.decided != (witness.closest_path or witness.path)[-1]:
-        return None  # things stood elsewhere when the atom had its number
+        return None  # the atom's number is of an earlier sample, with the objects at other places
     contact = next(
         (measurement.contact for measurement in deciding.measured if measurement.contact is not None), None
     )
@@ -401,7 +403,7 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
         return None
     number, pair = deciding.value * divisor_of(deciding.atom), pair_of(deciding.atom)
     is_response = witness.closest is not None
-    # as the arrow of the log's scene says it
+    # the same words as at the arrow in the log's scene
     holds = "must not hold, holds by " if number >= 0 else ""
     return {
         "time": (reported.fault_ns - first_ns) / 1e9,

@@ -1,6 +1,6 @@
 """The HTML page of a report: header, verdicts and explanations as text, panels for the scripts to fill.
 
-The page needs nothing else: styles, scripts and data are in it, and its policy lets the browser load nothing.
+Styles, scripts and data are in the page. Its policy forbids the browser to load anything else.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from spatial_replay.text import CALENDAR_NS, Instant, Sentence, plural, printabl
 from spatial_replay.version import __version__
 
 HEADER: Final = '<header class="top">'
-"""Begins the header of a report."""
+"""Start tag of a report's header."""
 _HEADLINE: Final = re.compile(
     r"`.+` (?:for .+ )?is (?:satisfied|violated): robustness [^ ]+(?: [^ ]+)?"
     r"(?:, certain since [\d.]+ s(?:, least at [\d.]+ s)?)?\."
 )
-"""A sentence that says no more than the line of its result does."""
+"""Sentences that only repeat the summary line of their result."""
 _WITHOUT_SCRIPTS: Final = "Without scripts this page shows verdicts and explanations alone."
 
 
@@ -41,7 +41,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
     """Return the header: the run, and notices that a reader needs before the verdicts.
 
     Args:
-        omissions: what the page leaves out to limit its size.
+        omissions: sentences on data that the page leaves out to limit its size.
     """
     counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
     title = element(
@@ -65,7 +65,7 @@ def _chip_of(report: RunReport) -> Html:
 
 
 def panels(report: RunReport) -> Html:
-    """Return the verdicts, and a place for each panel that is drawn."""
+    """Return the verdicts and an empty panel for each drawing."""
     has_automaton = any(reported.compiled.automaton is not None for reported in report.drawn)
     sections = [
         panel("verdicts", "Verdicts", *_verdicts(report)),
@@ -100,7 +100,7 @@ def footer(report: RunReport) -> Html:
 
 
 def text(words: str) -> Html:
-    """Return a text escaped, with spaces for characters that do not show."""
+    """Return a text with HTML escaped and control characters replaced by spaces."""
     return Html("\n".join(escape(printable(line, len(line))) for line in words.split("\n")))
 
 
@@ -161,7 +161,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
         yield element("p", text(_counts(report)), id="counts", **{"class": "counts"})
     worst = worst_first(report.replayed.results)
     for number, reported in enumerate(report.results[place] for place in worst):
-        # which result the page shows when something in the verdict is chosen
+        # the script shows this result in all panels after a click on the verdict
         result_attribute = {"data-result": str(places[id(reported)])} if id(reported) in places else {}
         is_reported = reported.result.verdict == report.replayed.verdict or bool(reported.result.remarks)
         is_unfolded = is_reported and not (are_many and number)
@@ -179,12 +179,11 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
 
 
 def _counts(report: RunReport) -> str:
-    """Return how many results have each verdict."""
     return counts_text(reported.result.verdict for reported in report.results)
 
 
 def _summary(reported: ReportedResult, first_ns: int) -> Html:
-    """Return the line of a result: its verdict, requirement and number, and since when it is certain."""
+    """Return the summary line of a result: verdict, requirement, robustness, and since when it is certain."""
     result = reported.result
     numbers = [f"robustness {reported.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
@@ -208,12 +207,12 @@ def _summary(reported: ReportedResult, first_ns: int) -> Html:
 
 
 def _is_sound(result: SpecResult) -> bool:
-    """Return whether a log shows a verdict: something tested it, and it rests on no doubt."""
+    """Return whether a verdict is reliable: the log tested it, and no doubt about the log affects it."""
     return result.tested != "nothing" and not result.doubts
 
 
 def _mark(result: SpecResult) -> str:
-    """Return what a verdict lacks; "" for nothing."""
+    """Return the flaws of a verdict in words; "" without flaws."""
     marks = ["doubtful"] if result.doubts else []
     if result.tested == "nothing":
         return ", ".join([*marks, "tested by nothing"])
@@ -224,7 +223,7 @@ def _mark(result: SpecResult) -> str:
 
 
 def _requirement(identifier: str | None, name: str, title: str | None) -> Iterator[Html]:
-    """Yield the id of a requirement, the name of its spec, and its words."""
+    """Yield the id of a requirement, the name of its spec, and its title."""
     if identifier is not None:
         yield element("span", text(identifier), **{"class": "requirement"})
     yield element("span", text(name), **{"class": "name"})
@@ -233,7 +232,7 @@ def _requirement(identifier: str | None, name: str, title: str | None) -> Iterat
 
 
 def _specs(reported: ReportedResult, first_ns: int) -> Html:
-    """Return one row for each named spec within a result, and the units that its number is the least of."""
+    """Return a row for each named spec within a result, and a sentence on mixed units."""
     named = {spec.name: spec for spec in reported.file.specs}
     rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(reported.result.formula)}
     for node in reported.specs:
@@ -255,7 +254,7 @@ def _specs(reported: ReportedResult, first_ns: int) -> Html:
 
 
 def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
-    """Yield a sentence: quoted parts as code, times with their ns since the log's first sample."""
+    """Yield the parts of a sentence: quoted parts as code, times with nanoseconds since the log's zero."""
     for part in sentence.parts:
         if isinstance(part, Instant):
             yield element("span", str(part), **{"data-time-ns": str(part.time_ns - first_ns)})
@@ -265,7 +264,7 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
 
 
 def chip(verdict: str, *, is_sound: bool = True) -> Html:
-    """Return a verdict on its colour, which is that of none where nothing tested it."""
+    """Return a verdict on its colour, or on a neutral colour if it is not sound."""
     return element("span", verdict, **{"class": f"chip is-{verdict if is_sound else 'vacuous'}"})
 
 
@@ -303,11 +302,14 @@ DARK: Final[Mapping[str, str]] = MappingProxyType(
         "negative-text": "#ffa35c",
     }
 )
-"""By their names in the style sheets; texts have a contrast of at least 4.5 to 1 on paper and panel."""
+"""Colours by name in the style sheets.
+
+Texts have a contrast of at least 4.5 to 1 on paper and panel, as
+https://www.w3.org/TR/WCAG21/#contrast-minimum requires."""
 
 
 def theme() -> str:
-    """Return the colours as a style sheet: the system's theme, unless the reader chose the other one."""
+    """Return the colours as a style sheet, which follows the system's theme unless the reader chose one."""
     light = _rule({"color-scheme": "light", **_variables(SIGNS), **_variables(LIGHT)})
     dark = _rule({"color-scheme": "dark", **_variables(DARK)})
     return (
@@ -331,11 +333,11 @@ _SCRIPTS: Final = (
     "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "map", "decisions", "behaviour",
     "scene", "camera", "automaton",
 )  # fmt: skip
-"""Files of browser/; after them comes the one that runs them."""
+"""Scripts in browser/, in the order of loading; the script of the page follows."""
 
 
 def page(report: RunReport) -> bytes:
-    """Return the page, in UTF-8; equal reports give equal bytes."""
+    """Return the page in UTF-8. Equal reports give equal bytes."""
     data = page_data(report)
     return document(
         f"{report.replayed.log}: {report.replayed.verdict}",
@@ -356,13 +358,14 @@ def document(
     *,
     has_pictures: bool = False,
 ) -> bytes:
-    """Return a whole page about runs, in UTF-8.
+    """Return a whole page about runs in UTF-8.
 
     Args:
-        parts: what is between the beginning of its body and the bar at the bottom.
-        facts, numbers: what the scripts read, as JSON and packed, by the ids of its elements.
-        script_name: the file of browser/ that runs the others.
-        has_pictures: whether there are pictures among the facts.
+        parts: content of the body above the playback bar.
+        facts: JSON data for the scripts, by the id of the element that holds them.
+        numbers: packed arrays for the scripts, by the id of the element that holds them.
+        script_name: script in browser/ that runs the others.
+        has_pictures: whether the facts have pictures.
     """
     json_kind, packed_kind = "application/json", "application/octet-stream"
     body = [
@@ -384,11 +387,11 @@ def html_page(
     marks: str = "",
     has_pictures: bool = False,
 ) -> bytes:
-    """Return a page with its styles and scripts in it, in UTF-8.
+    """Return a page with inline styles and scripts, in UTF-8.
 
     Args:
-        styles: assets, see `asset`.
-        marks: attributes of its root.
+        styles: names of style sheets, see `asset`.
+        marks: attributes of the root element.
     """
     style = "\n".join([theme(), *map(asset, styles)])
     whole = [
@@ -406,19 +409,22 @@ def html_page(
 
 
 def asset(name: str) -> str:
-    """Return the text of a file of this room, or of another one: "batch:overview.css"."""
+    """Return the text of a file of this package, or of another package: "batch:overview.css"."""
     room, _, file = name.rpartition(":")
     return files(f"spatial_replay.{room or 'report'}").joinpath(file).read_text("utf-8")
 
 
 def _script(name: str) -> str:
-    """Return our scripts as one, in a scope of its own."""
+    """Return all scripts joined, in one function scope."""
     scripts = "\n".join(asset(f"browser/{script}.js") for script in (*_SCRIPTS, name))
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 
 def _policy(scripts: Sequence[str], style: str, has_pictures: bool) -> str:
-    """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
+    """Return the Content-Security-Policy: nothing is loaded, and only the page's own scripts run.
+
+    Hashes permit the inline scripts and styles: https://www.w3.org/TR/CSP3/#grammardef-hash-source
+    """
     pictures = "img-src data:; " if has_pictures else ""
     script_sources = " ".join(map(_digest, scripts))
     return (

@@ -1,6 +1,6 @@
-"""Panels of a report: their facts as JSON, from a replay, with arrays in a compact form.
+"""Panels of a report: the facts of a replay as JSON, with arrays in a compact form.
 
-Arrays are packed one after the other (see `packed_bytes`), compressed, in Base64.
+All arrays of a page are packed (see `packed_bytes`), joined, compressed and written in Base64.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, 
 from spatial_replay.text import cut, json_fields, plural, with_unit
 
 Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
-"""Numbers of an array in the page: float64, float32, int32, uint16, uint8."""
+"""Number types of arrays in the page: float64, float32, int32, uint16, uint8."""
 Reference: TypeAlias = Mapping[str, Any]
-"""Where an array lies in the page: its kind, the offset of its first byte, how many numbers it has."""
+"""Position of an array in the page: its kind, the offset of its first byte, and its count of numbers."""
 
 _LEVEL: Final = 6
 
@@ -88,7 +88,7 @@ class Packing:
         self._size = 0
 
     def add(self, array: NDArray[Any], kind: Kind) -> Reference:
-        """Take in an array, flattened by rows, and return where the page finds it."""
+        """Add an array, flattened by rows, and return its position."""
         data = packed_bytes(array, kind)
         reference = {"kind": kind, "offset": self._size, "length": int(np.size(array))}
         self._pieces.append(data)
@@ -96,15 +96,15 @@ class Packing:
         return reference
 
     def text(self) -> str:
-        """Return everything taken in as a text without characters that HTML interprets."""
+        """Return all arrays as one text without characters that HTML interprets."""
         return base64.b64encode(zlib.compress(b"".join(self._pieces), _LEVEL)).decode("ascii")
 
 
 def packed_bytes(array: NDArray[Any], kind: Kind) -> bytes:
     """Return the numbers of an array, by rows, as bytes that compress well; read.js unpacks them.
 
-    The bits of each number are an unsigned integer. Its difference from the one before is written: the lowest
-    bytes of all differences, then the next ones.
+    The bits of a number are read as an unsigned integer. Differences of consecutive integers are written
+    plane by plane: first the lowest bytes of all differences, then the next bytes, and so on.
     """
     numbers = np.ascontiguousarray(array, f"<{kind}").ravel()
     codes = numbers.view(f"<u{numbers.itemsize}")
@@ -113,7 +113,7 @@ def packed_bytes(array: NDArray[Any], kind: Kind) -> bytes:
 
 
 def unpack_array(reference: Reference, data: bytes) -> NDArray[Any]:
-    """Return an array of a page, flat, from the bytes of all its arrays."""
+    """Return one array of a page, flat, from the bytes of all arrays."""
     dtype, length = np.dtype(f"<{reference['kind']}"), reference["length"]
     planes = np.frombuffer(data, np.uint8, length * dtype.itemsize, reference["offset"])
     differences = np.ascontiguousarray(planes.reshape(dtype.itemsize, length).T)
@@ -122,7 +122,7 @@ def unpack_array(reference: Reference, data: bytes) -> NDArray[Any]:
 
 
 def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return numbers in single precision; one below 0 stays below 0, however near."""
+    """Return numbers in single precision. Negative numbers stay negative, because the sign is the verdict."""
     with np.errstate(over="ignore", under="ignore"):
         near = numbers.astype(np.float32)
     smallest = np.finfo(np.float32).smallest_subnormal
@@ -130,7 +130,11 @@ def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def json_text(value: Any) -> str:
-    """Return JSON that is safe within a script element, with any texts in it."""
+    """Return JSON that is safe within a script element, whatever texts it contains.
+
+    Escapes keep texts such as `</script>` from ending the element:
+    https://html.spec.whatwg.org/multipage/scripting.html#restrictions-for-contents-of-script-elements
+    """
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -149,10 +153,10 @@ _CODE: Final = re.compile(
 
 
 def sentence_parts(sentence: str) -> list[str]:
-    """Split a sentence into text and code, in turn, beginning with text.
+    """Split a sentence into alternating text and code, beginning with text.
 
-    Code is between backquotes, which names of objects may contain, too. Numbers in the text have a minus
-    sign.
+    Code stands between backquotes; names of objects in it may contain backquotes, too. Numbers in the text
+    are written as `with_signs` writes them.
     """
     parts = _CODE.split(sentence)
     parts[::2] = map(with_signs, parts[::2])
@@ -164,19 +168,19 @@ _INFINITE: Final = re.compile(r"(?<![\w.-])[+]?inf(?![\w-])")
 
 
 def with_signs(words: str) -> str:
-    """Return a text whose numbers are written as on pages: "−0.05", "−∞"; names such as run-1 stay."""
+    """Return a text with typographic numbers, such as "−0.05" and "−∞"; names such as run-1 stay."""
     return _INFINITE.sub("∞", _MINUS.sub("\N{MINUS SIGN}", words))
 
 
 MOST_NODES: Final = 400
-"""Nodes of a tree that a page shows, at most."""
+"""Limit of shown nodes of a tree."""
 _LONGEST: Final = 400
-"""Characters after which the text of a node is cut."""
+"""Limit of a node's text, characters."""
 _PLACE: Final = "…"
 
 
 def shown_nodes(formula: Formula) -> tuple[int, ...]:
-    """Return the ids of the nodes on the page, in order: all of them or, of a large tree, the uppermost."""
+    """Return the ids of the nodes on the page, in order; a large tree keeps only its uppermost nodes."""
     nodes = list(iter_nodes(formula))
     if len(nodes) <= MOST_NODES:
         return tuple(range(len(nodes)))
@@ -188,7 +192,7 @@ def shown_nodes(formula: Formula) -> tuple[int, ...]:
 
 
 def initial_nodes(formula: Formula) -> frozenset[int]:
-    """Return the ids of the nodes that count at the first sample only: no temporal operator is above them."""
+    """Return the ids of the nodes without a temporal operator above: they count only at the first sample."""
     initial: set[int] = set()
     formulas: list[Formula] = []
     for identifier, parent, node in iter_nodes(formula):
@@ -204,11 +208,11 @@ def tree_value(
     """Return the shown nodes, each with its text and its final verdict.
 
     Args:
-        relations: the names of those that its file may use.
-        units: those that are declared.
-        calls: of nodes that are a `def` with its arguments, as the file writes them.
+        relations: names of the relations that the file may use.
+        units: declared units.
+        calls: texts of nodes that call a `def`, as the file writes them, by id.
     """
-    # with the object that it is about in place of a template's parameter
+    # a template's parameter is replaced by the object of the instance
     formula = result.evidence.bound(result.formula)
     nodes, initial = shown_nodes(formula), initial_nodes(formula)
     place = {identifier: index for index, identifier in enumerate(nodes)}
@@ -234,7 +238,7 @@ def requirement_values(result: SpecResult, samples: Integers, packing: Packing) 
     """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
 
     Args:
-        samples: (S,) indices of those that the page has.
+        samples: (S,) indices of the samples on the page.
     """
     place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
     settles = result.semantics == "ltlf"
@@ -262,7 +266,7 @@ def final_text(robustness: float, lower: float, upper: float, unit: str = "") ->
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:
-    """Return the nodes that have curves: the root and the named nodes among those shown."""
+    """Return the ids of the nodes with curves: the root, and all named nodes that are shown."""
     nodes = set(shown_nodes(formula))
     return tuple(
         identifier
@@ -272,7 +276,7 @@ def named_nodes(formula: Formula) -> tuple[int, ...]:
 
 
 def _head(node: Formula, relations: frozenset[str]) -> str:
-    """Return a node's text with dots for its operands."""
+    """Return a node's text with an ellipsis for each operand."""
     if isinstance(node, Boolean):
         return operator_of(node)
     text = format_formula(node, relations=relations)
@@ -285,12 +289,12 @@ def _head(node: Formula, relations: frozenset[str]) -> str:
 
 
 class StatePath:
-    """The states of a run, collected from its messages as they come.
+    """The states of a run in its automaton, collected message by message.
 
     Attributes:
-        times_ns: of each message.
-        codes: of each message, the number of its states in `sets`.
-        sets: states that the run may be in, with their numbers.
+        times_ns: times of the messages.
+        codes: the number in `sets` of each message's states.
+        sets: numbers by the set of states that the run may be in.
     """
 
     def __init__(self) -> None:
@@ -304,10 +308,10 @@ class StatePath:
 
 
 def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str], str]) -> Mapping[str, Any]:
-    """Return an automaton as the page draws it: states with their places, transitions with their guards.
+    """Return the drawing of an automaton: states with their positions, transitions with their guards.
 
     Args:
-        named: writes the object in place of a template's parameter.
+        named: replaces a template's parameter by the object in a text.
     """
     visited = {state for states in path.sets for state in states}
     drawing, short = draw_automaton(automaton, visited), abbreviate(automaton)
@@ -320,7 +324,7 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
             }
             for state in drawing.states
         ],
-        # the same words on arrows, and the same legend, as in a drawing by Graphviz
+        # arrows have the same words, and the legend is the same, as in a drawing by Graphviz
         "moves": [
             {**move._asdict(), "guard": named(move.guard), "label": named(brief.guard)}
             for move, brief in zip(drawing.moves, draw_automaton(short, visited).moves, strict=True)
@@ -330,17 +334,17 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
 
 
 MOST_EVENTS: Final = 2_000
-"""Events of a page, at most: the first ones."""
+"""Limit of events in a page; later events are left out."""
 
 
 def event_values(events: Sequence[Event], first_ns: int) -> list[Mapping[str, Any]]:
-    """Return the list as the page reads it, by start time."""
+    """Return the first events as the page's script reads them, by start time."""
     ordered = sorted(events, key=start_of)
     return [_event_value(event, first_ns) for event in ordered[:MOST_EVENTS]]
 
 
 def start_of(event: Event) -> int:
-    """Return the first sample of what began."""
+    """Return the start time of an event in nanoseconds."""
     time_ns: int = event.start_time.ToNanoseconds()
     return time_ns
 
@@ -365,28 +369,28 @@ def _status(facts: Mapping[str, str]) -> str:
 
 
 MOST_PICTURES: Final = 60
-"""Pictures of a page, at most: those of what decided verdicts, and others at equal distances."""
+"""Limit of pictures in a page: those of deciding samples, and others at equal intervals."""
 MOST_PICTURE_BYTES: Final = 1_500_000
-"""Characters of a page that its pictures take, at most."""
+"""Limit of all pictures of a page in Base64, characters."""
 
 _FORMS: Final = ((320, 70), (320, 45), (200, 45), (120, 40), (60, 30))
-"""Widths in pixels and qualities of JPEG, of which the first is taken that is small enough."""
+"""Widths in pixels and JPEG qualities, tried in this order until a picture is small enough."""
 
 
 NO_PICTURES: Final[Mapping[str, Any]] = MappingProxyType(
     {"topic": "", "reason": "", "times": (), "pictures": ()}
 )
-"""For a log without images."""
+"""The pictures of a log without images."""
 
 
 def pictures_of(
     source: Source, first_ns: int, span_ns: tuple[int, int], decided_ns: Collection[int]
 ) -> Mapping[str, Any]:
-    """Return small pictures of what a log's camera saw, as the page reads them; why there are none, if so.
+    """Return small pictures of a log's camera as the page's script reads them, or the reason for none.
 
     Args:
-        span_ns: from when to when.
-        decided_ns: samples whose pictures are among them, as far as there is room.
+        span_ns: first and last time.
+        decided_ns: times of deciding samples; their pictures take up to half of the limit.
     """
     path = source.path
     topic = _image_topic(path) if isinstance(path, LogFile) else None
@@ -410,7 +414,7 @@ def pictures_of(
 
 
 def _image_topic(path: LogFile) -> str | None:
-    """Return the topic with images that a layout shows, too: our own, or else the first."""
+    """Return the topic of images that layouts show, too: the video of the project, or else the first."""
     if not is_log(path):
         return None
     try:
@@ -420,12 +424,13 @@ def _image_topic(path: LogFile) -> str | None:
             if is_image_type(image_topic.type)
         ]
     except LogError:
-        # the replay has said how damaged it is
+        # the replay has already reported the damage
         return None
     return CAMERA_VIDEO if CAMERA_VIDEO in topics else next(iter(topics), None)
 
 
 def _small(image: Image) -> bytes:
+    # Base64 writes 3 bytes as 4 characters; 64 bytes are room for the head of the URL
     most = MOST_PICTURE_BYTES * 3 // 4 // MOST_PICTURES - 64
     data = b""
     for width, quality in _FORMS:
@@ -436,22 +441,22 @@ def _small(image: Image) -> bytes:
 
 
 MOST_FRAMES: Final = 3_000
-"""Frames of a page, at most."""
+"""Limit of frames in a page."""
 MOST_CORNERS: Final = 2_000_000
-"""Corners of the outlines in all frames together, at most."""
+"""Limit of outline corners in all frames together."""
 MOST_ARROWS: Final = 30_000
-"""Arrows in all frames together, at most: of so many results, the worst first, as may have one in each."""
+"""Limit of arrows in all frames together; it sets the number of results with arrows, the worst first."""
 _ABSENT: Final = 65_535
 _STEPS: Final = 65_535
 """Steps of a coordinate along each side of the scene: 16 bits, finer than any screen."""
 
 
 class ReportedScene:
-    """Frames of a scene, collected as they come; if there are too many, every other one is dropped.
+    """Frames of a scene, collected one by one. Beyond a limit, every other frame is dropped.
 
     Attributes:
-        frames: with their times.
-        stride: every how many messages there is a frame.
+        frames: frames with their times.
+        stride: number of scene messages per frame.
     """
 
     def __init__(self) -> None:
@@ -461,8 +466,8 @@ class ReportedScene:
         self._last_ns: int | None = None
 
     def add(self, frames: SceneFrames) -> None:
-        """Add what the next messages show."""
-        # no others have a place
+        """Add the next frames."""
+        # `add_frame` drops all other frames, so they are not computed
         frame_numbers = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
         repeats_last = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
         frames = replace(frames, chosen=np.union1d(frame_numbers, [0]) if repeats_last else frame_numbers)
@@ -470,9 +475,9 @@ class ReportedScene:
             self.add_frame(time_ns, partial(frames.frame, index))
 
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
-        """Add the next frame, which is made only if it has a place.
+        """Add the next frame, which is computed only if it is kept.
 
-        One of the same time as the frame before, that of the finished log, is the last and replaces it.
+        The last frame, of the finished log, has the time of the frame before it, and replaces that frame.
         """
         if time_ns == self._last_ns:
             while self.frames and self.frames[-1][0] == time_ns:
@@ -491,25 +496,25 @@ class ReportedScene:
             self._corners = sum(frame.corners for _, frame in self.frames)
 
     def insert(self, frames: SceneFrames) -> None:
-        """Add frames of other times than the ones that were collected."""
+        """Insert frames at times that were not collected."""
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             at = bisect_left(self.frames, time_ns, key=itemgetter(0))
             self.frames.insert(at, (time_ns, frames.frame(index)))
 
     @property
     def times_ns(self) -> Integers:
-        """(F,) int64, of the frames."""
+        """(F,) int64, the times of the frames."""
         return np.array([time_ns for time_ns, _ in self.frames], np.int64)
 
 
 class _Box(NamedTuple):
-    """The part of the plane that everything lies in: its lower left corner, and its size, above 0."""
+    """The bounding box of a drawing: its lower left corner and its size, which is positive."""
 
     low: Floats
     size: Floats
 
     def steps(self, points: Floats) -> Floats:
-        """Return points (n, 2) in steps of the box."""
+        """Return points (n, 2) as steps, 0 to `_STEPS` within the box."""
         return np.asarray(np.round((points - self.low) / self.size * _STEPS))
 
 
@@ -520,11 +525,11 @@ def scene_value(
     places: Mapping[tuple[int, int], tuple[int, int]],
     packing: Packing,
 ) -> Mapping[str, Any]:
-    """Return the scene as the page reads it; coordinates are in steps of the box that everything lies in.
+    """Return the scene as the page's script reads it, with coordinates as steps of the bounding box.
 
     Args:
-        kept_ns: times of the samples that the page has.
-        places: of results and their nodes, where the page has them.
+        kept_ns: times of the samples on the page.
+        places: indices on the page by (result, node).
     """
     times_ns = scene.times_ns
     is_kept = np.isin(times_ns, kept_ns)
@@ -534,7 +539,7 @@ def scene_value(
         if is_kept_frame
     ]
     entities = _entities(frames)
-    # of one result there is one arrow in a frame
+    # a frame has at most one arrow per result
     results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
     result_numbers = sorted(results, key=results.__getitem__)
     most = max(1, MOST_ARROWS // max(len(frames), 1))
@@ -569,11 +574,11 @@ def scene_value(
             "outline": packing.add(np.array([outlines.index(arrow.dashes) for arrow in arrows]), "i4"),
             "names": names,
             "name": packing.add(np.array([names.index(arrow.names) for arrow in arrows]), "i4"),
-            # of those about an earlier sample
+            # times of earlier samples, for arrows at those
             "moments": [
                 None if arrow.moment_ns is None else (arrow.moment_ns - first_ns) / 1e9 for arrow in arrows
             ],
-            # the result and the node of the page, -1 where the page leaves the node out
+            # indices of result and node on the page, -1 for a node that the page leaves out
             "places": packing.add(
                 np.array(
                     [places.get((arrow.result, arrow.node), (results[arrow.result], -1)) for arrow in arrows]
@@ -585,12 +590,12 @@ def scene_value(
 
 
 def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
-    """Order regions before objects, which are drawn over them."""
+    """Sort regions before objects, so that objects are drawn over them."""
     return not item[0].startswith(REGION), item[0]
 
 
 def _entities(frames: Sequence[SceneFrame]) -> Mapping[str, dict[int, DrawnEntity]]:
-    """Return what is drawn, by entity and frame."""
+    """Return the drawn entities by id and by number of the frame."""
     frames_by_entity: dict[str, dict[int, DrawnEntity]] = {}
     for number, frame in enumerate(frames):
         for identifier, entity in frame.entities.items():
@@ -608,7 +613,7 @@ def _box(entities: Mapping[str, Mapping[int, DrawnEntity]], arrows: Sequence[Dra
 
 
 def _join_points(points: Sequence[Floats]) -> Floats:
-    """Return all points, (n, 2)."""
+    """Return all points as (n, 2), also for an empty sequence."""
     return np.concatenate([np.empty((0, 2)), *points])
 
 
@@ -620,10 +625,10 @@ def _entity_value(
     box: _Box,
     packing: Packing,
 ) -> Mapping[str, Any]:
-    """Return one entity: its form in each frame, and its points and colours in the frames that have it.
+    """Return an entity with its form in each frame, and its points and colours in frames with the entity.
 
     Args:
-        results: those of the page, which it has shades for in this order.
+        results: indices of the page's results, in the order of the shades.
     """
     forms: dict[tuple[tuple[int, ...], bool], int] = {}
     form_of_frame = np.full(frame_count, _ABSENT, np.int64)
@@ -640,7 +645,7 @@ def _entity_value(
         "kind": kind,
         "name": name,
         "forms": [rings for rings, _ in forms],
-        # a missing object leaves its last outline
+        # forms of the last outline of a missing object
         "last": [form_number for (_, is_last), form_number in forms.items() if is_last],
         "form": packing.add(form_of_frame, "u2"),
         "points": packing.add(box.steps(_join_points(rings)), "u2"),
@@ -650,16 +655,16 @@ def _entity_value(
 
 
 MOST_CELLS: Final = 1_500_000
-"""Cells of all maps of a page together, at most; maps of chosen targets come first."""
+"""Limit of cells in all maps of a page together; maps of chosen targets come first."""
 _MOST_LAYERED: Final = 50_000
-"""Cells of a map of which a page says what limits and blocks them."""
+"""Limit of cells of a map whose page has the layers of limits and causes."""
 
 
 class ReportedDecisions:
-    """The decisions in a log, with the gradient maps, collected from messages as they come.
+    """The decisions of a log and their gradient maps, collected message by message.
 
     Attributes:
-        maps: by the number by which decisions name them, in the order of the log.
+        maps: gradient maps by the number that decisions refer to, in the order of the log.
         is_pushed: whether the robot pushes objects, so that the nearest cell that will do is chosen.
     """
 
@@ -668,18 +673,18 @@ class ReportedDecisions:
         self._decisions: list[PlanDecision] = []
 
     def add_decision(self, payload: bytes) -> None:
-        """Add a decision; one that cannot be decoded is skipped."""
+        """Add a decision, unless it cannot be decoded."""
         with suppress(LogError):
             self._decisions.append(decision_from_payload(payload))
 
     def add_map(self, number: int, payload: bytes) -> None:
-        """Add a gradient map; one that cannot be decoded is skipped."""
+        """Add a gradient map, unless it cannot be decoded."""
         with suppress(DecodeError):
             self.maps[number] = Grid.FromString(payload)
 
     @property
     def decisions(self) -> tuple[PlanDecision, ...]:
-        """In order, each with its outcome if it has one."""
+        """The decisions in order, each with its outcome if the log has it."""
         return latest_decisions(self._decisions)
 
 
@@ -687,8 +692,9 @@ class _Owner(NamedTuple):
     """The candidate that a map belongs to.
 
     Attributes:
-        edge, place: of the edge among those considered, and of the candidate among the edge's.
-        turn: how far the object is turned, in radians.
+        edge: index of the edge in the decision.
+        place: index of the candidate in the edge.
+        turn: turn of the object in radians.
     """
 
     edge: int
@@ -698,7 +704,7 @@ class _Owner(NamedTuple):
 
     @property
     def target(self) -> PlanTarget | None:
-        """The candidate's target, if it was found on this map: that of the nearest orientation."""
+        """The candidate's target, if this map has the nearest orientation to it; else None."""
         candidate = self.candidate
         if not candidate.HasField("target"):
             return None
@@ -712,11 +718,11 @@ class _Drawn(NamedTuple):
     """A gradient map as numbers.
 
     Attributes:
-        values: (rows, columns), NaN where blocked.
-        low, high: where its corners lie.
-        owner: None if the log does not record it.
-        is_chosen: whether the decision's target was found on it.
-        fields: what the message has of each cell, (rows, columns) by name.
+        values: (rows, columns), robustness, NaN where blocked.
+        low, high: lower left and upper right corner.
+        owner: candidate of the map; None if the log does not record it.
+        is_chosen: whether the decision's target was chosen on this map.
+        fields: arrays (rows, columns) of the message by name.
     """
 
     values: Floats
@@ -734,10 +740,10 @@ def decisions_value(
     packing: Packing,
     most_cells: int = MOST_CELLS,
 ) -> Mapping[str, Any]:
-    """Return the decisions as the page reads them, and how many maps did not fit.
+    """Return the decisions as the page's script reads them, and the number of maps left out.
 
     Args:
-        redone: what would have been decided otherwise, if the log has that.
+        redone: decisions of `plan --redo` that differ from the recorded ones.
     """
     maps_by_decision = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept_maps = _maps_that_fit([drawn_map for maps in maps_by_decision for drawn_map in maps], most_cells)
@@ -767,7 +773,7 @@ def _outcome(decision: PlanDecision) -> tuple[object, ...]:
 
 
 def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
-    """Return the maps that fit, by identity: those of chosen targets, then the others, in order."""
+    """Return the ids (`id`) of the maps within the limit. Maps of chosen targets come first."""
     kept_maps: set[int] = set()
     cells = 0
     for drawn_map in sorted(maps, key=lambda drawn_map: not drawn_map.is_chosen):
@@ -778,7 +784,7 @@ def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
 
 
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
-    """Yield the maps of a decision; if the log does not record their owners, those of its time."""
+    """Yield the maps of a decision. If the log does not record their owners, yield the maps of its time."""
     owners = {
         named.number: _Owner(edge, place, candidate, named.turn)
         for edge, considered in enumerate(decision.considered)
@@ -801,7 +807,7 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
-    """Return whether a decision's target was found on a map; without owners, on the only one."""
+    """Return whether a decision's target was chosen on a map. Without an owner, an only map is the one."""
     if not decision.HasField("target"):
         return False
     if owner is None:
@@ -811,7 +817,7 @@ def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
 
 
 def _draw_map(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
-    """Return a map's robustness; None if the sizes in the message are inconsistent or empty."""
+    """Return a map as numbers; None if its message has inconsistent or empty sizes."""
     fields = map_fields(grid)
     numbers = fields.get("robustness")
     if numbers is None:
@@ -899,7 +905,7 @@ def _value_at(drawn: _Drawn, target: PlanTarget) -> float | None:
 
 
 def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:
-    """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
+    """Return the limiting conjunct and the blocking cause of each cell, and layers of the chosen map."""
     if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
         return {}
     candidate = owner.candidate
@@ -988,7 +994,7 @@ def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
 
 
 def _target_value(target: PlanTarget) -> Mapping[str, Any]:
-    """Return a target in words, and as points to draw unless one is not finite."""
+    """Return a target in words, with the points of its path if all are finite."""
     points = [target.x, target.y, *target.waypoints]
     is_drawn = bool(np.isfinite(points).all())
     turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""

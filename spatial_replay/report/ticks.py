@@ -11,11 +11,14 @@ from google.protobuf.message import DecodeError
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 
 MOST_TICKS: Final = 4_000
-"""Ticks of a page, at most: the first ones."""
+"""Limit of ticks in a page; later ticks are left out."""
 
 
 def ticks_value(payloads: Sequence[bytes], first_ns: int) -> Sequence[Mapping[str, Any]]:
-    """Return stretches of ticks of one tree: its nodes, and the time and the status of each node per tick."""
+    """Return stretches of consecutive ticks with equal trees.
+
+    A stretch has the nodes of its tree, the time of each tick, and one digit per node with its status.
+    """
     ticks = _iter_ticks(payloads[:MOST_TICKS])
     values = []
     for nodes, group in groupby(ticks, key=_shape):
@@ -37,7 +40,7 @@ def ticks_value(payloads: Sequence[bytes], first_ns: int) -> Sequence[Mapping[st
 
 
 def _iter_ticks(payloads: Sequence[bytes]) -> Iterator[BehaviourTree]:
-    """Yield the ticks; one that cannot be decoded is skipped."""
+    """Yield the ticks that can be decoded."""
     for payload in payloads:
         try:
             yield BehaviourTree.FromString(payload)

@@ -1,7 +1,7 @@
-"""Reports as HTML pages: what a run did and why, or what differs, with both runs under one time cursor.
+"""Reports as HTML pages, of one run or of a comparison of two runs under one time cursor.
 
-A replay gives the results and a `Collector` takes the rest from its messages. Together they are a
-`RunReport`, which `page` turns into HTML.
+A replay gives the results, and a `Collector` gathers the other facts from the replay's messages. Together
+they are a `RunReport`, which `page` writes as HTML.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _COLLECTED: Final = frozenset(
 
 
 class Collector:
-    """Collects what a page shows from a run, as its messages come."""
+    """Collects the facts of a page from the messages and scenes of a replay."""
 
     def __init__(self, *, is_pushed: bool) -> None:
         self.scene = ReportedScene()
@@ -69,7 +69,7 @@ class Collector:
         self.paths: defaultdict[tuple[str, str | None], StatePath] = defaultdict(StatePath)
 
     def add(self, messages: Messages) -> None:
-        """Take in the next messages."""
+        """Add the next messages of the replay."""
         collected = messages.of_topics(_COLLECTED)
         for topic, (_, sequence, time_ns, _, payload) in zip(collected.topics, collected.rows(), strict=True):
             match topic:
@@ -91,10 +91,10 @@ class Collector:
 
 
 def refuse_output(output: Path, inputs: Sequence[Path] = ()) -> None:
-    """Check that a report may be written, before the log is read.
+    """Check the path of a report before the log is read.
 
     Raises:
-        UsageError: the output is not named like a page, is an input, is a folder, or is in none.
+        UsageError: the output is not named .html or .htm, is an input or a folder, or its folder is missing.
     """
     refuse_inputs(output, inputs)
     if output.suffix.lower() not in (".html", ".htm"):
@@ -115,12 +115,12 @@ def write_report(
     The page needs no other file and no network. Equal sources, specifications and options give an equal page.
 
     Args:
-        inputs: files that the output must not be.
-        advance: called with the number of samples of each block that is done.
+        inputs: files that the output must not replace.
+        advance: called with the number of samples of each evaluated block.
 
     Raises:
-        UsageError: an option that cannot work, no sample in the window, and what `refuse_output` refuses.
-        SpecificationError: names that the log never has, if names are strict.
+        UsageError: an option is impossible, the window has no sample, or `refuse_output` refuses the output.
+        SpecificationError: a name is missing from the whole log, if names are strict.
         LogError: no sample in the log.
         OutputError: the output cannot be written.
     """
@@ -139,7 +139,10 @@ def report_of(
     options: ReplayOptions = DEFAULT_OPTIONS,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> tuple[Replayed, RunReport]:
-    """Evaluate specifications over a source, and collect what a page shows of it; see `write_report`."""
+    """Evaluate specifications over a source, and return the results with the facts of the page.
+
+    Arguments and errors are those of `write_report`.
+    """
     collector = Collector(is_pushed=_is_pushed(source))
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     replayed = replay.run(collector.add, advance=advance)
@@ -156,6 +159,7 @@ def report_of(
         planned_for(source, replay.files),
         tuple(collector.ticks),
     )
+    # the scene has one of many messages; samples in sentences are drawn in a second pass over the log
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
     replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)
     return replayed, report
@@ -193,7 +197,7 @@ def _results(
 
 
 def _gaps(replayed: Replayed) -> tuple[str, ...]:
-    """Return sentences on what unknown results lack at the ends of a log, with a window without that."""
+    """Return a sentence for each gap of an unknown result that a smaller window of the log avoids."""
     unknown = [result for result in replayed.results if result.verdict is Verdict.UNKNOWN]
     gaps = (gap for result in unknown for gap in result.gaps() if gap.window is not None)
     return tuple(dict.fromkeys(gap_sentence(gap, replayed.first_ns) for gap in gaps))
@@ -214,13 +218,13 @@ def write_comparison(
     """Write a diff as one HTML page, which needs no other file and no network. Equal diffs give equal pages.
 
     Args:
-        sides: what was compared, the old specification or run A first.
-        inputs: files that the output must not be.
-        advance: called with the number of samples of each block that is done.
+        sides: the compared sides, with the old specification or run A first.
+        inputs: files that the output must not replace.
+        advance: called with the number of samples of each evaluated block.
 
     Raises:
-        UsageError: what `refuse_output` refuses.
-        LogError: a log can no longer be read.
+        UsageError: `refuse_output` refuses the output.
+        LogError: a log has become unreadable.
         OutputError: the output cannot be written.
     """
     refuse_output(output, inputs)
@@ -230,10 +234,10 @@ def write_comparison(
 
 
 def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> bytes:
-    """Return the page of a diff, in UTF-8.
+    """Return the page of a diff in UTF-8.
 
     Args:
-        a, b: both sides, as they are reported.
+        a, b: the reports of both sides.
     """
     data_a, data_b = page_data(a), page_data(b)
     labels = _labels(diff)
@@ -283,7 +287,7 @@ def _about(diff: SpecificationDiff | LogDiff) -> str:
 
 
 def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> Iterator[Html]:
-    """Yield each change: its headline, and its sentences with their times as links."""
+    """Yield the changes, each with its headline and with sentences whose times are links."""
     if diff.is_empty:
         yield element("p", "Nothing differs.")
     if isinstance(diff, SpecificationDiff):
@@ -314,7 +318,7 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
 
 
 def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> list[Html]:
-    """Return places for the first decision that differs, of both runs, with its gradient maps."""
+    """Return a panel per run for the first decision that differs, to be filled by the page's script."""
     if decision is None:
         return []
     names = zip(("decision-a", "decision-b"), labels, strict=True)
@@ -328,7 +332,7 @@ def _is_flipped(old: SpecResult, new: SpecResult) -> bool:
 def _change(
     title: str, verdicts: Sequence[str], sentences: Sequence[Sentence], first_ns: tuple[int, int]
 ) -> Html:
-    """Return one change, with its verdict or, where that has flipped, both."""
+    """Return one change with its verdict, or with both verdicts if they differ."""
     marks = [mark for verdict in dict.fromkeys(verdicts) for mark in (text(" → "), chip(verdict))][1:]
     name = element("span", text(title), **{"class": "name"})
     summary = element("div", *marks, name, **{"class": "summary"})
@@ -337,7 +341,7 @@ def _change(
 
 
 def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
-    """Yield a sentence whose times say which run they are of."""
+    """Yield a sentence, with the times of run B marked as such."""
     is_b = first_ns[0] != first_ns[1] and any(
         isinstance(part, Instant) and part.first_ns == first_ns[1] for part in sentence.parts
     )
@@ -347,7 +351,7 @@ def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
 
 
 def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dict[str, Any]:
-    """Return which curves belong together, how times correspond, and the time at which the page opens."""
+    """Return the pairs of curves, the alignment of both clocks, and the time at which the page opens."""
     first_ns: int | None = None
     decision: DecisionDiff | None = None
     nodes: list[dict[str, Any]] = []
@@ -392,7 +396,7 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
 
 
 _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
-"""By the title of a result: its place on the page, and those of its nodes."""
+"""Index of a result on the page, and index of each of its shown nodes by id, by the result's title."""
 
 
 def _places(report: RunReport) -> _Places:
@@ -408,7 +412,7 @@ def _places(report: RunReport) -> _Places:
 def _node_pairs(
     title: str, titles: tuple[str, str], results: tuple[SpecResult, SpecResult], places: Sequence[_Places]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the roots of two results, and their nodes of one name."""
+    """Yield the pair of roots of two results, and the pairs of nodes with equal names."""
     yield from _node_pair(title, titles, (0, 0), places)
     named = {node.name: node.id for node in reversed(results[1].nodes) if node.name and node.id}
     seen: set[str] = set()
@@ -421,7 +425,7 @@ def _node_pairs(
 def _node_pair(
     label: str, titles: tuple[str, str], ids: tuple[int, int], places: Sequence[_Places]
 ) -> Iterator[dict[str, Any]]:
-    """Yield two nodes as the page finds them, if it shows both."""
+    """Yield a pair of nodes by their indices on the page, if the page shows both."""
     shown_nodes_of_pair = [
         [places_of_report[title][0], places_of_report[title][1][identifier]]
         for places_of_report, title, identifier in zip(places, titles, ids, strict=True)
