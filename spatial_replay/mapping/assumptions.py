@@ -835,7 +835,7 @@ ASSUMPTIONS: Final = (
     Assumption(
         "one_object",
         "A name is one object.",
-        "leaps by more than the object's size, and back within four reports; a quarter of reports contradicts",
+        "leaps by more than the object's size and back within four reports; a quarter of reports contradicts",
         _one_object,
         "give a `name` with the field that distinguishes them",
     ),
