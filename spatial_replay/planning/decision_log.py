@@ -343,7 +343,7 @@ class BlackBox:
     def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
         """Return messages of each channel, with consecutive numbers."""
         streams = []
-        # not strict, because only some decisions have messages of the last channel, timings
+        # the last channel, for timings, is often absent
         for channel, messages in zip(_CHANNELS, of_channels, strict=False):
             first = self._written[channel]
             self._written[channel] += len(messages)

@@ -1,4 +1,4 @@
-"""Targets: the best cell of an object's gradient map, or for a push the nearest good cell that it can reach.
+"""Targets: the best cell of an object's gradient map or, for a push, the nearest good cell within reach.
 
 A target is then refined on finer grids, from the centre of its cell to a better place and turn nearby.
 """
