@@ -60,11 +60,11 @@ from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_RECENT: Final = 20
-"""The most events in a message on recent ones."""
+"""Limit of events in a message on recent events."""
 
 
 class _Result:
-    """One result, with what its messages are made from; it follows the samples."""
+    """The state of one result between blocks, from which its messages are encoded."""
 
     def __init__(
         self,
@@ -94,35 +94,35 @@ class _Result:
             )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> list[EncodedEvent]:
-        """Take in the next samples and their evaluation; return the events."""
+        """Add the next samples and their evaluation, and return the events."""
         self._shades.extend(trace, block)
         self.violate(block)
         return self.reporter.extend(block)
 
     def violate(self, block: SeriesBlock) -> None:
-        """Follow which requirements are violated for certain."""
+        """Update since when each requirement is permanently violated."""
         self._since_ns = violated_since(self.requirements, block, self._since_ns)
 
     def robustness(self, block: SeriesBlock, *, final: bool = False) -> Payloads:
-        """Return one message per sample."""
+        """Return one message on robustness per sample."""
         tree = self.tree
         return encode_robustness(
             tree.name, tree.object, self._names, block.times_ns, block.series, final=final
         )
 
     def result_for_scene(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
-        """Return the result as the scene shows it."""
+        """Return the numbers of the result that the scene shows."""
         of = self._since_ns, self.reporter.settled, is_final, self._shades.shades
         return EvaluatedResult(self.requirements, block, self._pairs, *of)
 
 
 class Annotator:
-    """Encodes the results of an evaluation as messages, sample after sample.
+    """Encodes the results of an evaluation as messages, sample by sample.
 
-    Cutting the samples into blocks changes no message.
+    The messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        first_event_ns: the time of the first event; None before it.
+        first_event_ns: time of the first event; None before it.
     """
 
     def __init__(
@@ -140,12 +140,12 @@ class Annotator:
         """Start before the first sample.
 
         Args:
-            instances, automata: one for each of `trees`.
-            scene: what a viewer already shows, if it continues with these messages.
-            show: takes what the messages of the scene show.
-            arrow: the title of the result whose violation the scene points at; "" for the first one, and one
-                that there is not.
-            units: those that are declared, see `unit_of`.
+            instances, automata: one per tree.
+            scene: state of a viewer that continues with these messages; None for a new viewer.
+            show: function that receives the frames of the scene.
+            arrow: title of the result whose violation has the arrow. A title that no result has, such as "",
+                means the first violated result.
+            units: declared units, see `unit_of`.
         """
         self._units = units
         self._files = files
@@ -180,30 +180,30 @@ class Annotator:
 
     @property
     def scene(self) -> SceneState:
-        """State of a viewer after the messages so far."""
+        """The state of a viewer after the messages so far."""
         return self._scene
 
     @property
     def extent(self) -> SceneBounds | None:
-        """The box of all footprints so far, and of the planner's map; None before any."""
+        """The bounds of the planner's map and of all footprints so far; None without both."""
         return self._scene.extent.bounds
 
     def add_map(self, plan: Mapping[str, str]) -> None:
-        """Add the area of a planner's map to the extent, by the metadata of its plan."""
+        """Add the area of a planner's map, from the metadata of its plan, to the extent."""
         self._scene = replace(self._scene, extent=self._scene.extent.with_area(map_area(plan)))
 
     @property
     def has_samples(self) -> bool:
-        """Whether there was any sample."""
+        """Whether there was at least one sample."""
         return self._latest is not None
 
     @property
     def _over(self) -> list[str]:
-        """Deciding atoms of the results that are decided so far."""
+        """The deciding atom or missed response of each result, "" before its verdict."""
         return [result.reporter.over for result in self._results]
 
     def count_from(self, zero_ns: int) -> None:
-        """Set the time that texts count from; without it, that of the first sample."""
+        """Set the zero of times in texts; the default is the time of the first sample."""
         self._scene = replace(self._scene, zero_ns=zero_ns)
         self.standing.zero_ns = zero_ns
 
@@ -212,10 +212,10 @@ class Annotator:
             self.count_from(int(trace.times_ns[0]))
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
-        """Return what to write beside the next samples.
+        """Return the messages that annotate the next samples.
 
         Args:
-            blocks: their evaluation, one for each tree.
+            blocks: evaluation of the samples, one block per tree.
         """
         if not len(trace):
             return []
@@ -249,14 +249,14 @@ class Annotator:
         return messages
 
     def occurrence(self, time_ns: int, what: str, sentence: str) -> list[Messages]:
-        """Return the event of what happens to a run beside its samples."""
+        """Return the messages of an external event, such as a lost connection."""
         return self._events([encoded_occurrence(time_ns, what, sentence)])
 
     def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock], most_changes: int = 0) -> list[Messages]:
-        """Take in the next samples and return only their events, and how results stood at the last changes.
+        """Add the next samples, and return only their events and the standing at the last changes.
 
         Args:
-            most_changes: the number of these changes, at most; see `StandingEncoder.encode_changes`.
+            most_changes: limit of these changes; see `StandingEncoder.encode_changes`.
         """
         if not len(trace):
             return []
@@ -274,7 +274,7 @@ class Annotator:
         return [*messages, self._messages(_STANDING, *changes)]
 
     def draw(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
-        """Show the scene at the next sample, however short ago the one before was; nothing else is made."""
+        """Draw the scene at the next sample, without the rate limit of scenes and without other messages."""
         self.pass_over(trace, blocks)
         self._scene = replace(self._scene, written_ns=None)
         self._scene_messages(trace, blocks)
@@ -282,13 +282,15 @@ class Annotator:
     def end(
         self, time_ns: int, finals: Sequence[Floats], results: Sequence[SpecResult] = ()
     ) -> list[Messages]:
-        """Return what to write after the last sample: events of what was still pending, warnings, and how all
-        results stand, in numbers and in the scene.
+        """Return the messages after the last sample.
+
+        They are the final verdicts of pending nodes, warnings about untested parts, and the robustness,
+        standing and scene of the finished log.
 
         Args:
-            time_ns: when the log ends, the last sample's time or later.
+            time_ns: time of the end of the log, not before the last sample.
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
-            results: for each tree its result, if there is one: they know what they were tested by.
+            results: results of the trees, for the warnings; without results there are no warnings.
         """
         events = list[EncodedEvent]()
         for follower, final in zip(self._results, finals, strict=True):
@@ -311,14 +313,14 @@ class Annotator:
         standing = self._messages(_STANDING, np.array([time_ns]), [ending])
         for result, block in zip(self._results, ended, strict=True):
             result.violate(block)
-        # drawn again at once, now in the colours of the finished log
+        # without a time of the last scene, the final colours are drawn at once
         self._scene = replace(self._scene, written_ns=None)
         scene = self._scene_messages(trace, ended, is_final=True)
         times_ns = np.full(len(scene), time_ns)
         return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
 
     def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
-        """Keep the last sample, and the last one of each result, for the end."""
+        """Store the last sample of the trace and of each result, for the messages of `end`."""
         before = [None] * len(blocks) if self._latest is None else self._latest[1]
         latest = [
             _last_of(block) if len(block.times_ns) or earlier is None else earlier
@@ -327,7 +329,7 @@ class Annotator:
         self._latest = trace.slice(len(trace) - 1, len(trace)), latest
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
-        """Return one message per sample and result."""
+        """Return one message on robustness per sample and result."""
         encoded = [result.robustness(block) for result, block in zip(self._results, blocks, strict=True)]
         return self._in_order(_ROBUSTNESS, blocks, encoded)
 
@@ -352,9 +354,9 @@ class Annotator:
         ]
 
     def _recent(self, events: Sequence[EncodedEvent]) -> bytes:
-        """Add events of one time to the newest ones, and return these as one message.
+        """Add events of one time, and return a message with the newest events.
 
-        After a seek, viewers get no more of a topic of a file.
+        Each message repeats earlier events, because a viewer reads one message of each topic after a seek.
         """
         zero_ns = events[0].time_ns if self._scene.zero_ns is None else self._scene.zero_ns
         for event in events:
@@ -377,7 +379,7 @@ class Annotator:
     def _in_order(
         self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
     ) -> Messages:
-        """Order the messages of results by time; among equal times the order of results stays."""
+        """Sort the messages of all results by time. Messages of equal times keep the order of results."""
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         order = np.argsort(times_ns, kind="stable")
         return self._messages(channel, times_ns[order], Payloads.concatenate(encoded).select(order))
@@ -389,21 +391,25 @@ class Annotator:
 
 
 def _last_of(block: SeriesBlock) -> SeriesBlock:
-    """Return the last sample of a block, if it has any."""
+    """Return the last sample of a block, or an empty block for an empty one."""
+    # copies, because views would keep the whole block in memory
     return SeriesBlock(
         block.times_ns[-1:].copy(), block.series[:, :, -1:].copy(), block.leaves[:, :, -1:].copy()
     )
 
 
 def _with_final_intervals(block: SeriesBlock, final: Floats) -> SeriesBlock:
-    """Return a last sample, if there is one, with the interval (N, 2) of each node over the finished log."""
+    """Return the last sample with each node's interval over the finished log, (N, 2)."""
     series = block.series.copy()
     series[:, 2:] = final[:, :, None]
     return replace(block, series=series)
 
 
 def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
-    """Return the regions of all files; where two differ on a name, the later one gets its file's name."""
+    """Return the regions of all files by name.
+
+    If two files define a name differently, the later region is named FILE:NAME.
+    """
     outlines: dict[str, Outline] = {}
     for file in files:
         for name, outline in file.regions.items():
@@ -424,7 +430,7 @@ _RECENT_EVENTS = protobuf_channel(RECENT_EVENTS, RecentEvents)
 
 
 def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
-    """Return the channels of the messages that annotate a sample with results."""
+    """Return the channels of the messages that annotate samples."""
     if not trees:
         return (_FRAME, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _RECENT_EVENTS, _SCENE)
     events = (_EVENTS, _EVENT_LOG, _RECENT_EVENTS)

@@ -1,4 +1,4 @@
-"""Automata of results: their states after every sample → messages of /spatial/automaton, and their files."""
+"""Automata of results: their states after each sample as messages, and the automata as attachments."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from spatial_replay.spec.walks import nodes_of, rates_of
 from spatial_replay.text import listing
 
 _NOW = 1
-"""The place of `now` among the numbers of a node."""
+"""Index of `now` among the numbers of a node."""
 
 _MOST_TEMPLATES = 512
-"""Steps, each with up to `MAX_STATES` states, of which the messages and words are held."""
+"""Limit of cached steps, with their messages and words; a step has up to `MAX_STATES` states."""
 
-# what the values of propositions are in messages: false, true and, last so that -1 finds it, unknown
+# values of propositions in messages by FALSE, TRUE and UNKNOWN, which is the index -1
 _TRUTHS = np.array(
     [AutomatonState_pb2.TRUTH_FALSE, AutomatonState_pb2.TRUTH_TRUE, AutomatonState_pb2.TRUTH_UNKNOWN],
     np.uint8,
@@ -53,11 +53,11 @@ _TRUTHS = np.array(
 class AutomatonRun:
     """The run of one automaton over the samples, and its messages.
 
-    Cutting the samples into blocks changes no message.
+    The messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        propositions: the nodes that are the automaton's propositions, or that these judge where rates have
-            values.
+        propositions: the node of each proposition: the proposition itself, or the atom of a rate that the
+            proposition tests.
     """
 
     def __init__(
@@ -72,11 +72,11 @@ class AutomatonRun:
         """Start before the first sample.
 
         Args:
-            name: the specification's name.
-            object: the object that a template's parameter stands for, or None.
-            formula: what the automaton is of.
-            order: the leaves, in the order of a block's.
-            named: writes the object in place of the parameter.
+            name: name of the specification.
+            object: object of a template's instance, or None.
+            formula: formula of the automaton.
+            order: leaves in the order of `SeriesBlock.leaves`.
+            named: replaces a template's parameter by the object in a text.
         """
         self._name, self._object, self._named = name, object, named
         self._automaton = automaton
@@ -91,7 +91,7 @@ class AutomatonRun:
         self._possible[automaton.initial] = True
         self._are_nodes = all(self._is_node)
         self._state: int | None = automaton.initial
-        # whether the state has been stepped since the possible states were set
+        # whether `step` has moved `_state` on since `_possible` was set
         self._is_behind = False
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
@@ -102,7 +102,7 @@ class AutomatonRun:
         self._text = lru_cache(_MOST_TEMPLATES)(self._description)
 
     def encode(self, block: SeriesBlock) -> Sequence[bytes]:
-        """Take in the next samples; return one message for each."""
+        """Add the next samples, and return one message per sample."""
         if not len(block.times_ns):
             return []
         values = self._values(block)
@@ -119,22 +119,22 @@ class AutomatonRun:
         return join_in_order(encoded)
 
     def pass_over(self, block: SeriesBlock) -> None:
-        """Take in the next samples without a message."""
+        """Add the next samples without messages."""
         if len(block.times_ns):
             self._steps(self._values(block))
 
     def states(self, block: SeriesBlock) -> NDArray[np.bool_] | Integers:
-        """Take in the next samples, at least one; return the states after each, (T,) or as sets (T, S)."""
+        """Add at least one sample, and return the states after each sample, (T,) or as sets (T, S)."""
         return self._steps(self._values(block))[1]
 
     def step(self, time_ns: int, numbers: Floats, leaves: Callable[[], Floats]) -> tuple[int, ...]:
-        """Take in one sample; return the states after it, as `states` does of a block of one sample.
+        """Add one sample, and return the states after it.
 
-        Where all propositions are known, that takes a hundredth of the time.
+        If all propositions are known, this takes a hundredth of the time of `states` with one sample.
 
         Args:
-            numbers: (N, 4), those of the formula's nodes after the sample.
-            leaves: returns (C, A, 1), its leaves, for a sample that leaves a proposition unknown.
+            numbers: (N, 4), numbers of the formula's nodes after the sample.
+            leaves: returns (C, A, 1), the leaves of the sample; called only for the slow way.
         """
         now = [numbers.item(node, _NOW) for node in self.propositions]
         if self._state is None or not self._are_nodes or any(map(math.isnan, now)):
@@ -145,7 +145,7 @@ class AutomatonRun:
         return (self._state,)
 
     def words(self) -> tuple[list[str], Integers]:
-        """Return states in words, and which of them is after each of the samples last taken in."""
+        """Return the distinct states of the last block in words, and (T,) the index of words per sample."""
         texts, which = list[str](), np.empty(len(self._after), np.int64)
         for members in _alike(self._after, self._after):
             which[members] = len(texts)
@@ -161,7 +161,7 @@ class AutomatonRun:
         return tuple(_members(self._after[sample]).tolist())
 
     def _description(self, states: tuple[int, ...]) -> str:
-        """Return some states in words: what they decide, or what is still to be done."""
+        """Return states in words: their verdicts, or the guard of the next step to acceptance."""
         numbers = listing([*map(str, states)], _MOST_NAMED)
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
         accepting, can_accept, can_reject = self._about[list(states)].T
@@ -184,7 +184,7 @@ class AutomatonRun:
         return self._named(self._automaton.guard_words(move))
 
     def _values(self, block: SeriesBlock) -> Flags:
-        """Return (P, T): whether each proposition is true in each sample, or unknown."""
+        """Return (P, T), each proposition in each sample as TRUE, FALSE or UNKNOWN."""
         now = block.series[list(self.propositions), _NOW]
         values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
         unclear = np.isnan(now) | ~np.array(self._is_node, dtype=np.bool_)[:, None]
@@ -244,13 +244,13 @@ def states_of_result(
     """Return the automaton of a result and its states after each sample, (T,) or as sets (T, S).
 
     Raises:
-        NoAutomatonError: the spec has none.
-        UsageError: under the paper's semantics, or the leaves of the samples were not stored.
+        NoAutomatonError: the spec has no automaton.
+        UsageError: the semantics is the paper's, or the leaves of the samples were not stored.
     """
     require_ltlf(result.semantics, "an automaton")
     if result.leaves is None:
         raise UsageError("the states of an automaton need the leaves of every sample, which were not stored")
-    # of the very formula that was evaluated
+    # the evaluated formula itself is compiled, because nodes are found by identity
     machine = automaton(replace(specification, specs=(result.spec,)), result.spec.name, rate_hz=rate_hz)
     leaves = result.evidence.instance.program.leaves
     run = AutomatonRun(result.name, result.object, machine, result.formula, leaves)
@@ -258,7 +258,7 @@ def states_of_result(
 
 
 def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int]) -> int:
-    """Return the node that a proposition is, or that it judges where rates have values."""
+    """Return the id of a proposition's node, or of the atom of a rate that the proposition tests."""
     if id(proposition) in numbers:
         return numbers[id(proposition)]
     if isinstance(proposition, Boolean):
@@ -271,9 +271,9 @@ def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int])
 _LONGEST_GUARD = 500
 _LONGEST_STEP = 120
 _MOST_NAMED = 5
-"""The most states that are named where a run may be in one of several."""
+"""Limit of listed states if a run may be in one of several."""
 _MOST_SEARCHED = 2_000
-"""The most states of an automaton whose way to acceptance is looked for while it runs."""
+"""Limit of states of an automaton whose messages name the next step to acceptance."""
 
 
 def _shorten(text: str, most: int = _LONGEST_GUARD) -> str:
@@ -281,12 +281,12 @@ def _shorten(text: str, most: int = _LONGEST_GUARD) -> str:
 
 
 def _members(states: NDArray[np.bool_] | Integers) -> Integers:
-    """Return the numbers of the states in a set, or of one."""
+    """Return the numbers of the states in a set (S,), or of a single state."""
     return np.atleast_1d(np.flatnonzero(states) if states.ndim else states.astype(np.int64))
 
 
 def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers) -> Iterator[Integers]:
-    """Return the samples of each distinct step."""
+    """Yield the samples of each distinct pair of states before and after."""
     if before.ndim == 1:
         return equal_places(combined_code([before, after], len(before)))
     rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
@@ -296,17 +296,17 @@ def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Inte
 
 _STORED = ".json"
 _MOST_LITERALS = 50_000
-"""An automaton whose guards have more literals is stored only in the form that a replay reads."""
+"""Limit of literals in all guards of an automaton that is stored as DOT and HOA, too."""
 
 
 @dataclass(frozen=True)
 class SpecAutomaton:
-    """The automaton of a spec or, for a template, of all its instances.
+    """The automaton of a spec, which all instances of a template share.
 
     Attributes:
-        name: the name that the spec is reported under.
-        automaton: None if it has none.
-        reason: why not.
+        name: reported name of the spec.
+        automaton: the automaton; None if the spec has none.
+        reason: reason why the spec has none.
     """
 
     name: str
@@ -317,7 +317,7 @@ class SpecAutomaton:
 
     @property
     def summary(self) -> str:
-        """Its size, or the reason why there is none."""
+        """The size of the automaton, or the reason why there is none."""
         if self.automaton is None:
             return f"none: {self.reason}"
         return size_words(self.automaton)
@@ -330,11 +330,11 @@ def automata_of(
     compiled_before: Sequence[Attachment] = (),
     known: Sequence[SpecAutomaton] = (),
 ) -> list[SpecAutomaton]:
-    """Return the automaton of each tree's spec; instances of a template share theirs.
+    """Return the automaton of each tree's spec. Instances of a template share one automaton.
 
     Args:
-        compiled_before: attachments of a log; an automaton among them is used where it would take MONA.
-        known: automata of specs of these files, which are not compiled again.
+        compiled_before: attachments of a log, whose automata replace compilations with MONA.
+        known: compiled automata of specs in these files.
     """
     stored = [attachment.data for attachment in compiled_before if _is_stored(attachment)]
     by_formula = {id(spec_automaton.spec.formula): spec_automaton for spec_automaton in known}
@@ -350,7 +350,7 @@ def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list
     """Return the automata as files: JSON for a replay, DOT for Graphviz, HOA for other tools.
 
     Args:
-        prefix: what the names of the specification's own attachments begin with.
+        prefix: prefix of the names of the specification's attachments.
     """
     attachments = []
     for spec_automaton in {spec_automaton.name: spec_automaton for spec_automaton in automata}.values():

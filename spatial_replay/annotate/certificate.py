@@ -1,7 +1,7 @@
-"""Certificates: hashes of what an evaluation read and of its results.
+"""Certificates: hashes of the inputs and the results of an evaluation.
 
-Every hash is over content, however that is cut into blocks, chunks or files: one recording in two containers
-has one sample hash.
+Hashes depend only on content, not on the cut into blocks, chunks or files. So a recording has the same
+sample hash in two containers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from spatial_replay.version import __version__
 
 
 class SampleHash:
-    """SHA-256 of samples: every column of every object and signal, in the order of their names."""
+    """SHA-256 of samples: all columns of objects and signals, in the order of their names."""
 
     def __init__(self) -> None:
         self._times = hashlib.sha256()
@@ -34,13 +34,14 @@ class SampleHash:
         self._lasting: set[str] = set()
 
     def add(self, trace: Trace) -> None:
-        """Take in the next samples."""
+        """Add the next samples."""
         _take_in(self._times, _integers(trace.times_ns))
         classes = np.array([list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8)
         for name, rows in zip(trace.names, trace.rows.T, strict=True):
             seen = np.flatnonzero(rows != ABSENT)
             if not len(seen):
                 continue
+            # unreadable observations are stored under the row number -2 - row
             observations = np.where(rows < ABSENT, -2 - rows, rows)[seen]
             shapes = trace.footprints.select(observations)
             columns = (
@@ -75,7 +76,7 @@ class SampleHash:
             self._add_reports(f"signal {name}", trace.times_ns, reported_ns, is_known)
 
     def _add_reports(self, what: str, times_ns: Integers, reported_ns: Integers, is_known: Booleans) -> None:
-        """Take in the times of reports that are not those of samples: of many logs, none."""
+        """Add the times of reports that differ from the time of their sample; many logs have none."""
         earlier = np.flatnonzero(is_known & (reported_ns != times_ns))
         if len(earlier):
             hashed = self._reports.setdefault(what, hashlib.sha256())
@@ -99,18 +100,18 @@ class SampleHash:
 
 
 class MessageHash:
-    """SHA-256 of messages: of each topic, in order, the times and bytes of its messages.
+    """SHA-256 of messages: the times and bytes of each topic's messages, in order.
 
-    The order among topics does not count: a recorder gets messages from several threads, and may have written
-    later ones of one topic when those of another arrive.
+    The order of messages of different topics does not count. A recorder receives messages from several
+    threads, and may write later messages of one topic before messages of another topic arrive.
     """
 
     def __init__(self) -> None:
-        # one hash per column, so that many messages are hashed at once however they are cut into blocks
+        # one hash per column: many messages are hashed at once, and the cut into blocks does not count
         self._topics: dict[str, tuple[hashlib._Hash, hashlib._Hash, hashlib._Hash]] = {}
 
     def add(self, messages: Messages) -> None:
-        """Take in the next messages."""
+        """Add the next messages."""
         for topic, rows in messages.by_topic():
             payloads = [messages.payloads[row] for row in rows.tolist()]
             lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
@@ -141,7 +142,7 @@ def plan_sha256(plan: Mapping[str, str]) -> str:
 
 
 def specifications_json(files: Sequence[Specification]) -> str:
-    """Return specifications as metadata lists them, in JSON: name, SHA-256 of their text, plug-ins."""
+    """Return specifications as JSON for metadata: a list of name, SHA-256 of the text, and plug-ins."""
     entries = []
     for file in files:
         text = format_specification(file).encode("utf-8", "surrogatepass")
@@ -151,20 +152,24 @@ def specifications_json(files: Sequence[Specification]) -> str:
 
 
 class EvaluationHashes:
-    """The hashes of an evaluation: of its samples, of the messages beside them, and of its results."""
+    """The hashes of an evaluation: of its samples, of the log's other messages, and of its results."""
 
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
-        """Start before the first sample; each result has a name and, of a template, an object."""
+        """Start before the first sample.
+
+        Args:
+            names: name of each result, with the object of a template's instance or None.
+        """
         self._samples, self._messages = SampleHash(), MessageHash()
         self._results = [(_text(name) + _text(object), hashlib.sha256()) for name, object in names]
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
-        """Take in the next samples and the log's own messages; their results follow, in any pieces."""
+        """Add the next samples and the log's own messages. Their results may be added in other blocks."""
         self._samples.add(trace)
         self._messages.add(own)
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
-        """Take in the next numbers of each result, sample by sample, node by node."""
+        """Add the next numbers of each result, sample by sample, node by node."""
         for (_, hashed), block in zip(self._results, results, strict=True):
             _take_in(hashed, _floats(block.series.transpose(2, 0, 1)))
 
@@ -174,11 +179,11 @@ class EvaluationHashes:
         plan: Mapping[str, str] | None = None,
         doubts: Iterable[str] = (),
     ) -> Mapping[str, str]:
-        """Return the certificate of the evaluation, once it is finished.
+        """Return the certificate of the finished evaluation.
 
         Args:
-            plan: the metadata of a planned run.
-            doubts: titles of the doubts that the log was read with.
+            plan: metadata of a planned run; None without a plan.
+            doubts: titles of the doubts about the log.
         """
         titles = ", ".join(sorted(doubts))
         specifications, results = hashlib.sha256(), hashlib.sha256()
@@ -198,17 +203,17 @@ class EvaluationHashes:
 
 
 def _take_in(hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
-    # an array is a buffer, though its type does not say so
+    # hashlib accepts an array as a buffer, but its type stub does not
     hashed.update(cast(bytes, buffer))
 
 
 def _integers(values: Integers) -> NDArray[np.generic]:
-    """Return little-endian values side by side, without a copy where they are that already."""
+    """Return contiguous little-endian int64, copied only if necessary."""
     return np.ascontiguousarray(values, "<i8")
 
 
 def _floats(values: Floats) -> NDArray[np.generic]:
-    """Return the same of doubles, in which every NaN is the same one."""
+    """Return contiguous little-endian float64, with equal bits for all NaN."""
     ordered = np.ascontiguousarray(values, "<f8")
     unknown = np.isnan(ordered)
     return np.where(unknown, np.nan, ordered) if unknown.any() else ordered

@@ -1,7 +1,7 @@
-"""The leaf that gives a node its number, found by comparing numbers instead of walking through the log.
+"""The deciding leaf of a node, found by comparing numbers instead of evaluating the log again.
 
-Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with its
-sign turned. If that sample is the newest, `find_leaf` compares the numbers of the leaves there.
+Robustness consists of minima, maxima and negations. So the number of a node equals the number of a leaf in
+some sample, up to its sign. If that sample is the newest, `find_leaf` finds the leaf by comparison.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from spatial_replay.trace.trace import Trace
 
 
 class LeavesBelow(NamedTuple):
-    """The leaves below one node, each once for each sign in which it counts.
+    """The leaves below one node, with one entry per leaf and sign.
 
     Attributes:
         indices: (L,) int64, index among the program's leaves.
@@ -72,13 +72,13 @@ class DecidingLeaf(NamedTuple):
 
     Attributes:
         leaf: index among the program's leaves.
-        number: its own number there, its sign not turned, without what is uncertain.
-        end: which end of its interval that is.
-        time_ns: of the sample.
-        node: its id in the formula's tree; -1 where only its number was compared.
-        bound: the same number with what is uncertain: the end of its interval that decides.
-        missed: the implication above it that failed, if a violation is due to one.
-        response: where it is the condition's, the leaf by which the response came closest, if one did.
+        number: nominal number of the leaf in the sample, with the leaf's own sign.
+        end: end of the leaf's interval that `number` is.
+        time_ns: time of the sample.
+        node: id of the leaf in the formula's tree; -1 if the leaf was found by its number alone.
+        bound: deciding end of the leaf's interval with uncertainty.
+        missed: the failed implication above the leaf that causes the violation, or None.
+        response: for a leaf of the condition, the leaf closest to fulfilling the response, or None.
     """
 
     leaf: int
@@ -92,7 +92,7 @@ class DecidingLeaf(NamedTuple):
 
     @property
     def shown(self) -> DecidingLeaf:
-        """The leaf to point at: that of a response that was missed, not of the condition that held."""
+        """The leaf that arrows point at: for a missed response `response`, otherwise this leaf."""
         return self if self.response is None else self.response
 
 
@@ -100,7 +100,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
     """Return the leaves below each node of a formula, by id.
 
     Args:
-        leaves: the program's leaves, of which equal ones are one.
+        leaves: the program's leaves, without duplicates.
     """
     numbers = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
     nodes = nodes_with_operands(formula)
@@ -119,13 +119,13 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
 def find_leaf(
     below: LeavesBelow, ends: tuple[Floats, Floats], number: float, time_ns: int, *, low: bool
 ) -> DecidingLeaf | None:
-    """Return the first leaf below a node that has the node's number, in one sample.
+    """Return the first leaf below a node whose number in a sample gives the node its number.
 
     Args:
-        ends: (A,) low and high end of each of the program's leaves in that sample.
-        number: of the node; NaN finds the first that is unknown, an infinite one identifies no leaf.
-        time_ns: of the sample.
-        low: whether the number is the low end of the node's interval, or the high one.
+        ends: (A,), low and high end of each of the program's leaves in the sample.
+        number: number of the node. NaN finds the first unknown leaf; an infinite number finds no leaf.
+        time_ns: time of the sample.
+        low: whether the number is the low end of the node's interval; False for the high end.
     """
     if np.isinf(number):
         return None
@@ -136,6 +136,7 @@ def find_leaf(
     if not len(hits):
         return None
     end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
+    # adding 0.0 turns -0.0 into 0.0
     leaf_number = number if np.isnan(number) else float(numbers[hits[0]]) + 0.0
     return DecidingLeaf(int(below.indices[hits[0]]), leaf_number, end, time_ns)
 
@@ -146,13 +147,13 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
 
 
 _RECENT: Final = 1024
-"""Samples before a change in which the object that decides a quantifier is looked for."""
+"""Length of the search for the deciding object of a quantifier before a change, samples."""
 
 
 class NewestSamples:
-    """The newest samples, in which quantifiers are traced to the objects that decide them.
+    """The newest samples, for finding the deciding objects of quantifiers.
 
-    Cutting the samples into blocks changes nothing.
+    Results do not depend on the cut of samples into blocks.
     """
 
     def __init__(self) -> None:
@@ -161,7 +162,7 @@ class NewestSamples:
         self._older = 0
 
     def extend(self, trace: Trace) -> None:
-        """Take in the next samples."""
+        """Add the next samples."""
         while self._blocks and self._older - len(self._blocks[0]) >= _RECENT:
             self._older -= len(self._blocks.popleft())
         self._blocks.append(trace)
@@ -170,14 +171,15 @@ class NewestSamples:
     def deciding_atom(
         self, leaf: Formula, found: DecidingLeaf, now_ns: int, regions: Mapping[str, Outline]
     ) -> tuple[Atom, float] | None:
-        """Return the atom of the objects that give a quantifier its number, with the atom's own number.
+        """Return the deciding atom of a quantifier, with the deciding objects and the atom's own number.
 
-        None if the sample is not recent, if earlier samples would be needed, or if no atom has
-        that number.
+        None if the sample is not recent, if the quantifier needs earlier samples, or if no atom has the
+        number.
 
         Args:
-            leaf: with the object of a template.
-            now_ns: the time of the sample from which the number is looked back at.
+            leaf: the quantifier, with the object in place of a template's parameter.
+            found: number and sample of the quantifier.
+            now_ns: time of the change, before which the sample must be recent.
         """
         sample = self.sample(found.time_ns, now_ns)
         if sample is None or look_back([leaf]):
@@ -191,7 +193,7 @@ class NewestSamples:
         return (decided.atom, number) if number in ends else None
 
     def sample(self, time_ns: int, now_ns: int) -> Trace | None:
-        """Return the sample of a time, if it is recent."""
+        """Return the sample at a time, if it is at most `_RECENT` samples before `now_ns`; else None."""
         between = 0
         for trace in reversed(self._blocks):
             at, now = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
@@ -203,18 +205,18 @@ class NewestSamples:
 
 
 MOST_NUMBERS: Final = 1 << 22
-"""Numbers of leaves that are kept of one result, at most: 32 MiB of them."""
+"""Limit of stored leaf numbers per result: 32 MiB."""
 _END_OF: Final = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}
 
 
 class SettledViolation(NamedTuple):
-    """The leaf that made a violation certain before the end of a log.
+    """A violation that was certain before the end of a log.
 
     Attributes:
-        time_ns: of the sample since which it is certain.
-        leaf: what decided it then, perhaps at an earlier sample; None if no leaf did.
-        atom: the leaf to point at or, for a quantifier, the atom of the objects that decide it.
-        sample: the sample of that leaf, if it was recent then.
+        time_ns: time of the sample since which the violation is certain.
+        leaf: deciding leaf, perhaps of an earlier sample; None if no leaf decided.
+        atom: formula of the leaf to point at; for a quantifier its deciding atom, with objects.
+        sample: sample of that leaf; None if it was not recent at `time_ns`.
     """
 
     time_ns: int
@@ -224,19 +226,19 @@ class SettledViolation(NamedTuple):
 
     @property
     def shown(self) -> DecidingLeaf | None:
-        """The leaf to point at, if there is one."""
+        """The leaf that arrows point at, or None."""
         return None if self.leaf is None else self.leaf.shown
 
     @property
     def objects(self) -> list[str]:
-        """The objects that the atom relates, as it can be pointed at."""
+        """The objects at the ends of the arrow at the atom."""
         pair = None if self.atom is None else pair_of(self.atom)
         terms = [] if pair is None else [base_of(pair.first), base_of(pair.second)]
         return [term.name for term in terms if isinstance(term, TrackedName)]
 
 
 class LeafHistory:
-    """The leaves of one result in the samples so far; cutting the samples into blocks changes nothing."""
+    """The leaves of one result in the samples so far. The cut of samples into blocks does not count."""
 
     def __init__(
         self, formula: Formula, order: Sequence[Atom | Quantified], bindings: Bindings | None = None
@@ -244,8 +246,8 @@ class LeafHistory:
         """Start before the first sample.
 
         Args:
-            order: which leaf is which.
-            bindings: what the parameter of a template stands for.
+            order: leaves in the order of `SeriesBlock.leaves`.
+            bindings: object by the parameter of a template.
         """
         self._bindings = bindings or {}
         self._formula = formula
@@ -257,11 +259,11 @@ class LeafHistory:
         ]
         self._blocks: list[SeriesBlock] = []
         self._samples = 0
-        # two channels at least, so that the bound does not depend on whether a block has uncertain leaves
+        # four channels always, so that the limit does not depend on whether a block has uncertain leaves
         self._most = MOST_NUMBERS // max(4 * len(order), 1)
 
     def extend(self, block: SeriesBlock) -> None:
-        """Take in the next samples."""
+        """Add the next samples. Beyond `MOST_NUMBERS`, all stored samples are dropped."""
         self._samples += len(block.times_ns)
         if self._samples > self._most:
             self._blocks.clear()
@@ -271,16 +273,16 @@ class LeafHistory:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all samples so far are kept."""
+        """Whether all samples so far are stored."""
         return self._samples <= self._most
 
     def settling_leaf(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
-        """Return what settled a node's verdict at a sample; None beyond the bound.
+        """Return the leaf that settled a node's verdict at a sample; None beyond `MOST_NUMBERS`.
 
-        For a violated conjunction it settled the first violated conjunct.
+        For a violated conjunction, it is the leaf that settled the first violated conjunct.
 
         Args:
-            series: (N, 4), the numbers of all nodes at that sample.
+            series: (N, 4), numbers of all nodes at that sample.
         """
         samples = self._until(time_ns)
         if samples is None:
@@ -292,9 +294,9 @@ class LeafHistory:
         return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
     def final_leaf(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
-        """Return what decides a node that was pending up to the end of the log; None beyond the bound.
+        """Return the deciding leaf of a node that was pending at the end; None beyond `MOST_NUMBERS`.
 
-        For a violated conjunction it decides the first cause (see `find_causes`).
+        For a violated conjunction, it is the deciding leaf of the first cause (see `find_causes`).
 
         Args:
             values: (N,), each node's value on the whole log.
@@ -311,7 +313,7 @@ class LeafHistory:
         return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
 
     def _until(self, time_ns: int | None) -> SeriesBlock | None:
-        """Return the samples up to a time, or all."""
+        """Return the samples up to a time, or all samples; None without stored samples."""
         if not self._blocks:
             return None
         self._blocks = [join_blocks(self._blocks)]
@@ -320,7 +322,10 @@ class LeafHistory:
     def _leaf(
         self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes, verdict: Verdict
     ) -> DecidingLeaf | None:
-        """Return the leaf at the end of a path, with what was missed; None if it has no finite number."""
+        """Return the leaf at the end of a path, with the missed response of a violation.
+
+        None if the leaf has no finite number.
+        """
         deciding = self._end_of(path, samples)
         if deciding is None or verdict is not Verdict.VIOLATED:
             return deciding
@@ -339,6 +344,7 @@ class LeafHistory:
             return None
         low, high = low_and_high(len(samples.leaves), wide=False)
         number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        # a nominal number of the other sign would contradict the verdict
         if not math.isfinite(number) or (number >= 0.0) != (bound >= 0.0):
             number = bound
         time_ns = int(samples.times_ns[sample])
@@ -346,7 +352,7 @@ class LeafHistory:
 
 
 class Pair(NamedTuple):
-    """Two terms that an atom relates: by their distance, or by how far one sticks out of the other."""
+    """Two terms that an atom relates, by their distance or by the protrusion of one from the other."""
 
     first: Term
     second: Term
@@ -354,7 +360,7 @@ class Pair(NamedTuple):
 
     @property
     def names(self) -> tuple[TrackedName | RegionName, ...]:
-        """The objects and regions that are related, each once."""
+        """The related objects and regions, each once."""
         bases = dict.fromkeys((base_of(self.first), base_of(self.second)))
         return tuple(base for base in bases if isinstance(base, TrackedName | RegionName))
 
@@ -363,13 +369,13 @@ class LeafPairs(NamedTuple):
     """The pairs of objects and regions that the leaves of one result relate.
 
     Attributes:
-        leaves: those of the program, with the object of a template.
-        pairs: of each of the program's leaves; None for one that does not relate two things in one sample.
-        below: of each requirement of the formula, its leaves.
+        leaves: leaves of the program, with the object in place of a template's parameter.
+        pairs: pair of each leaf; None for a leaf that does not relate two things in one sample.
+        below: leaves below each requirement of the formula.
         regions: shapes by name.
-        divisors: of each leaf, what `scale` divides its number by.
-        texts: of each leaf, in the language.
-        relations: the names of those that texts may use.
+        divisors: divisor of each leaf's number by `scale`, 1 without one.
+        texts: text of each leaf in the language.
+        relations: names of relations that texts may use.
     """
 
     leaves: tuple[Formula, ...]
@@ -381,7 +387,7 @@ class LeafPairs(NamedTuple):
     relations: frozenset[str]
 
     def text_of(self, formula: Formula) -> str:
-        """Return a part of the formula in the language."""
+        """Return the text of a formula in the language."""
         return format_formula(formula, relations=self.relations)
 
 
@@ -391,10 +397,10 @@ def leaf_pairs(
     regions: Mapping[str, Outline],
     relations: frozenset[str] = frozenset(),
 ) -> LeafPairs:
-    """Return what the leaves of an instance relate.
+    """Return the pairs of the leaves of an instance.
 
     Args:
-        relations: the names of those that the file defines.
+        relations: names of relations that the file defines.
     """
     below = leaves_below(instance.formula, instance.program.leaves)
     leaves = tuple(substitute(leaf, instance.bindings) for leaf in instance.program.leaves)
@@ -406,7 +412,10 @@ def leaf_pairs(
 
 
 def pair_of(leaf: Formula) -> Pair | None:
-    """Return the first distance or enclosure in an atom, or the distance of its first terms."""
+    """Return the first distance or enclosure in an atom, or else the distance of its first two terms.
+
+    None for other leaves, and for terms that look back in time.
+    """
     if not isinstance(leaf, Atom):
         return None
     for pair in _pairs(leaf):

@@ -1,6 +1,6 @@
-"""Specifications evaluated over samples, for their results and for the messages of an annotated log.
+"""Evaluations of specifications over samples, with the messages of an annotated log.
 
-The encoders of messages are loaded with the first message, so that an evaluation without any needs none.
+The encoders are imported with the first message, so that an evaluation without messages imports none.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.scene.scene_update import SceneState
 
 _MOST_NAMED: Final = 10
-"""The most results that an error lists."""
+"""Limit of results in an error."""
 
 
 class AnnotatedEvaluation:
-    """Specifications evaluated over samples as they come, with the messages of an annotated log.
+    """An evaluation of specifications, block by block, with the messages of an annotated log.
 
-    Cutting the samples into blocks changes neither numbers nor messages.
+    Numbers and messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        trees: every result, under the name it is reported by.
-        streams: their evaluation, in the same order.
+        trees: reported trees of all results.
+        streams: evaluation of each tree.
     """
 
     def __init__(
@@ -59,16 +59,16 @@ class AnnotatedEvaluation:
         """Start before the first sample.
 
         Args:
-            instances: what to evaluate of each file.
-            compiled_before: returns the attachments of a log; automata among them are not compiled with MONA.
-            known: automata of specs of these files, which are not compiled again.
-            show: takes what the messages of the scene show.
-            arrow: the title of the result whose violation the scene points at; "" for the first one.
-            units: those that are declared, see `unit_of`.
-            plan: the metadata of the plan that the log was recorded with, whose map the scene has room for.
+            instances: instances to evaluate, by file.
+            compiled_before: returns the attachments of a log, whose automata replace compilations with MONA.
+            known: compiled automata of specs in these files.
+            show: function that receives the frames of the scene.
+            arrow: title of the result whose violation has the arrow; "" for the first violated result.
+            units: declared units, see `unit_of`.
+            plan: metadata of the log's plan; its map belongs to the extent of the scene.
 
         Raises:
-            UsageError: no result has that title.
+            UsageError: no result has the title `arrow`.
         """
         self._files = files
         self._semantics = semantics
@@ -86,10 +86,10 @@ class AnnotatedEvaluation:
         self.check_arrow(arrow)
 
     def check_arrow(self, title: str) -> None:
-        """Check that a result has a title, or that it is "".
+        """Check that a result has a title; "" is valid, too.
 
         Raises:
-            UsageError: none has.
+            UsageError: no result has the title.
         """
         if title and not any(tree.is_called(title) for tree in self.trees):
             titles = [tree.title for tree in self.trees]
@@ -97,17 +97,17 @@ class AnnotatedEvaluation:
             raise UsageError(f"there is no result {title!r} for the arrow to point at; {hint}")
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Evaluate the next samples; return one block for each of `trees`."""
+        """Evaluate the next samples, and return one block per tree."""
         return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
 
     @property
     def finals(self) -> list[Floats]:
-        """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
+        """For each tree, (N, 2), lower and upper end of each node's value if the log ends now."""
         return [stream.final for stream in self.streams]
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """The channels of the messages that annotate a sample."""
+        """The channels of the messages that annotate samples."""
         from spatial_replay.annotate.annotator import channels_of_results
 
         return channels_of_results(self.trees)
@@ -119,13 +119,13 @@ class AnnotatedEvaluation:
         axes: Axes = OUR_AXES,
         images: Collection[str] = (),
     ) -> LayoutContents:
-        """Return what an annotated log of these results has for a viewer to show.
+        """Return the contents of an annotated log that its layout shows.
 
         Args:
-            extent: of all footprints; None without any.
-            topics: those of messages that are not derived from samples.
-            axes: those of the source.
-            images: those of the topics that have images.
+            extent: bounds of all footprints; None without footprints.
+            topics: topics of messages that are not derived from samples.
+            axes: axes of the source.
+            images: topics with images.
         """
         from spatial_replay.annotate.annotator import shown_regions
         from spatial_replay.annotate.foxglove_layout import LayoutContents
@@ -158,15 +158,15 @@ class AnnotatedEvaluation:
         start: tuple[int, str] = (0, ""),
         planned: str = "",
     ) -> Attachment:
-        """Return the layout that opens the log in a viewer, once everything else is written.
+        """Return the layout for viewers of the log. All messages must be encoded before.
 
         Args:
-            topics: those of messages that are not derived from samples.
-            axes: those of the source.
-            images: those of the topics that have images.
-            planned_for: the file that decisions were made for, if these results are of another one.
-            start: the time of the first message that a viewer shows, and the name of the log that has it.
-            planned: the name of the result that a planner worked for.
+            topics: topics of messages that are not derived from samples.
+            axes: axes of the source.
+            images: topics with images.
+            planned_for: specification file of the decisions, if these results are of another file; else "".
+            start: time of the first message that a viewer shows, and name of its log.
+            planned: name of the result that a planner worked for; "" without a plan.
         """
         from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 
@@ -187,7 +187,7 @@ class AnnotatedEvaluation:
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """Automata of the trees; compiled on first use, since not every evaluation is written to a log."""
+        """The automata of the trees, compiled on first use, because only logs and viewers need them."""
         from spatial_replay.annotate.automaton_state import automata_of
 
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
@@ -201,9 +201,9 @@ class AnnotatedEvaluation:
         """Return an annotator that starts before the first sample.
 
         Args:
-            scene: what a viewer already shows, if it continues with these messages.
-            arrow: the title of the result whose violation the scene points at; "" for the first one.
-            show: takes what the messages of the scene show, instead of that of the evaluation.
+            scene: state of a viewer that continues with these messages; None for a new viewer.
+            arrow: title of the result whose violation has the arrow; "" for the first violated result.
+            show: function that receives the frames of the scene; None for the evaluation's own.
         """
         from spatial_replay.annotate.annotator import Annotator
 
@@ -222,7 +222,7 @@ class AnnotatedEvaluation:
 
     @cached_property
     def annotator(self) -> Annotator:
-        """The encoder of messages beside samples, which takes in what `extend` returns for these."""
+        """The encoder of the log's messages, which needs each block of `extend` with its samples."""
         annotator = self.new_annotator(arrow=self._arrow)
         annotator.add_map(self._plan)
         return annotator

@@ -73,7 +73,7 @@ class Gate:
             return "403 Origin Not Allowed"
         if self.token is not None:
             token = parse_qs(urlsplit(words[1]).query).get("token", [""])[0]
-            # in constant time, so that the response time tells nothing about the token
+            # in constant time, so that response times do not reveal the token
             if not hmac.compare_digest(token.encode(), self.token.encode()):
                 return "401 Token Missing Or Wrong"
         return None
@@ -241,7 +241,7 @@ async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWrite
 def with_exact_numbers(text: bytes) -> bytes:
     """Return a request with numbers of parameters in hexadecimal, because the SDK rounds long decimals.
 
-    Of 200 random decimals with 16 or 17 digits, the SDK changed the last bit of 24.
+    The SDK changed the last bit of 24 of 200 random decimals with 16 or 17 digits.
     """
     if b'"setParameters"' not in text:
         return text
