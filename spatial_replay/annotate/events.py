@@ -1,4 +1,4 @@
-"""Events: verdicts that change along a run, in sentences, and the leaves that changed them."""
+"""Events: changes of verdicts during a run, as sentences with the deciding leaves."""
 
 from __future__ import annotations
 
@@ -38,13 +38,16 @@ from spatial_replay.spec.walks import declared_unit, looks_ahead, substitute
 from spatial_replay.text import requirement_text, time_text, with_unit
 
 LASTING: Final = 3
-"""Samples in a row that a sign must last."""
+"""Debounce of a change of sign, samples in a row."""
 
 START, HOLDING, FAILING, UNKNOWN, SATISFIED, VIOLATED = 0, 1, 2, 3, 4, 5
-"""Nothing known yet; pending, with a value of at least 0, or below 0; unknown again; and the final ones."""
+"""States of a node.
+
+Nothing known yet; pending with a value of at least 0; pending with a value below 0; unknown again; and the
+final states."""
 
 OF_CURRENT, OF_CANDIDATE = -1, -2
-"""In place of a sample of the block: the worst sample lies before it and is part of the state."""
+"""Places of worst samples before the block: of the current state, and of the candidate for the next state."""
 
 _CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
 
@@ -54,9 +57,9 @@ class Period(NamedTuple):
 
     Attributes:
         code: the state.
-        start_ns, end_ns: its first and its last sample.
-        worst: the least number: of the value; of a final verdict, the end of the interval that decides.
-        place: the first sample of the block that has it, or `OF_CURRENT`, `OF_CANDIDATE`.
+        start_ns, end_ns: times of its first and its last sample.
+        worst: least value in the period; for a final verdict, the deciding end of the interval.
+        place: first sample of the block with `worst`, or `OF_CURRENT`, `OF_CANDIDATE`.
     """
 
     code: int
@@ -67,13 +70,13 @@ class Period(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A node is in another state than before.
+    """A change of the state of a node.
 
     Attributes:
-        node: index among the nodes tracked.
-        sample: index in the block, where it is confirmed.
-        before: None where nothing was known before.
-        after: the new period, up to the sample that confirms it.
+        node: index among the tracked nodes.
+        sample: index in the block of the sample that confirms the change.
+        before: the former period; None if nothing was known before.
+        after: the new period, up to the sample that confirms the change.
     """
 
     node: int
@@ -87,9 +90,9 @@ class NodeStates:
     """The states of some nodes, each with a candidate for the next one.
 
     Attributes:
-        integers: (K, 6) int64: of each node, its state, since when, its last sample; the candidate, for how
-            many samples in a row, since when.
-        worst: (K, 2): the least number of the state and of the candidate.
+        integers: (K, 6) int64, per node: its state, the times of the first and the last sample in that state;
+            the candidate, its count of samples in a row, the time of its first sample.
+        worst: (K, 2), least number of the state and of the candidate.
     """
 
     integers: Integers
@@ -102,12 +105,12 @@ class NodeStates:
 
     @property
     def are_final(self) -> bool:
-        """Whether no node can change any more."""
+        """Whether all nodes have final states."""
         return bool((self.integers[:, _CODE] >= SATISFIED).all())
 
     @property
     def pending(self) -> list[int]:
-        """The nodes that can still change."""
+        """The indices of the nodes whose state is not final."""
         return np.flatnonzero(self.integers[:, _CODE] < SATISFIED).tolist()
 
     def period(self, node: int) -> Period:
@@ -120,8 +123,8 @@ class TrackedChanges(NamedTuple):
     """The states of some nodes after a block, and the changes in it.
 
     Attributes:
-        changes: by node, then by time.
-        places: (K, 2) int64, where each of `states.worst` is: a sample of the block, or `OF_CURRENT`,
+        changes: changes by node, then by time.
+        places: (K, 2) int64, place of each number of `states.worst`: a sample of the block, or `OF_CURRENT`,
             `OF_CANDIDATE`.
     """
 
@@ -133,16 +136,17 @@ class TrackedChanges(NamedTuple):
 def track(
     before: NodeStates, times_ns: Integers, series: Floats, nodes: Integers, *, settles: bool = True
 ) -> TrackedChanges:
-    """Take in the next samples.
+    """Update the states of some nodes with the next samples.
 
     Args:
-        times_ns: (T,).
+        times_ns: (T,), times of the samples.
         series: (N, 4, T): value, now, lower, upper.
-        nodes: (K,) int64, ids of the nodes that are tracked.
-        settles: whether an interval on one side of 0 is a verdict that stays.
+        nodes: (K,) int64, ids of the tracked nodes.
+        settles: whether an interval on one side of 0 is a final verdict.
     """
     integers, worst = before.integers.copy(), before.worst.copy()
     places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
+    # a change takes `LASTING` samples, the first may have begun before the block, and a verdict takes one
     room = len(nodes) * (len(times_ns) // LASTING + 2)
     change_rows, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
     count = _track(times_ns, series, nodes, settles, integers, worst, places, change_rows, numbers)
@@ -223,12 +227,12 @@ _NOW: Final[Mapping[int, str]] = {
 
 
 def change_sentence(title: str, after: Period, witness: str, unit: str = "") -> str:
-    """Return a sentence on what has begun.
+    """Return a sentence on the new state of a node.
 
     Args:
-        title: what the node is called.
-        witness: the leaf that its number is that of, in words; "" for none.
-        unit: the declared one of its number, or "".
+        title: name of the node in sentences.
+        witness: deciding leaf in words; "" for none.
+        unit: declared unit of the number, or "".
     """
     is_short = after.code == FAILING
     because = ""
@@ -244,8 +248,8 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
     """Return a sentence on the verdict over the finished log.
 
     Args:
-        ends: of the interval of its value; NaN where that is not determined.
-        unit: their declared one, or "".
+        ends: ends of the interval of the value; NaN if not determined.
+        unit: declared unit of the ends, or "".
     """
     amount, because = "", f": {witness}" if witness else ""
     number = ends[verdict is Verdict.VIOLATED]
@@ -258,7 +262,7 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
 
 
 def past_sentence(before: Period, until_ns: int, witness: str, unit: str) -> str:
-    """Return a sentence on the period before, until another began."""
+    """Return a sentence on the former period, which lasted until `until_ns`."""
     seconds = time_text(until_ns, before.start_ns)
     if before.code in (FAILING, UNKNOWN):
         return f"Before, it was {'pending' if before.code == FAILING else 'unknown'} for {seconds}."
@@ -274,14 +278,14 @@ class ReportedNode(NamedTuple):
     """A node whose changes are reported.
 
     Attributes:
-        node: its id.
-        title: what it is called in a sentence.
-        name: the spec's name.
-        line: where the spec stands in its file, from 1; 0 if nowhere.
-        below: its leaves.
-        requirement, sentence: the id of the requirement that the spec stands for, and its words, or None.
-        is_needed: whether the root needs it to hold; not within `not`, or as one of several that may hold.
-        unit: the declared one of its number, or "".
+        node: id of the node.
+        title: name of the node in sentences.
+        name: name of the spec.
+        line: line of the spec in its file, from 1; 0 if it is not in the file.
+        below: leaves below the node.
+        requirement, sentence: id and title of the spec's requirement, or None.
+        is_needed: whether the root needs the node to hold, because only conjunctions are above it.
+        unit: declared unit of its number, or "".
     """
 
     node: int
@@ -296,10 +300,12 @@ class ReportedNode(NamedTuple):
 
 
 class PeriodText(NamedTuple):
-    """A period in words: the leaf that gives its number, "" if none does, and a sentence.
+    """A period in words.
 
     Attributes:
-        decided: that leaf with its node and its time, of a verdict where that is known.
+        witness: the deciding leaf in words; "" for none.
+        sentence: the sentence on the period.
+        decided: the deciding leaf with its node; None if the leaf was found by its number alone.
     """
 
     period: Period
@@ -309,7 +315,13 @@ class PeriodText(NamedTuple):
 
 
 class EncodedEvent(NamedTuple):
-    """One change, the time at which it is confirmed, and its message for a list of events."""
+    """One event as messages.
+
+    Attributes:
+        time_ns: time of the sample that confirms the change.
+        event: the serialized `foxglove.Event`.
+        log: the message for a list of events.
+    """
 
     time_ns: int
     event: bytes
@@ -317,7 +329,7 @@ class EncodedEvent(NamedTuple):
 
     @property
     def facts(self) -> EventFacts:
-        """Its facts, as far as a list of events needs them."""
+        """The facts of the event that a list of events needs."""
         event = Event.FromString(self.event)
         facts = EventFacts(start_time=event.start_time, end_time=event.end_time)
         for entry in event.metadata:
@@ -327,12 +339,12 @@ class EncodedEvent(NamedTuple):
 
 
 _LISTED: Final = frozenset({"specification", "object", "node", "verdict", "sign", "witness_node", "vacuous"})
-"""The facts of an event that a list of events needs."""
+"""Keys of the facts that a list of events needs."""
 
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
-    """Encode what happens to a run beside its samples, such as a connection that is lost."""
-    # what it makes unknown is reported with the samples
+    """Encode an external event, such as a lost connection."""
+    # verdicts that become unknown by it are reported with the samples
     facts = {"occurrence": what, "verdict": str(Verdict.UNKNOWN), "message": sentence}
     at = _stamp(time_ns)
     event = Event(start_time=at, end_time=at)
@@ -343,15 +355,14 @@ def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
 
 
 class EventReporter:
-    """Reports the changes of one result's root and of the named specs in it, up to the end of the log.
+    """Reports the changes of a result's root and of its named specs, up to the end of the log.
 
-    Its state between blocks is a few numbers for each of these nodes, and the leaves of each operand at one
-    sample. Up to a limit it keeps the leaves of all samples (see `LeafHistory`).
+    Between blocks it stores a few numbers and two deciding leaves for each of these nodes. Up to a limit it
+    stores the leaves of all samples (see `LeafHistory`).
 
     Attributes:
-        settled: what settled the violation of the root before the end of the log, once it has happened.
-        over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
-            is not known.
+        settled: the violation of the root that was certain before the end of the log; None without one.
+        over: the deciding atom or the missed response of the root's verdict; "" before it, or if not known.
     """
 
     def __init__(
@@ -366,8 +377,9 @@ class EventReporter:
         """Start before the first sample.
 
         Args:
-            units: those that are declared, see `unit_of`.
-            samples: take in each sample before this does; without them quantifiers are named as a whole.
+            units: declared units, see `unit_of`.
+            samples: the newest samples, which the caller extends before this object. Without them, sentences
+                name quantifiers without their deciding objects.
         """
         self._units, self._regions = units, file.regions
         self._samples = samples or NewestSamples()
@@ -388,7 +400,7 @@ class EventReporter:
         self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
-        """Take in the next samples; return the changes that they confirm, by node, then by time."""
+        """Add the next samples, and return the changes that they confirm, by node, then by time."""
         if self._states.are_final:
             self._history = None
         if not len(block.times_ns) or self._states.are_final:
@@ -413,7 +425,7 @@ class EventReporter:
         """Return the final verdicts of the nodes that were still pending.
 
         Args:
-            time_ns: the time of these events; not before the last sample.
+            time_ns: time of these events, not before the last sample.
             final: (N, 2), lower and upper end of each node's value over the finished log.
         """
         if self._last_ns is None:
@@ -421,10 +433,10 @@ class EventReporter:
         return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
     def untested_warnings(self, time_ns: int, result: SpecResult) -> list[EncodedEvent]:
-        """Return one warning for each part of the result that was not tested, or not wholly.
+        """Return a warning for each part of the result that was not tested, or only partly.
 
         Args:
-            time_ns: when the log ends.
+            time_ns: time of the end of the log.
         """
         root = self._reported[0]
         facts = self._facts(root) | {"verdict": str(result.verdict), "tested": result.tested}
@@ -441,7 +453,7 @@ class EventReporter:
         ]
 
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> DecidingLeaf | None:
-        """Return the leaf that gives a period its worst number, if comparing numbers finds one."""
+        """Return the leaf with the worst number of a period; None if no leaf has it."""
         if period.place < 0:
             return self._carried.get((node, period.place))
         leaves = block.leaves[:, :, period.place]
@@ -534,7 +546,7 @@ class EventReporter:
         return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
     def _remember(self, node: int, found: DecidingLeaf | None, now_ns: int) -> None:
-        """Keep what decided the root's verdict, if it is one over all continuations."""
+        """Store the deciding atom or missed response of the root's verdict, under LTLf semantics."""
         if self._reported[node].node or found is None or not self._settles:
             return
         leaf, _ = self._leaf(found.shown, now_ns)
@@ -543,14 +555,14 @@ class EventReporter:
             self.over = f"missed {found.missed.response}"
 
     def _violation(self, found: DecidingLeaf | None, time_ns: int) -> SettledViolation:
-        """Return the violation of the root with the atom that settled it, as it stood then."""
+        """Return the violation of the root with the deciding atom and its sample."""
         if found is None:
             return SettledViolation(time_ns, found)
         atom, _ = self._leaf(found.shown, time_ns)
         return SettledViolation(time_ns, found, atom, self._samples.sample(found.shown.time_ns, time_ns))
 
     def _leaf(self, found: DecidingLeaf, now_ns: int) -> tuple[Formula, float]:
-        """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""
+        """Return a leaf with its number; for a quantifier, its deciding atom with the atom's number."""
         leaf = substitute(self._leaves[found.leaf], self._bindings)
         decided = None
         if isinstance(leaf, Quantified):
@@ -563,7 +575,10 @@ class EventReporter:
     def _settling_words(
         self, found: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
     ) -> tuple[str, str]:
-        """Return what decided in words, and the same with how long before a time; nothing for None."""
+        """Return the deciding leaf in words, and a longer text with its condition and the time since then.
+
+        Both are "" for None.
+        """
         if found is None:
             return "", ""
         missed, deciding = found.missed, found.shown
@@ -582,7 +597,7 @@ class EventReporter:
     def _words(
         self, found: DecidingLeaf | None, now_ns: int, *, past: bool = False, is_violated: bool = False
     ) -> str:
-        """Return a leaf and its number in words, as of `how_text`; "" for none."""
+        """Return a leaf with its number in words (see `how_text`); "" for None."""
         if found is None:
             return ""
         leaf, number = self._leaf(found, now_ns)
@@ -618,10 +633,10 @@ class EventReporter:
 def _reported_nodes(
     tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification, units: Mapping[str, str]
 ) -> list[ReportedNode]:
-    """Return the root, and once each named node that later samples can change.
+    """Return the root, and the first node of each named spec that later samples can change.
 
     Args:
-        below: of each node of the tree, its leaves.
+        below: leaves below each node of the tree.
     """
     specs = {spec.name: spec for spec in file.specs}
     reported_nodes: list[ReportedNode] = []
@@ -665,7 +680,7 @@ _ENDED: Final[Mapping[Verdict, int]] = {
     Verdict.VIOLATED: VIOLATED,
     Verdict.UNKNOWN: UNKNOWN,
 }
-"""The state of a node when the log has ended."""
+"""State of a node after the end of the log, by verdict."""
 
 _VERDICTS: Final = {SATISFIED: Verdict.SATISFIED, VIOLATED: Verdict.VIOLATED}
 

@@ -1,12 +1,12 @@
-"""The requirements of a formula: what it demands of objects and regions in a single sample.
+"""The requirements of a formula: its demands on objects and regions in a single sample.
 
-A formula without temporal operators is about the present sample alone. The largest such subformulas of a
-specification are its *requirements*. Each has the sign in which the specification needs it: under a negation,
-or left of an implication, low robustness is what is wanted. A requirement counts until its *obligation*, the
-largest temporal subformula around it, is fulfilled: no later sample can undo that.
+A formula without temporal operators concerns only the present sample. The largest such subformulas of a
+specification are its *requirements*. Each has the sign in which the specification needs it. Under a negation,
+or left of an implication, the specification needs low robustness. A requirement counts until its
+*obligation*, the largest temporal subformula around it, is permanently fulfilled.
 
-A requirement that fails now is violated only if that is certain: its obligation, and the conjunct of the
-specification that this is in, are permanently violated. A goal that is not reached yet is pending.
+A requirement that fails now is violated only if its obligation, and the conjunct of the specification around
+it, are permanently violated. A goal that is not reached yet is pending.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from spatial_replay.spec.walks import base_of, is_spatial, iter_bound, operand_s
 
 
 class Obligation(NamedTuple):
-    """A temporal subformula that is in no larger one.
+    """A temporal subformula that is not part of a larger one.
 
     Attributes:
-        node: its id in the formula's tree.
-        sign: 1 where the formula needs it to hold, -1 where it needs it not to.
+        node: id in the formula's tree.
+        sign: 1 if the formula needs the subformula to hold, -1 if it needs the subformula to fail.
     """
 
     node: int
     sign: float
 
     def is_fulfilled(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
-        """Return (S,) whether it is decided as it should be, whatever samples follow.
+        """Return (S,), whether the obligation is permanently met.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
@@ -62,17 +62,18 @@ class Obligation(NamedTuple):
         return np.asarray(series[self.node, 3, at] < 0.0)
 
     def is_open(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
-        """Return (S,) whether it is met, or later samples may still meet it; see `is_fulfilled`."""
+        """Return (S,), whether the obligation is met, or later samples may meet it; see `is_fulfilled`."""
         if self.sign > 0.0:
             return np.asarray(series[self.node, 3, at] >= 0.0)
         return np.asarray(series[self.node, 2, at] <= 0.0)
 
 
 class Standing(IntEnum):
-    """How a requirement stands in a sample.
+    """The state of a requirement in a sample.
 
-    `FULFILLED`: its obligation is, so that it no longer counts. `HOLDING` and `VIOLATED`: now, in the sign
-    that counts. `PENDING`: it fails now, and later samples can make up for that. `UNKNOWN`: not observed.
+    `FULFILLED`: the obligation is permanently met, so the requirement no longer counts. `HOLDING`: it holds
+    now. `VIOLATED`: it fails now, and later samples cannot make up for it. `PENDING`: it fails now, and later
+    samples can make up for it. `UNKNOWN`: it is not observed.
     """
 
     FULFILLED = 0
@@ -95,18 +96,19 @@ class ClassMembers(NamedTuple):
 
 
 class Requirement(NamedTuple):
-    """A subformula without temporal operators that is in no larger one.
+    """A subformula without temporal operators that is not part of a larger one.
 
     Attributes:
-        node: its id in the formula's tree.
-        sign: 1 where the formula needs it to hold, -1 where it needs it not to.
-        obligation: the temporal subformula that needs it; None if there is none.
-        objects, regions: names.
-        groups: open groups, whose members are objects too.
-        conjunct: the conjunct of the formula that it is in.
-        can_violate: whether failing now may be what violates its obligation; not a goal beside invariants.
-        is_condition: whether it is left of an implication, which is met without it, too.
-        is_invariant: whether its obligation asks it of every sample, and nothing makes up for it.
+        node: id in the formula's tree.
+        sign: 1 if the formula needs the subformula to hold, -1 if it needs the subformula to fail.
+        obligation: the temporal subformula around it; None without one.
+        objects, regions: names of related objects and regions.
+        groups: open groups, whose members are related, too.
+        conjunct: the conjunct of the formula around it.
+        can_violate: whether its failure can be a violation. False for a goal whose obligation also has
+            invariants, and for all goals under a semantics without final verdicts.
+        is_condition: whether it is left of an implication, which also holds if the condition fails.
+        is_invariant: whether its obligation needs it in every sample, without an alternative.
     """
 
     node: int
@@ -121,7 +123,7 @@ class Requirement(NamedTuple):
     is_invariant: bool = False
 
     def standing(self, series: Floats, at: Integers) -> NDArray[np.uint8]:
-        """Return (S,) how it stands, see `Standing`.
+        """Return (S,), the state of the requirement, see `Standing`.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
@@ -130,7 +132,7 @@ class Requirement(NamedTuple):
         return self._numbers(series, at)[0]
 
     def robustness(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,) its robustness where it holds or is violated, in the sign that counts; else NaN.
+        """Return (S,), its robustness times its sign if it holds or is violated, otherwise NaN.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
@@ -154,12 +156,12 @@ class Requirement(NamedTuple):
         return standing, np.where(counts, now, np.nan)
 
     def outcome(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,) the robustness of its obligation over the finished log, in the sign that counts.
+        """Return (S,), the robustness of its obligation over the finished log, times the obligation's sign.
 
-        NaN where that is not known, and where its failing violates nothing, as one of several that may hold.
+        NaN if it is not known, and if a failing obligation is an alternative that the formula does not need.
 
         Args:
-            series: (N, 4, T), of which lower and upper are those of the finished log.
+            series: (N, 4, T): value, now, and lower and upper over the finished log.
             at: (S,) indices of samples.
         """
         obligation = self.obligation or Obligation(self.node, self.sign)
@@ -173,12 +175,14 @@ class Requirement(NamedTuple):
 def requirements_of(
     formula: Formula, object: str | None = None, *, settles: bool = True, splits: bool = False
 ) -> tuple[Requirement, ...]:
-    """Return the requirements of a formula, by node, but for those needed in both signs (`xor`, `<->`).
+    """Return the requirements of a formula, by node.
+
+    Subformulas that are needed in both signs, under `xor` and `<->`, are not requirements.
 
     Args:
-        splits: whether each conjunct of a requirement stands for itself.
-        object: what the parameter of a template stands for.
-        settles: whether the semantics has verdicts that stay; without, a goal is pending up to the end.
+        object: object of a template's instance, or None.
+        settles: whether the semantics has final verdicts; otherwise a goal is pending up to the end.
+        splits: whether each conjunct of a requirement is a requirement of its own.
     """
     places = _places(formula)
     is_plain = [is_spatial(place.formula) for place in places]
@@ -207,7 +211,7 @@ def requirements_of(
 
 
 def _conjuncts(places: Sequence[_Place], identifier: int) -> list[int]:
-    """Return the conjuncts of a node without temporal operators, in the sign in which it counts."""
+    """Return the parts of a requirement that are all needed: operands of `and`, or of `or` under sign -1."""
     operands = [child for child, place in enumerate(places) if place.parent == identifier]
     if not operands or not _needs_all(places[identifier]):
         return [identifier]
@@ -215,11 +219,11 @@ def _conjuncts(places: Sequence[_Place], identifier: int) -> list[int]:
 
 
 class _Place(NamedTuple):
-    """Where a node is in a formula.
+    """The position of a node in a formula.
 
     Attributes:
-        sign: 0 where it counts in both.
-        always: whether no operator above it but conjunctions and those that need it at every sample.
+        sign: sign in which the formula needs the node; 0 for both signs.
+        always: whether all operators above need all of their operands (see `_NEEDS_ALL`).
         is_condition, is_invariant: see `Requirement`.
     """
 
@@ -234,7 +238,7 @@ class _Place(NamedTuple):
 
 
 def _places(formula: Formula) -> list[_Place]:
-    """Return where each node is, by id."""
+    """Return the position of each node, by id."""
     places: list[_Place] = []
     passed: list[int] = []
     for identifier, parent, node in iter_nodes(formula):
@@ -267,11 +271,11 @@ _NEEDS_ALL: Final[Mapping[float, frozenset[str]]] = MappingProxyType(
         -1.0: frozenset({"or", "not", "spec", "->", "F", "O", "X", "WX", "Y"}),
     }
 )
-"""Operators that need all of their operands, by the sign in which they count themselves."""
+"""Operators that need all of their operands, by the sign in which the formula needs the operator."""
 
 
 def _is_endless(formula: Formula) -> bool:
-    """Say whether an operator asks something of samples without end."""
+    """Return whether an operator concerns all later samples, without an upper bound."""
     is_ahead = operator_of(formula) in FUTURE_OPERATORS - {"X", "WX"}
     return (
         is_ahead and isinstance(formula, Temporal) and (formula.bound is None or formula.bound.upper is None)
@@ -283,13 +287,17 @@ def _needs_all(place: _Place) -> bool:
 
 
 def _needs_all_now(place: _Place, is_always: bool) -> bool:
-    """Say whether a node needs its operands wherever it is needed itself, or always."""
+    """Return whether operands of a node may be invariants of their obligation.
+
+    They may below an unbounded operator that needs every sample, above all obligations, and below Boolean
+    operators that need all operands.
+    """
     is_outside = place.obligation is None and not isinstance(place.formula, Temporal)
     return is_always or is_outside or (isinstance(place.formula, Boolean) and _needs_all(place))
 
 
 def _sign(parent: Formula, operand: int) -> float:
-    """Return the sign that an operand has in its parent; 0 where it counts in both."""
+    """Return the sign in which a node needs an operand; 0 for both signs."""
     signs = operand_signs(parent, operand)
     return float(signs[0]) if len(signs) == 1 else 0.0
 
@@ -304,7 +312,7 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
         if isinstance(node, Quantified):
             terms = (node.group,)
         for term in terms:
-            # what it is about, without its delay and enlargement
+            # the object or region itself, without delay and enlargement
             base = base_of(term)
             match bindings.get(base.name, base) if isinstance(base, Variable) else base:
                 case TrackedName(name):

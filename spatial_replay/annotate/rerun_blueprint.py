@@ -1,4 +1,4 @@
-"""A blueprint for Rerun: which panels show an annotated log there, without any change of the log."""
+"""A blueprint for Rerun: the panels for an annotated log, which stays unchanged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.logs.topics import EVENT_LOG, SCENE, STANDING
 from spatial_replay.palette import CURVES, hexadecimal
 
 _SOURCE: Final = f"{StandingUpdate.DESCRIPTOR.full_name}:message"
-"""Name that Rerun gives to the messages of the topic."""
+"""Component in which Rerun stores the topic's messages."""
 _TIMELINE: Final = "message_log_time"
 _MOST_LANES: Final = 12
 _Strip: TypeAlias = tuple[list[tuple[float, float, float]], int]
@@ -29,10 +29,10 @@ class BlueprintRow(NamedTuple):
     """A result or named spec in Rerun.
 
     Attributes:
-        title: as in the messages.
-        unit: of its robustness, or "".
-        selector: of its entry in a message.
-        colour: of its curve, "#rrggbb".
+        title: name in the messages.
+        unit: unit of its robustness, or "".
+        selector: Rerun's selector of its entry in a message.
+        colour: colour of its curve, "#rrggbb".
     """
 
     title: str
@@ -42,7 +42,7 @@ class BlueprintRow(NamedTuple):
 
 
 def blueprint_rows(standing: StandingUpdate) -> list[BlueprintRow]:
-    """Return the rows of a message, which each message of its log has in the same places."""
+    """Return the rows of a message. All messages of its log have equal rows, in the same order."""
     return [
         BlueprintRow(result.name, result.unit, f".results[{place}]", CURVES[place % len(CURVES)])
         for place, result in enumerate(standing.results)
@@ -50,7 +50,7 @@ def blueprint_rows(standing: StandingUpdate) -> list[BlueprintRow]:
 
 
 def state_words() -> Iterator[tuple[str, str, str]]:
-    """Yield the states of a row: their names in messages, in words, and their colours."""
+    """Yield each state of a row: its name in messages, its words, and its colour."""
     for code, (words, colour) in STANDING_WORDS.items():
         yield Standing.Name(code), words, hexadecimal(colour)
 
@@ -58,10 +58,10 @@ def state_words() -> Iterator[tuple[str, str, str]]:
 def write_blueprint(
     rows: Sequence[BlueprintRow], log: Path, path: Path, scenes: Iterable[SceneUpdate] = ()
 ) -> None:
-    """Write a blueprint: curves of each unit, a lane for each result, and the sentences of the log.
+    """Write a blueprint: a view of curves per unit, a lane per result, and the sentences of the events.
 
-    Rerun finds the blueprint of a log by its name without the suffix. A file with the suffix .rrd also has
-    the log and outlines of its scenes, because Rerun shows each file as a recording with its own time.
+    Rerun finds the blueprint of a log by the log's name without the suffix. A file with the suffix .rrd also
+    has the log and the outlines of its scenes, because Rerun shows each file as a recording of its own.
 
     Raises:
         UsageError: Rerun is not installed.
@@ -144,7 +144,7 @@ def _curves(unit: str, rows: Sequence[BlueprintRow]) -> Any:
 
 
 def _lane(row: BlueprintRow) -> Any:
-    """Return a lane; Rerun names lanes by their topic, so that each state has the name of the result."""
+    """Return a lane. Rerun names lanes after their topic, so the words of states have the result's name."""
     import rerun
 
     names, words, colours = zip(*state_words(), strict=True)
@@ -164,5 +164,5 @@ def _mapping(target: str, selector: str) -> Any:
 
 
 def _number(colour: str) -> int:
-    """Return a colour as Rerun takes it: 0xrrggbbaa."""
+    """Return a colour as an opaque 0xrrggbbaa."""
     return int(colour.removeprefix("#"), 16) << 8 | 0xFF

@@ -34,14 +34,14 @@ Codes = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class RobustnessSeries:
-    """The numbers that a log has of one specification, or of one object's instance of a template.
+    """The numbers in a log of one specification, or of one instance of a template.
 
     Attributes:
-        specification: its name.
-        object: the object that a template's parameter stands for, or None.
-        ids: (N,) int64, the nodes' numbers.
-        names: N names; None for a node without one.
-        times_ns: (T,) int64.
+        specification: name of the specification.
+        object: object of a template's instance, or None.
+        ids: (N,) int64, ids of the nodes.
+        names: N names; None for a node without a name.
+        times_ns: (T,) int64, times of the samples.
         series: (N, 4, T): value, now, lower, upper.
     """
 
@@ -65,12 +65,12 @@ def encode_robustness(
     """Return one message for each sample.
 
     Args:
-        name: the specification's name.
-        object: the object that a template's parameter stands for, or None.
-        names: of the N nodes, by id; None for a node without one.
-        times_ns: (T,) int64.
+        name: name of the specification.
+        object: object of a template's instance, or None.
+        names: names of the N nodes by id; None for a node without a name.
+        times_ns: (T,) int64, times of the samples.
         series: (N, 4, T): value, now, lower, upper.
-        final: whether lower and upper are those of the finished log.
+        final: whether lower and upper are ends over the finished log.
     """
     numbers = series.reshape(4 * len(names), len(times_ns))
     words = words_of([times_ns[:, None], numbers.T])
@@ -80,7 +80,7 @@ def encode_robustness(
 
 @lru_cache(64)
 def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], final: bool) -> WireTemplate:
-    """Return the template of a result's messages, which are encoded a block at a time."""
+    """Return the template of a result's messages; blocks share it."""
     message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(
@@ -90,11 +90,11 @@ def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], 
 
 
 def standing_codes(series: Floats, *, final: bool = False) -> Codes:
-    """Return the numbers of `Standing` (N, T) of some nodes.
+    """Return (N, T), the standing of some nodes as numbers of the enumeration `Standing` in messages.
 
     Args:
         series: (N, 4, T): value, now, lower, upper.
-        final: whether lower and upper are those of the finished log; otherwise more samples may come.
+        final: whether lower and upper are ends over the finished log, so that no node is pending.
     """
     value, _, lower, upper = series.swapaxes(0, 1)
     codes = np.full(value.shape, UNKNOWN, np.uint8)
@@ -107,9 +107,9 @@ def standing_codes(series: Floats, *, final: bool = False) -> Codes:
 
 
 def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
-    """Decode messages: one entry for each specification and object, in order of first appearance.
+    """Decode messages into one series per specification and object, in order of first appearance.
 
-    Messages of one specification with other nodes than before, as of another run, make another entry. Final
+    Messages with other nodes than before, such as of another run, go into a series of their own. Final
     messages, about the finished log, are left out.
 
     Raises:
@@ -154,22 +154,22 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
 
 
 MOST_POINTS: Final = 2_000
-"""Points of a curve; of very many curves there are fewer."""
+"""Limit of points in a curve; messages with very many curves have fewer."""
 
 _MOST_NUMBERS: Final = 1 << 19
-"""Numbers in a message, about: 4 MiB of them."""
+"""Approximate limit of numbers in a message: 4 MiB."""
 _FEWEST_POINTS: Final = 64
 
 
 class Thinning:
-    """Thins long curves to the least and the greatest point of equally many samples."""
+    """Thins long curves to the least and the greatest number in each of equally long stretches."""
 
     def __init__(self, times_ns: Integers, most: int) -> None:
-        """Cut up the samples of a log.
+        """Divide the samples of a log into stretches.
 
         Args:
-            times_ns: (T,) int64, of all samples, at least one.
-            most: points that a curve may have, at least 2.
+            times_ns: (T,) int64, times of all samples, at least one.
+            most: limit of points in a curve, at least 2.
         """
         self._times_ns = times_ns
         count = len(times_ns)
@@ -178,7 +178,7 @@ class Thinning:
         self._ends = np.append(self._starts[1:], count) - 1
 
     def seconds(self, first_ns: int) -> Floats:
-        """Return the times of the points, counted from a first one."""
+        """Return the times of the points in seconds after `first_ns`."""
         seconds = (self._times_ns - first_ns) / 1e9
         return self._interleave(seconds[self._starts], seconds[self._ends]) if self._is_needed else seconds
 
@@ -196,6 +196,7 @@ class Thinning:
             return whole
         low = np.fmin.reduceat(whole, self._starts)
         high = np.fmax.reduceat(whole, self._starts)
+        # the order of both points within a stretch follows the curve, so that slopes keep their direction
         falls = whole[self._starts] > whole[self._ends]
         return self._interleave(np.where(falls, high, low), np.where(falls, low, high))
 
@@ -209,9 +210,9 @@ def encode_curves(
     """Return the message with the curves of a whole log.
 
     Args:
-        times_ns: (T,) int64, of all samples, at least one.
-        first_ns: the time that seconds count from.
-        summary: what the results come to, in words.
+        times_ns: (T,) int64, times of all samples, at least one.
+        first_ns: zero of the seconds.
+        summary: all results in words.
     """
     curves = 2 * sum(len(curved_nodes(result.formula)) for result in results)
     most = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curves, 1)))
@@ -225,7 +226,7 @@ def encode_curves(
 
 
 def curved_nodes(formula: Formula) -> dict[int, Formula]:
-    """Return the nodes that have curves, by id: the root, and those with a name that no other node has."""
+    """Return the nodes with curves, by id: the root, and each node with a name that is unique."""
     nodes = [(identifier, node) for identifier, _, node in iter_nodes(formula)]
     names = [node.name for _, node in nodes]
     return {

@@ -1,4 +1,4 @@
-"""Specifications as a log has them: their texts, and the trees of their results → /spatial/specification."""
+"""Specifications in a log: their texts, and the trees of their results in /spatial/specification."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ _CALL = re.compile(r"[(\s]*(\w+)\s*\(")
 
 
 class ReportedTree(NamedTuple):
-    """One result, as the tree that /spatial/robustness has numbers for.
+    """One result with the tree of its nodes, whose numbers are in /spatial/robustness.
 
     Attributes:
-        name: the name it is reported under.
-        object: the object that a template's parameter stands for, or None.
+        name: reported name of the result.
+        object: object of a template's instance, or None.
         file: index of its specification among the files.
-        requirement: the id of the requirement that it stands for, or None.
-        sentence: that requirement in words, or None.
-        parameter: the name of the parameter, or None.
+        requirement: id of its requirement, or None.
+        sentence: title of its requirement, or None.
+        parameter: name of the template's parameter, or None.
     """
 
     name: str
@@ -57,17 +57,17 @@ class ReportedTree(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Name for readers: "REQ-12 calm(bike)"."""
+        """Name of the result for readers, such as "REQ-12 calm(bike)"."""
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return title if self.requirement is None else f"{self.requirement} {title}"
 
     def is_called(self, name: str) -> bool:
-        """Say whether a reader calls this result so: by its title, with the requirement's id or without."""
+        """Return whether a name is the title of this result, with or without the requirement's id."""
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return name in names_of(title, self.requirement)
 
     def with_object_name(self, text: str) -> str:
-        """Return a text about the formula with the object in place of the template's parameter."""
+        """Return a text about the formula, with the object instead of the template's parameter."""
         if self.parameter is None or self.object is None:
             return text
         parameter = re.escape(self.parameter)
@@ -75,13 +75,13 @@ class ReportedTree(NamedTuple):
         return re.sub(rf'(?<![\w"]){parameter}(?![\w"])', lambda _: name, text)
 
     def written_texts(self, source: str) -> list[str]:
-        """Return the text of each node as the file writes it, with the object in place of the parameter.
+        """Return the text of each node as the file writes it, with the object instead of the parameter.
 
-        The body of a `def` is in canonical form, below the node that has its call. So is what a
-        quantifier stands for, with its objects, which the file writes once for all of them.
+        Two kinds of nodes have canonical texts instead, because the file has no text for them: the body of a
+        `def` below its call, and operands of a quantifier for its objects.
 
         Args:
-            source: of the file.
+            source: text of the file.
         """
         texts, spans = [], []
         is_quantifier: list[bool] = []
@@ -96,10 +96,10 @@ class ReportedTree(NamedTuple):
         return texts
 
     def calls(self, source: str) -> dict[int, str]:
-        """Return the text of each node that is a `def` with its arguments, as the file writes it."""
+        """Return the text of each node that is a call of a `def`, as the file writes it, by id."""
         nodes, spec_text = list(iter_nodes(self.formula)), self.written_texts(source)
         spans, defined = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
-        # what a def stands for has the place of its call
+        # the parser gives the body of a `def` the span of its call
         expanded = {
             identifier
             for identifier, parent, _ in nodes
@@ -116,7 +116,7 @@ class ReportedTree(NamedTuple):
 
 
 def _is_call(node: Formula, written: str, defined: Collection[str]) -> bool:
-    """Return whether a single atom is what a `def` of these names stands for."""
+    """Return whether an atom was written as a call of one of these `def` names."""
     call = _CALL.match(written) if isinstance(node, Atom) else None
     return call is not None and call[1] in defined
 
@@ -124,10 +124,10 @@ def _is_call(node: Formula, written: str, defined: Collection[str]) -> bool:
 def reported_trees(
     files: Sequence[Specification], instances: Sequence[Sequence[Instance]]
 ) -> list[ReportedTree]:
-    """Return every result of every file; specs of one name in two files get their files' stems as prefix.
+    """Return the trees of all results. If two files have a spec of one name, their stems become prefixes.
 
     Args:
-        instances: of each file, in the order in which they are evaluated.
+        instances: instances of each file, in the order of evaluation.
     """
     names = [spec.name for file in files for spec in file.results]
     trees = []
@@ -149,15 +149,15 @@ def encode_specification(
     automata: Sequence[Automaton | None] = (),
     start_ns: int = 0,
 ) -> bytes:
-    """Return the message with the specifications of a log; equal arguments give equal bytes.
+    """Return the message with the specifications of a log. Equal arguments give equal bytes.
 
     Args:
-        units: those that are declared, of signals by their names, of lengths by "".
-        propositions: of each tree, the nodes that are propositions of its automaton.
-        automata: of each tree, its automaton.
-        start_ns: the time that texts count from.
+        units: declared units, by name of the signal and by "" for lengths.
+        propositions: nodes of the automaton's propositions, by tree.
+        automata: automaton of each tree.
+        start_ns: zero of times in texts.
     """
-    # imported here since an evaluation without messages needs no message types
+    # imported here, because an evaluation without messages needs no message types
     from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 
     message = SpecificationMessage(start_ns=start_ns)
@@ -179,24 +179,24 @@ def encode_specification(
 
 
 def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
-    """Return the unit of a formula's robustness: that of its atoms, if they share one.
+    """Return the unit of a formula's robustness, which is the common unit of its atoms.
 
-    Footprint units are "" where nothing declares them, numbers without a unit "1"; a signal without a known
-    unit has "units of NAME". A formula over atoms of several units has "mixed".
+    Undeclared lengths have the unit "", numbers without a unit "1", and a signal with an unknown unit
+    "units of NAME". Atoms of several units give "mixed".
 
     Args:
-        units: those that are declared, of signals by their names, of lengths by "".
+        units: declared units, by name of the signal and by "" for lengths.
     """
     declared_units = {_declared_unit(unit, units) for unit in units_of(formula)}
     if len(declared_units) > 1:
         return MIXED
     if not declared_units and any(iter_atoms(formula)):
-        return DIMENSIONLESS  # comparisons of modes alone are infinite
+        return DIMENSIONLESS  # the formula only compares modes, whose robustness is infinite
     return declared_units.pop() if declared_units else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
 def unit_words(unit: str) -> str:
-    """Return a unit that `unit_of` gives as it is written at an axis."""
+    """Return the words at an axis for a unit of `unit_of`."""
     words = {FOOTPRINT_UNITS: "footprint units", DIMENSIONLESS: "no unit", MIXED: "mixed units"}
     return words.get(unit, unit)
 
@@ -244,7 +244,7 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
 
 
 def _declared_unit(unit: Unit, units: Mapping[str, str]) -> str:
-    """Return the words for a unit of an atom's number."""
+    """Return the declared unit of an atom's number, or words instead."""
     if unit.divisor is not None or unit.kind == "orientation":
         return DIMENSIONLESS
     declared = plain_unit(units.get(unit.signal or FOOTPRINT_UNITS, ""))
@@ -254,17 +254,17 @@ def _declared_unit(unit: Unit, units: Mapping[str, str]) -> str:
 
 
 def logged_specifications(files: Sequence[Specification], units: Mapping[str, str]) -> list[Specification]:
-    """Return the specifications as a log stores them, so that reading it gives equal ones of equal names.
+    """Return the specifications as a log stores them, so that the log gives equal specifications.
 
-    Each has a file name with a stem of its own. Constants given from outside are written into the text. One
-    that still does not parse to the same specification (it was parsed with another profile) is replaced by
-    the canonical text.
+    Each file name gets a unique stem. Constants given from outside are written into the text. A text that
+    still parses to another specification, because it was parsed with another profile, is replaced by the
+    canonical text.
 
     Args:
-        units: those of the log, see `with_numbers`.
+        units: units of the log, see `with_numbers`.
 
     Raises:
-        SpecificationError: what that raises.
+        SpecificationError: `with_numbers` fails.
     """
     logged: list[Specification] = []
     stems: set[str] = set()
@@ -288,7 +288,7 @@ def specification_attachments(files: Sequence[Specification], prefix: str) -> li
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Same:
-    """A specification that equals itself alone: equal ones may have other texts."""
+    """A cache key compared by identity, because equal specifications may have different texts."""
 
     file: Specification
 
@@ -299,7 +299,7 @@ class _Same:
         return isinstance(other, _Same) and other.file is self.file
 
 
-# many logs are evaluated with the same specifications
+# a batch evaluates many logs with the same specifications
 @lru_cache(maxsize=64)
 def _logged_copy(same: _Same) -> Specification:
     file = same.file
@@ -307,7 +307,7 @@ def _logged_copy(same: _Same) -> Specification:
         try:
             text = text_of(file)
             if set(file.plugins) - set(used_modules(text)):
-                # one that the command line alone names has to be named in a log
+                # the text of a log must name a plug-in that only the command line names
                 continue
             read_back = parse_specification(text, filename=file.filename)
         except SpecificationError:

@@ -1,4 +1,4 @@
-"""Stages of a task: how far a run has come in the automaton of a spec, and what it owes next."""
+"""Stages of a task: the progress of a run in the automaton of a spec, and the proposition owed next."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from spatial_replay.text import shortened_formula
 LOST: Final = "lost"
 """Name of the stage in which acceptance is lost."""
 UNKNOWN: Final = "unknown"
-"""Name of the stage of samples that leave several stages possible."""
+"""Name of the stage after samples for which several stages are possible."""
 
 _MOST_WAYS: Final = 1_000_000
-"""Pairs of a decision and a state that follows it, of an automaton whose stages are computed."""
+"""Limit of an automaton with stages: pairs of a decision and a following state."""
 
 _MOST_HELD: Final = 1024
-"""Sets of states whose stage is held while samples come."""
+"""Limit of cached sets of states with their stages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class Stage:
     """A stage of a task.
 
     Attributes:
-        name: such as "never reached" or "reached, not lifted".
-        owed: the proposition that must come true next; "" if nothing is owed, or acceptance is lost.
+        name: name, such as "never reached" or "reached, not lifted".
+        owed: proposition that must become true next; "" if nothing is owed, or acceptance is lost.
     """
 
     name: str
@@ -52,10 +52,10 @@ class StagesOfStates:
     """The stages of an automaton.
 
     Attributes:
-        stages: the farthest from acceptance first; "lost" and "unknown" come last.
-        numbers: the place in `stages` of each state's stage.
-        left: the propositions that must still come true from each state; a trap has those of the start.
-        progress: from 0 to 1, the share of the start's propositions that each state no longer owes.
+        stages: stages, the farthest from acceptance first, with "lost" and "unknown" last.
+        numbers: index in `stages` of each state's stage.
+        left: number of propositions that each state owes; a trap owes as many as the initial state.
+        progress: from 0 to 1, share of the initial state's propositions that each state no longer owes.
     """
 
     stages: tuple[Stage, ...]
@@ -64,7 +64,7 @@ class StagesOfStates:
     progress: tuple[float, ...]
 
     def stage_of(self, states: Sequence[int]) -> tuple[int, float]:
-        """Return the stage of a run that may be in any of some states, and the progress that is certain."""
+        """Return the index of the stage of a run in one of some states, and the progress that is certain."""
         numbers = {self.numbers[state] for state in states}
         number = numbers.pop() if len(numbers) == 1 else len(self.stages) - 1
         return number, min(self.progress[state] for state in states)
@@ -75,11 +75,11 @@ class Stages:
     """The stages of one result, sample by sample.
 
     Attributes:
-        result: the title of the result.
-        stages: all that there are, the farthest from acceptance first; "lost" and "unknown" come last.
-        times_ns: (T,), the samples.
-        numbers: (T,), the place in `stages` of the stage after each sample.
-        progress: (T,), from 0 to 1; 1 where the result is satisfied if the log ends there.
+        result: title of the result.
+        stages: all stages, the farthest from acceptance first, with "lost" and "unknown" last.
+        times_ns: (T,), times of the samples.
+        numbers: (T,), index in `stages` of the stage after each sample.
+        progress: (T,), from 0 to 1; 1 if the result is satisfied by a log that ends with the sample.
     """
 
     result: str
@@ -89,18 +89,18 @@ class Stages:
     progress: Floats = field(repr=False)
 
     def __getitem__(self, sample: int) -> Stage:
-        """Return the stage after a sample; -1 is the last one."""
+        """Return the stage after a sample, by index; -1 is the last sample."""
         return self.stages[int(self.numbers[sample])]
 
 
 class LiveStages:
-    """The stages of a spec while its samples come, equal to those of a log of the same samples."""
+    """The stages of a spec, sample by sample. A log with the same samples gives the same stages."""
 
     def __init__(self, specification: Specification, spec: NamedSpec, *, rate_hz: float | None) -> None:
         """Start before the first sample.
 
         Raises:
-            NoAutomatonError: the spec has no automaton, or too large a one.
+            NoAutomatonError: the spec has no automaton, or its automaton is too large for stages.
         """
         self._spec = spec
         self._automaton = automaton(replace(specification, specs=(spec,)), spec.name, rate_hz=rate_hz)
@@ -114,7 +114,7 @@ class LiveStages:
         self._run = AutomatonRun(self._spec.name, None, self._automaton, self._spec.formula, self._leaves)
 
     def extend(self, time_ns: int, numbers: Floats, leaves: Callable[[], Floats]) -> tuple[Stage, float]:
-        """Add a sample; return the stage and the progress after it.
+        """Add a sample, and return the stage and the progress after it.
 
         Args:
             numbers, leaves: see `AutomatonRun.step`.
@@ -133,13 +133,12 @@ def stages(
     """Return the stages of a result, by the automaton of its spec.
 
     Args:
-        name, object: of the result, as in `Evaluation.result`.
-        rate_hz: how many samples a second has, for bounds in seconds; without it, that of evenly spaced
-            samples.
+        name, object: name and object of the result, as in `Evaluation.result`.
+        rate_hz: samples per second, for bounds in seconds; None for the rate of evenly spaced samples.
 
     Raises:
-        NoAutomatonError: the spec has no automaton, or too large a one.
-        UsageError: no such result, several, or under the paper's semantics.
+        NoAutomatonError: the spec has no automaton, or its automaton is too large for stages.
+        UsageError: no result or several results match, or the semantics is the paper's.
     """
     return stages_of_result(evaluation.result(name, object), evaluation.specification, rate_hz=rate_hz)
 
@@ -170,7 +169,10 @@ def stages_of_result(
 
 
 def _even_rate(times_ns: Integers) -> float | None:
-    """Return the samples a second of evenly spaced samples, whose times are rounded to ns; None if uneven."""
+    """Return the rate of evenly spaced samples in Hz; None for uneven samples.
+
+    Gaps may differ by 1 ns, because times are rounded to nanoseconds.
+    """
     gaps = np.diff(times_ns)
     if not len(gaps) or np.ptp(gaps) > 1:
         return None
@@ -181,8 +183,8 @@ def _even_rate(times_ns: Integers) -> float | None:
 def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
     """Return the stages of an automaton's states.
 
-    The number left at a state is the least number of propositions that come true on a way to acceptance.
-    Propositions that must only stay true, as in `G safe`, are not counted.
+    A state owes the least number of propositions that must become true on a path to acceptance. Propositions
+    that must only stay true, as in `G safe`, are not counted.
 
     Raises:
         NoAutomatonError: the automaton is too large.
@@ -194,10 +196,10 @@ def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
     stage_of_state = {
         state: _stage(automaton, state, start, way, unmet[state]) for state, way in ways.items()
     }
-    # a state that does not accept owes something, if only that a proposition comes to be false
+    # a state that does not accept owes at least one change, for example a proposition that must become false
     left = {state: count or int(automaton.distances[state] > 0) for state, count in left.items()}
     most = left[automaton.initial] or max(left.values()) or 1
-    # of stages with one name, the place is that of the state with the most left
+    # among states of one stage, the state that owes most gives the stage its place
     order = sorted(stage_of_state, key=lambda state: (-left[state], state))
     ordered = [*dict.fromkeys(stage_of_state[state] for state in order), Stage(LOST), Stage(UNKNOWN)]
     return StagesOfStates(
@@ -209,9 +211,9 @@ def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
 
 
 def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
-    """Return for each state the states that follow it, each with the fewest propositions that come true.
+    """Return the successors of each state, each with the fewest propositions that must become true for it.
 
-    Propositions come in the order of the text.
+    Propositions are in the order of the text.
     """
     alive = automaton.can_accept
     tables: list[dict[int, tuple[int, ...]]] = []
@@ -221,7 +223,7 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
         return tables[place] if place >= 0 else {~place: ()} if ~place in alive else {}
 
     def requires(place: int) -> frozenset[int] | None:
-        """Return the propositions without which acceptance is lost; None if it always is."""
+        """Return the propositions without which a move loses acceptance; None if every move loses it."""
         return required[place] if place >= 0 else frozenset() if ~place in alive else None
 
     size = 0
@@ -241,7 +243,7 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
     moves: list[dict[int, tuple[int, ...]]] = []
     for state, entry in enumerate(automaton.entries):
         targets = table(entry)
-        # a run that may stay here only keeps true what it needs for that
+        # propositions that the run needs to stay in the state must only stay true
         constant = (requires(entry) or frozenset()) if state in targets else frozenset()
         moves.append({target: tuple(p for p in way if p not in constant) for target, way in targets.items()})
     return moves
@@ -250,7 +252,10 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
 def _ways(
     automaton: Automaton, moves: Sequence[Mapping[int, Sequence[int]]]
 ) -> tuple[dict[int, int], dict[int, tuple[int, ...]]]:
-    """Return for each state that can accept how many propositions are left, and these in their order."""
+    """Return, by state that can accept, the number of owed propositions, and these in their order.
+
+    It is Dijkstra's algorithm from the accepting states backwards.
+    """
     sources: dict[int, list[int]] = {}
     for state, targets in enumerate(moves):
         for target in targets:
@@ -276,19 +281,19 @@ def _way(
     ways: Mapping[int, tuple[int, ...]],
     state: int,
 ) -> tuple[int, ...]:
-    """Return the propositions that are left at a state, by the way that takes the most steps."""
+    """Return the propositions that a state owes, in the order of a path with few propositions per sample."""
     nearest = [
         target
         for target, way in targets.items()
         if target != state and target in ways and len(way) + left[target] == left[state]
     ]
-    # one proposition after the other, rather than all in one sample, shows the order of the formula
+    # a path with one proposition per sample shows the order of the formula; a single step hides it
     target = min(nearest, key=lambda target: (len(targets[target]) or len(targets), target))
     return (*targets[target], *ways[target])
 
 
 def _unmet_propositions(automaton: Automaton) -> list[frozenset[int]]:
-    """Return for each state the propositions that have never been true when a run is there."""
+    """Return, for each state, the propositions that were never true on any path to the state."""
     count = len(automaton.propositions)
     unmet: list[set[int]] = [set(range(count)) for _ in automaton.states]
     for proposition in range(count):
@@ -309,12 +314,12 @@ def _stage(
     """Return the stage of a state that can accept.
 
     Args:
-        start, way: what is left at the start, and at the state.
-        unmet: the propositions that have never been true when a run is in the state.
+        start, way: propositions that the initial state and this state owe.
+        unmet: propositions that were never true on any path to the state.
     """
     words = [p.name or shortened_formula(p.text) for p in automaton.propositions]
     if not way and automaton.distances[state]:
-        # only propositions that come to be false are left
+        # the state owes only propositions that must become false
         (move, *_) = next(automaton.paths(state))
         return Stage(
             f"{words[start[-1]]}, not finished" if start else "not finished", automaton.guard_words(move, 80)

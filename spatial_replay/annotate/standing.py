@@ -1,6 +1,6 @@
-"""How all results stand, in one message → /spatial/standing.
+"""The standing of all results in one message of /spatial/standing.
 
-Viewers need no other topic of numbers: one message has every result.
+One message has the numbers of every result, so viewers need no other topic for them.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ _RANKS: Final = np.full(256, 2, np.uint8)
 for _rank, _code in enumerate(STANDING_WORDS):
     _RANKS[_code] = _rank
 _RANKS.flags.writeable = False
-"""How bad each number of `Standing` is; 0 is the worst."""
+"""Rank of each number of `Standing`; 0 is the worst."""
 
 
 def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
-    """Return (S,) the worst of R results: of those violated, the one that was so for certain first.
+    """Return (S,), the index of the worst of R results in each of S samples.
 
-    Robustness of different results is not compared: their units may differ.
+    Among violated results, the one with the earliest certain violation is the worst. Robustness is not
+    compared, because units may differ.
 
     Args:
         codes: (R, S), numbers of `Standing`.
-        violated_ns: (R, S), since when each is violated, or `LATEST_NS`.
+        violated_ns: (R, S), time since which each result is violated, or `LATEST_NS`.
     """
     ranks = _RANKS[codes]
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
@@ -51,12 +52,13 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
 
 
 class _Entry(NamedTuple):
-    """An entry of `results` in every message: a result, or a named spec within one.
+    """An entry of `results` in every message: a result, or a named spec within a result.
 
     Attributes:
-        title, unit: as messages have them.
-        tree, node: the result's place, and the id of the node in it.
-        number: which of the node's numbers is shown: its value or, of a condition of each sample, `now`.
+        title, unit: title and unit in messages.
+        tree: index of the result.
+        node: id of the node in the result's tree.
+        number: index of the number to show: 0 for the value, 1 for `now` of a named spec without look-ahead.
     """
 
     title: str
@@ -67,12 +69,12 @@ class _Entry(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Shared parts of messages with the same texts and lengths.
+    """The part of a message that a template fixes: texts, and the lengths of lists.
 
     Attributes:
-        worst: the place of the worst result.
-        words: states of automata.
-        violated: the violated results with their deciding atoms.
+        worst: index of the worst result.
+        words: states of automata in words.
+        violated: indices of the violated results, with their deciding atoms.
         final: whether the log is finished.
     """
 
@@ -86,10 +88,10 @@ class FinalStanding(NamedTuple):
     """Outcome of a result over the finished log.
 
     Attributes:
-        standing: satisfied, violated or unknown, a number of `Standing`.
-        by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
-        at: since when it is that.
-        unit: of the robustness.
+        standing: number of `Standing`: satisfied, violated or unknown.
+        by: magnitude of the deciding end of its interval; NaN if unknown.
+        at: time of the least upper end of its interval.
+        unit: unit of the robustness.
     """
 
     standing: int
@@ -99,14 +101,14 @@ class FinalStanding(NamedTuple):
 
 
 class StandingEncoder:
-    """Encodes how results stand, sample after sample.
+    """Encodes the standing of results, sample by sample.
 
-    Its state is the last numbers of each result. Cutting the samples into blocks changes no message.
+    Between blocks it stores the last numbers of each result. Messages do not depend on the cut into blocks.
 
     Attributes:
-        outcomes: of each result, once the log has ended.
-        order: then the places of results, the worst first: of those violated, the one that was so first.
-        zero_ns: the time that seconds count from; None before it is known.
+        outcomes: outcome of each result after `end`; before it empty.
+        order: indices of results after `end`, the worst first; earlier violations come first.
+        zero_ns: zero of the seconds; None before it is known.
     """
 
     def __init__(
@@ -115,8 +117,8 @@ class StandingEncoder:
         """Start before the first sample.
 
         Args:
-            runs: of each tree, the run of its automaton, which takes in the same samples.
-            units: those that are declared, see `unit_of`.
+            runs: run of each tree's automaton, extended by the caller; None without an automaton.
+            units: declared units, see `unit_of`.
         """
         self._trees, self._runs = trees, runs
         self._units = [unit_of(tree.formula, units) for tree in trees]
@@ -142,12 +144,12 @@ class StandingEncoder:
     def encode(
         self, times_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
     ) -> tuple[Integers, Sequence[bytes]]:
-        """Take in the next samples; return the times and contents of their messages.
+        """Add the next samples, and return the times and contents of their messages.
 
         Args:
-            times_ns: (T,), of all samples.
-            blocks: of each tree; an object's result may have fewer samples.
-            over: of each tree, what decided it, if that has happened in these samples or before.
+            times_ns: (T,), times of all samples.
+            blocks: block of each tree; an instance for an object may have fewer samples.
+            over: deciding atom of each tree up to the last of these samples; "" without a verdict.
         """
         shown_ns = times_ns[samples_to_write(times_ns, self._written_ns)]
         if len(shown_ns):
@@ -157,13 +159,14 @@ class StandingEncoder:
     def encode_changes(
         self, blocks: Sequence[SeriesBlock], over: Sequence[str], most: int
     ) -> tuple[Integers, Sequence[bytes]]:
-        """Take the next samples; return the time and the content of one message for each of the last changes.
+        """Add the next samples, and return the times and contents of one message per change.
 
-        A change is the first sample, or one in which an entry stands otherwise than in the sample before.
+        A change is the first of the samples, or a sample in which the standing of an entry differs from the
+        previous sample. Only the last `most` changes have messages.
 
         Args:
-            over: as for `encode`.
-            most: the number of changes, at most.
+            over: deciding atoms, as for `encode`.
+            most: limit of changes.
         """
         changes_ns = [np.empty(0, np.int64)]
         for index, block in enumerate(blocks):
@@ -178,7 +181,7 @@ class StandingEncoder:
     def _encode_at(
         self, shown_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
     ) -> Sequence[bytes]:
-        """Take in the next samples; return the messages of the times that are shown."""
+        """Add the next samples, and return the messages at `shown_ns`."""
         series, words, since, least = [], [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
@@ -192,7 +195,10 @@ class StandingEncoder:
         return self._messages(shown_ns, series, words, np.array([since, least]), over)
 
     def _numbers(self, index: int, block: SeriesBlock, at: Integers) -> Floats:
-        """Return the numbers (N, 4, S) of a result `at` samples into a block; those before it at 0."""
+        """Return (N, 4, S), the numbers of a result after `at` samples of a block.
+
+        At 0 they are the numbers of the last sample before the block.
+        """
         if not len(block.times_ns):
             return np.repeat(self._last[index], len(at), axis=2)
         numbers = block.series[:, :, np.maximum(at - 1, 0)]
@@ -200,7 +206,7 @@ class StandingEncoder:
         return numbers
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
-        """Take in the next samples without a message."""
+        """Add the next samples without messages."""
         for index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
@@ -213,7 +219,7 @@ class StandingEncoder:
                 self._words[index] = run.latest_words
 
     def _violated_since(self, index: int, block: SeriesBlock) -> Integers:
-        """Return (T,) since when a result is violated, at each sample of a block; `LATEST_NS` where not."""
+        """Return (T,), the start of the violation at each sample of a block; `LATEST_NS` without one."""
         is_violated = block.series[0, 3] < 0.0
         begins = is_violated & ~np.append(self._violated_ns[index] < LATEST_NS, is_violated)[:-1]
         begun = np.maximum.accumulate(np.where(begins, np.arange(len(begins)), -1))
@@ -221,7 +227,7 @@ class StandingEncoder:
         return np.where(is_violated, since_ns, LATEST_NS)
 
     def _became_least(self, index: int, block: SeriesBlock) -> Integers:
-        """Return (T,) since when the upper end of a result is as low as it is, at each sample of a block."""
+        """Return (T,), the time of the least upper end of a result so far, at each sample of a block."""
         upper = np.append(self._least[index], block.series[0, 3])
         is_less = upper[1:] < np.fmin.accumulate(upper)[:-1]
         return np.maximum.accumulate(np.where(is_less, block.times_ns, self._least_ns[index]))
@@ -230,9 +236,9 @@ class StandingEncoder:
         """Return the message about the finished log.
 
         Args:
-            time_ns: of the last sample.
+            time_ns: time of the last sample.
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
-            over: of each tree, what decided it.
+            over: deciding atom of each tree, or "".
         """
         zero_ns = time_ns if self.zero_ns is None else self.zero_ns
         since_ns = self._violated_ns
@@ -258,7 +264,7 @@ class StandingEncoder:
         return payload
 
     def _descriptions(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
-        """Return states of an automaton in words, and which of them (S,) is `at` samples into a block."""
+        """Return the states of an automaton in words, and (S,) the index of the words after `at` samples."""
         run = self._runs[index]
         if run is None or not len(block.times_ns):
             return [self._words[index]], np.zeros(len(at), np.int64)
@@ -275,12 +281,16 @@ class StandingEncoder:
         *,
         final: bool = False,
     ) -> Sequence[bytes]:
-        """Encode messages; `instants_ns` (2, R, S) are since when each result is violated, and so bad."""
+        """Encode messages.
+
+        Args:
+            instants_ns: (2, R, S), time since which each result is violated, and time of its least upper end.
+        """
         since_ns = instants_ns[0]
         codes = [standing_codes(node_series, final=final) for node_series in series]
         of_results = np.array([node_codes[0] for node_codes in codes])
         worst = worst_results(of_results, since_ns)
-        # the first of those violated first
+        # the earliest violation first
         order = np.argsort(
             np.where(of_results == VIOLATED, np.minimum(since_ns, LATEST_NS - 1), LATEST_NS),
             axis=0,
@@ -327,10 +337,10 @@ class StandingEncoder:
 
 
 def _finite(numbers: Floats) -> Floats:
-    """Return numbers without those that are infinite, which no curve and no table can show."""
+    """Return numbers with NaN instead of infinite ones, which curves and tables cannot show."""
     return np.where(np.isinf(numbers), np.nan, numbers)
 
 
 def part_title(part: Formula, tree: ReportedTree) -> str:
-    """Return what a named spec within a result is known by."""
+    """Return the title of a named spec within a result."""
     return f"{part.name} in {tree.title}"

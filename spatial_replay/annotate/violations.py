@@ -1,6 +1,6 @@
-"""How well objects and regions meet the requirements in each sample, and where the first violation is.
+"""The robustness of objects and regions in each sample, and the position of the first violation.
 
-The scene is coloured by the one, and an arrow in it points at the other.
+Robustness gives the colours of the scene, and the position gives its arrow.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
-"""If a quantifier binds more, all members have the number of the worst."""
+"""Limit of bindings with numbers of their own; beyond it, all members get the number of the worst."""
 
 _NO_NUMBERS: Final[Mapping[str, Floats]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
 class Shade:
-    """A part of a requirement, with its numbers in the sign that counts.
+    """A part of a requirement that objects are coloured by, with numbers times the part's sign.
 
     Attributes:
         requirement: the part.
-        bound: of each object that the part's quantifier binds, its own number (T,) in the samples of a block;
-            NaN where the part holds.
-        least: the least number of the part so far.
+        bound: number (T,) of each object that the part's quantifier binds, in the samples of a block; NaN
+            where the part holds.
+        least: least number of the part so far.
         is_known: whether the part was known in all samples.
-        least_bound: the least of `bound` so far.
-        leaf: which of the program's leaves the quantifier is; -1 if the part is none.
-        bodies: what the quantifier asks of each of its bindings.
-        worst: (T,), which of them decides it in each sample of the block; -1 where the part holds.
+        least_bound: least number of each bound object so far.
+        leaf: index of the quantifier among the program's leaves; -1 for another part.
+        bodies: the quantifier's body for each of its bindings.
+        worst: (T,), index of the deciding body in each sample of the block; -1 where the part holds.
     """
 
     requirement: Requirement
@@ -59,22 +59,35 @@ class Shade:
     worst: Integers = field(default_factory=lambda: np.empty(0, np.int64))
 
     def outcome(self, whole: Floats) -> Floats:
-        """Return what the part comes to over a finished log, given what its obligation does, (S,)."""
+        """Return (S,), the part's outcome over a finished log.
+
+        Args:
+            whole: (S,), outcome of the part's obligation.
+        """
         if not self.requirement.is_invariant or not (whole < 0.0).any():
             return whole
         number = self.least if self.is_known or self.least < 0.0 else math.nan
         return np.where(whole < 0.0, number, whole)
 
     def outcome_of(self, name: str, part: Floats) -> Floats:
-        """Return what it comes to for one of the objects that the quantifier binds, given the part."""
+        """Return (S,), the outcome of a bound object over a finished log.
+
+        Args:
+            part: (S,), outcome of the part.
+        """
         if not self.requirement.is_invariant or not self.least_bound:
             return part
-        # where it never failed, it held by no less than 0
+        # numbers are stored only in failing samples: an object without one never failed
         number = self.least_bound.get(name, 0.0)
         return np.where(part < 0.0, number, part)
 
     def now_of(self, name: str, now: Floats, at: Sequence[int] | np.ndarray) -> Floats:
-        """Return the number of one of the objects that the quantifier binds, given the part's (S,)."""
+        """Return (S,), the present number of a bound object.
+
+        Args:
+            now: (S,), present numbers of the part, which replace unknown ones.
+            at: (S,) indices of samples in the block.
+        """
         numbers = self.bound.get(name)
         if numbers is None:
             return now
@@ -82,7 +95,7 @@ class Shade:
 
 
 class ShadeTracker:
-    """Follows the parts of one result's requirements; cutting the samples into blocks changes nothing."""
+    """Follows the parts of one result's requirements. The cut of samples into blocks does not count."""
 
     def __init__(
         self, instance: Instance, parts: Sequence[Requirement], regions: Mapping[str, Outline]
@@ -100,7 +113,7 @@ class ShadeTracker:
         )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> None:
-        """Take in the next samples."""
+        """Add the next samples."""
         if len(block.times_ns):
             self.shades = tuple(
                 self._extend_shade(shade, leaf, trace, block)
@@ -133,7 +146,7 @@ class ShadeTracker:
 
 
 def _separable(leaf: Formula, sign: float) -> Quantified | None:
-    """Return a quantifier that needs all that it binds, in one sample; None for others."""
+    """Return a leaf if it is a quantifier that needs all its bindings within one sample; else None."""
     if not isinstance(leaf, Quantified) or leaf.quantifier != ("forall" if sign > 0.0 else "exists"):
         return None
     return None if any(map(looks_back, iter_terms([leaf]))) else leaf
@@ -142,7 +155,10 @@ def _separable(leaf: Formula, sign: float) -> Quantified | None:
 def _numbers_of(
     leaf: Quantified, sign: float, scene: TraceScene
 ) -> tuple[Sequence[tuple[str, ...]], tuple[Formula, ...], Floats]:
-    """Return the B bindings of a quantifier, what it asks of each, and its numbers (B, T); not of many."""
+    """Return the bindings of a quantifier, its body for each binding, and their numbers (B, T).
+
+    All three are empty for more than `_MOST_BINDINGS` bindings.
+    """
     names, none = scene.candidates(leaf.group), np.empty((0, len(scene.trace)))
     if math.perm(len(names), len(leaf.variables)) > _MOST_BINDINGS:
         return (), (), none
@@ -153,7 +169,7 @@ def _numbers_of(
 def _numbers_of_bindings(
     leaf: Quantified, sign: float, scene: TraceScene, tuples: Sequence[tuple[str, ...]]
 ) -> tuple[tuple[Formula, ...], Floats]:
-    """Return what a quantifier asks of some bindings, at least one, and their numbers (B, T)."""
+    """Return a quantifier's body for each of at least one binding, and the numbers (B, T) of these."""
     bodies = tuple(
         substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, names), strict=True)))
         for names in tuples
@@ -164,17 +180,17 @@ def _numbers_of_bindings(
 
 
 class EvaluatedResult(NamedTuple):
-    """One result over some samples, as the scene shows it.
+    """The numbers of one result over some samples, for the scene.
 
     Attributes:
-        requirements: the formula's.
-        block: the numbers of nodes and leaves.
-        leaf_pairs: what its violations can be traced to; None leaves them out.
-        since_ns: (R,), since when each requirement's conjunct is violated for certain (see
-            `violated_since`); None for an equal time.
-        settled: what settled the violation of the formula, if it is.
-        is_final: whether the block is about the finished log.
-        shades: the parts of the requirements that objects are coloured by; None for the requirements.
+        requirements: requirements of the formula.
+        block: numbers of nodes and leaves.
+        leaf_pairs: pairs that an arrow can point at; None for a result without arrows.
+        since_ns: (R,), start of the certain violation of each requirement's conjunct (see `violated_since`);
+            None for equal times.
+        settled: the formula's violation that is certain before the end, or None.
+        is_final: whether the block is the last sample with intervals over the finished log.
+        shades: parts of the requirements that objects are coloured by; None for the requirements themselves.
     """
 
     requirements: tuple[Requirement, ...]
@@ -187,11 +203,11 @@ class EvaluatedResult(NamedTuple):
 
 
 class Presence(NamedTuple):
-    """Which objects are in S samples.
+    """The presence of objects in S samples.
 
     Attributes:
-        times_ns: (S,) int64.
-        names: the objects' names.
+        times_ns: (S,) int64, times of the samples.
+        names: names of the objects.
         class_code: (S, len(names)) int64, index into `classes`; -1 where the object is absent.
         classes: class names, or None.
     """
@@ -203,21 +219,21 @@ class Presence(NamedTuple):
 
 
 class Violations(NamedTuple):
-    """The violation to point at in each of S samples, and where it can be pointed at.
+    """The violation with the arrow in each of S samples, and the ends of the arrow.
 
     Attributes:
-        result: (S,) int64, which of the results it is of; -1 where nothing is violated.
-        node: (S,) int64, id of the requirement that is violated, or of the atom that settled the violation.
-        leaf: (S,) int64, index of what decides it among the leaves of the result's program; -1 for none.
-        is_shown: (S,), whether there are two points to show it between.
-        points: (S, 2, 2), a point of the first of the pair and one of the second.
-        top: (S,), the upper end of the higher one, NaN if neither has a height.
-        robustness: (S,), at most 0: of the requirement, or of the atom that settled the violation; in the
-            unit of the log, where `scale` divides the number of the atom.
-        holds: (S,), whether the atom holds, where it should not.
-        moment_ns: (S,) int64, of which sample the number is; -1 for the sample itself.
-        atom: (S,) int64, which of `atoms` decides the leaf, if that is a quantifier; else -1.
-        atoms: those, with the objects that a quantifier binds.
+        result: (S,) int64, index of the result; -1 without a violation.
+        node: (S,) int64, id of the violated requirement, or of the atom that settled the violation.
+        leaf: (S,) int64, index of the deciding leaf in the result's program; -1 for none.
+        is_shown: (S,), whether the arrow has two ends.
+        points: (S, 2, 2), a point of the first and a point of the second thing of the pair.
+        top: (S,), upper end of the higher thing; NaN if neither has a height.
+        robustness: (S,), at most 0, of the requirement or of the settling atom. It is in the unit of the log:
+            a division by `scale` is undone.
+        holds: (S,), whether the atom holds but must not.
+        moment_ns: (S,) int64, time of the sample of the number; -1 for the sample itself.
+        atom: (S,) int64, index in `atoms` of the atom that decides a quantifier; else -1.
+        atoms: atoms of quantifiers with their bound objects.
     """
 
     result: Integers
@@ -234,18 +250,18 @@ class Violations(NamedTuple):
 
 
 class BoundAtom(NamedTuple):
-    """An atom of a quantifier with the objects that decide it: in words, and the pair that it relates."""
+    """An atom of a quantifier with its deciding objects: its text, and the pair that it relates."""
 
     text: str
     pair: Pair
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
-    """Return (R,) since when the conjunct of each requirement is violated for certain, or `LATEST_NS`.
+    """Return (R,), the start of the certain violation of each requirement's conjunct, or `LATEST_NS`.
 
     Args:
         block: the next samples.
-        before_ns: the same before them.
+        before_ns: (R,), the result for all earlier samples.
     """
     since_ns = before_ns.copy()
     at = np.arange(len(block.times_ns))
@@ -259,10 +275,10 @@ def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, befo
 def worst_robustness(
     results: Sequence[EvaluatedResult], presence: Presence, regions: Sequence[str]
 ) -> tuple[Floats, Floats]:
-    """Return the least robustness of what is asked of each object and region, in the sign that counts.
+    """Return the least robustness of the requirements on each object and region, times their signs.
 
-    In a conjunction or quantifier, it is the part about the object itself. For a finished log it is the
-    outcome of the obligations, otherwise their present state.
+    From a conjunction or quantifier, only the part about the object itself counts. The numbers are outcomes
+    of obligations for a finished log, and present numbers otherwise.
 
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
@@ -295,16 +311,16 @@ def worst_robustness(
 
 
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
-    """Return the violation to point at in some samples of a trace: of those now, what was certain first.
+    """Return the violation with the arrow in some samples of a trace: the earliest that lasts.
 
-    It is shown at the atom that gives the requirement its number, between the two points that attain the
-    signed distance of its terms. For an enclosure it follows the protrusion. In the sample that settled the
-    formula's violation that is the atom that settled it. A requirement with a deadline or in response to a
-    condition keeps its arrow afterwards, between the places and with the number that settled it. Conditions
-    of implications are not pointed at: those hold, and what had to follow does not.
+    The arrow is at the deciding atom of the requirement, between the two points that attain the signed
+    distance of its terms, or along the protrusion of an enclosure. In the sample that settled the formula's
+    violation, the arrow is at the settling atom. A requirement with a deadline or in response to a condition
+    keeps the arrow, its ends and its number after that sample. Conditions of implications have no arrow,
+    because the missing response is the fault.
 
     Args:
-        samples: (S,) int64, indices.
+        samples: (S,) int64, indices of samples.
     """
     times_ns = trace.times_ns[samples]
     which, requirement, robustness = _first(results, times_ns)
@@ -339,9 +355,10 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 
 
 def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
-    """Return (S,), in which samples a result is pointed at by what settled its violation.
+    """Return (S,), whether the arrow of a result is at the leaf that settled its violation.
 
-    That is the sample that settled it and, if the atom is not asked of every sample, all after it.
+    It is in the sample that settled the violation. If the atom is not an invariant, it is in all later
+    samples, too.
     """
     settled = result.settled
     if result.leaf_pairs is None or settled is None or settled.shown is None:
@@ -354,7 +371,7 @@ def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray
 
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
-    """Return the requirement that a leaf is in."""
+    """Return the requirement around a node: the last requirement with an id up to the node's."""
     within = [requirement for requirement in result.requirements if requirement.node <= node]
     return within[-1] if within else None
 
@@ -362,7 +379,7 @@ def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
 def _point_at_settling_leaf(
     result: EvaluatedResult, times_ns: Integers, places: Integers, violations: Violations
 ) -> None:
-    """Name the leaf that settled the violation, where that is what is pointed at."""
+    """Put the arrow at the leaf that settled the violation, in samples of `_shows_settling_leaf`."""
     if result.settled is None:
         return
     violations.leaf[places[times_ns[places] == result.settled.time_ns]] = -1
@@ -383,7 +400,7 @@ def _robustness(
     times_ns: Integers,
     of: Callable[[Requirement, Floats, Integers], Floats] = Requirement.robustness,
 ) -> Iterator[tuple[Requirement, Floats]]:
-    """Yield each requirement with its robustness (S,) at some times; NaN where it is not evaluated."""
+    """Yield each requirement with its robustness (S,) at some times; NaN at times without evaluation."""
     own_ns = result.block.times_ns
     if not len(own_ns):
         return
@@ -395,9 +412,9 @@ def _robustness(
 
 
 def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
-    """Return (S,) the first violation at each time: the result, the place of its requirement, its robustness.
+    """Return (S,) indices of results, (S,) indices of requirements and (S,) robustness of first violations.
 
-    A requirement of -inf is passed over: it has no members to satisfy it, and so no place in the scene.
+    A requirement with robustness -inf is skipped: no object can fulfil it, so the arrow would have no ends.
     """
     which, place = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
     violated = np.full(len(times_ns), np.nan)
@@ -420,7 +437,7 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
             which[is_first], place[is_first], violated[is_first] = index, number, now[is_first]
             earliest[is_first] = since_ns[number]
         if result.settled is not None and result.settled.shown is not None:
-            # what settled a violation may be a goal whose time is over
+            # a goal after its deadline may have settled the violation
             is_first = _shows_settling_leaf(result, times_ns) & (result.settled.time_ns < earliest)
             which[is_first], violated[is_first] = index, -abs(result.settled.shown.number)
             earliest[is_first] = result.settled.time_ns
@@ -430,8 +447,10 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
 def _deciding(
     result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers
 ) -> tuple[Integers, NDArray[np.bool_]]:
-    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,), -1 for none. Also
-    return whether that leaf is negated, so that it holds where the requirement fails."""
+    """Return (H,) deciding leaves of requirements (H,) in samples (H,), and whether each leaf is negated.
+
+    A leaf is -1 if no leaf has the requirement's number. A negated leaf holds if its requirement fails.
+    """
     leaf, is_turned = np.full(len(at), -1, np.int64), np.zeros(len(at), np.bool_)
     leaves = result.block.leaves
     low, high = low_and_high(len(leaves), wide=False)
@@ -439,7 +458,7 @@ def _deciding(
         samples = np.flatnonzero(requirement == number)
         below, demand = pairs.below[number], result.requirements[number]
         if not len(below.indices):
-            continue  # a constant
+            continue  # a constant formula has no leaves
         places = below.indices[:, None], at[samples][None, :]
         lows, highs = leaves[low][places], leaves[high][places]
         now = result.block.series[demand.node, 1, at[samples]]
@@ -453,7 +472,7 @@ def _deciding(
 def _locate(
     result: EvaluatedResult, trace: Trace, samples: Integers, places: Integers, violations: Violations
 ) -> None:
-    """Fill in the points at `places` (H,), whose leaves are given, and the atoms of quantifiers."""
+    """Set the ends of arrows and the atoms of quantifiers at `places` (H,), whose leaves are set."""
     if result.leaf_pairs is None:
         return
     is_past = violations.moment_ns[places] >= 0
@@ -461,7 +480,7 @@ def _locate(
     places = places[(violations.leaf[places] >= 0) & ~is_past]
     if not len(places):
         return
-    # of all samples, these are often few
+    # a trace of only these samples, which are often few, is faster to measure
     leaf, scene = violations.leaf[places], TraceScene(trace.take(samples[places]), result.leaf_pairs.regions)
     for index in np.unique(leaf).tolist():
         with_leaf = np.flatnonzero(leaf == index)
@@ -480,7 +499,7 @@ def _locate(
 def _point_at_past(
     result: EvaluatedResult, pairs: LeafPairs, places: Integers, violations: Violations
 ) -> None:
-    """Point at what settled a violation in an earlier sample, where it stood then."""
+    """Set the arrow at the leaf that settled a violation in an earlier sample, with the ends at that time."""
     settled = result.settled
     pair = None if settled is None or settled.atom is None else pair_of(settled.atom)
     if not len(places) or settled is None or settled.atom is None or settled.sample is None or pair is None:
@@ -495,14 +514,14 @@ def _point_at_past(
 def _iter_deciding(
     result: EvaluatedResult, pairs: LeafPairs, leaf: int, scene: TraceScene, samples: Integers
 ) -> Iterator[tuple[Formula, Integers]]:
-    """Yield what a quantifier asks of the objects that decide it, and at which of some samples (k,)."""
+    """Yield a quantifier's body for each deciding binding, with the indices (k,) in `samples`."""
     shades = [shade for shade in result.shades or () if shade.leaf == leaf]
     if not shades:
         return
     if not shades[0].bodies:
         yield from _iter_worst(pairs.leaves[leaf], shades[0].requirement.sign, scene, samples)
         return
-    # of the finished log there is the last sample alone
+    # the shades are of the last block, but a final block has only its last sample
     at = np.searchsorted(result.block.times_ns, scene.trace.times_ns[samples]) - (
         len(result.block.times_ns) if result.is_final else 0
     )
@@ -514,7 +533,10 @@ def _iter_deciding(
 def _iter_worst(
     leaf: Formula, sign: float, scene: TraceScene, samples: Integers
 ) -> Iterator[tuple[Formula, Integers]]:
-    """Yield what a quantifier with many bindings asks of those with the least number, as `_iter_deciding`."""
+    """Yield the body for each binding with the least number, for a quantifier with many bindings.
+
+    The indices are those of `_iter_deciding`.
+    """
     if not isinstance(leaf, Quantified):
         return
     part_scene = TraceScene(scene.trace.take(samples), scene.regions)
@@ -537,7 +559,7 @@ def _iter_worst(
 def _point_at(
     scene: TraceScene, pair: Pair, samples: Integers, places: Integers, violations: Violations
 ) -> None:
-    """Fill in the points of some samples of a scene, those of the violations at `places`."""
+    """Set the ends of the arrows at `places`, from the pair in some samples of a scene."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
     first, second = (Operand(operand.rows[samples], operand.enlargement) for operand in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
@@ -551,8 +573,8 @@ def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:
 
 
 def _members(group: ClassMembers, presence: Presence) -> NDArray[np.bool_]:
-    """Return (S, objects), which objects belong to an open group in each sample."""
+    """Return (S, objects), whether each object belongs to an open group in each sample."""
     fits = [group.class_name in (ANY_CLASS, (name or "").casefold()) for name in presence.classes]
     included = np.array([name not in group.excluded for name in presence.names], np.bool_)
-    # absent objects have the code -1, and so the last entry
+    # the class code -1 of absent objects indexes the last entry
     return np.array([*fits, False], np.bool_)[presence.class_code] & included
