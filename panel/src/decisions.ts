@@ -222,7 +222,7 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
   return {
     columns, low: [x, y], high, values, edge: owner.edge, candidate: owner.candidate, target, object, layers,
     scale: values.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0),
-    title: object + turned,
+    title: object + turned, rule: printable(candidate.rule ?? ""),
     chosen: Boolean(decision.target && isLast && candidate.chosen && target),
     limits: conjuncts.map(({ text }) => printable(text)), blocks: causes.map(({ words }) => partsOf(words ?? "")),
     ...(limited && blocked ? { limited, blocked } : {}),

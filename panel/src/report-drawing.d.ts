@@ -59,7 +59,7 @@ declare module "report-drawing" {
     target: DrawnTarget | null;
     limited?: Float32Array; blocked?: Float32Array; limits: string[]; blocks: string[][];
     layers: { number: number; title: string; values: Float32Array }[]; at_target?: (number | null)[];
-    room?: Float32Array; wanted_room?: number;
+    room?: Float32Array; wanted_room?: number; rule: string;
   }
   export interface DrawnBar { kind: string; words: string[]; cells: number }
   export interface DrawnEdge {

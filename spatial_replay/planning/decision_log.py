@@ -177,12 +177,18 @@ def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
 
 
 def explain(
-    message: PlanCandidate, candidate: Candidate, layers: MapLayers, settings: Settings, bans: Sequence[Ban]
+    message: PlanCandidate,
+    candidate: Candidate,
+    layers: MapLayers,
+    settings: Settings,
+    bans: Sequence[Ban],
+    motions: int,
 ) -> None:
     """Add to a candidate the relations of its map, the causes of blocked cells, and the cost of room.
 
     Args:
         bans: the constraint set of its edge.
+        motions: the number of motions that are planned together for its edge.
     """
     target = candidate.target
     free = layers.limiting[layers.blocked_by < 0]
@@ -193,11 +199,24 @@ def explain(
         message.conjuncts.append(PlanConjunct(text=text, limits=counts[number], at_target=at_target))
     for cause in layers.causes:
         kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")
-        words = cause_sentence(kind, cause.name, bans)
+        words = cause_sentence(kind, cause.name, bans, settings.constraint_margin)
         message.causes.append(PlanCause(kind=kind, text=cause.name, cells=cause.cells, words=words))
     if target is not None and (cost := room_cost(candidate, target, settings)) is not None:
         room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.room)
         message.room.CopyFrom(room)
+    if target is not None:
+        message.rule = _rule(settings, motions, has_room_cost=message.HasField("room"))
+
+
+def _rule(settings: Settings, motions: int, *, has_room_cost: bool) -> str:
+    """Return how a target is chosen among places that will do."""
+    if motions > 1:
+        return f"the places of {motions} motions are chosen together"
+    if settings.skill == "push":
+        return "a robot that pushes takes the nearest place that will do"
+    if has_room_cost:
+        return "places with enough room come first"
+    return "the most robust place is taken, of equal ones the nearest"
 
 
 # -------------------------------------------------------------------------------------------------- decisions
@@ -420,10 +439,11 @@ def explained_decision(
     message.margin = planner.settings.margin
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
         bans = planner.bans(edge, step.pruned)
+        motions = len(edge.motions) if edge.is_joint else 1
         of_edge.wanted[:] = wanted_of(edge.progress.texts, bans)
         of_edge.rules[:] = rules_of(bans)
         for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, candidate, layers[candidate], planner.settings, bans)
+            explain(of_candidate, candidate, layers[candidate], planner.settings, bans, motions)
     return message
 
 
@@ -731,15 +751,17 @@ def room_sentence(candidate: PlanCandidate) -> str:
     )
 
 
-def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban]) -> str:
+def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban], margin: float) -> str:
     """Return why an object must not be in a cell, with formulas between backquotes.
 
     Args:
         text: the guard that would hold, or the object that stands there.
         bans: the constraint set that the guard is of.
+        margin: by which constraints have to be false.
     """
     if kind == PlanCause.KIND_CONSTRAINT:
-        return ban_of(text, bans).breach
+        nearly = f", or nearly (margin {margin:.4g})" if margin else ""
+        return f"{ban_of(text, bans).breach}{nearly}"
     texts = {
         PlanCause.KIND_OBJECT: f"{text} stands there",
         PlanCause.KIND_OBSTACLE: "an obstacle of the workspace stands there",

@@ -70,7 +70,7 @@ from spatial_replay.planning.decision_log import (
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import cut, json_fields, plural, with_unit
+from spatial_replay.text import cut, json_fields, with_unit
 
 Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 """Number types of arrays in the page: float64, float32, int32, uint16, uint8."""
@@ -666,11 +666,10 @@ class ReportedDecisions:
 
     Attributes:
         maps: gradient maps by the number that decisions refer to, in the order of the log.
-        is_pushed: whether the robot pushes objects, so that the nearest cell that will do is chosen.
     """
 
-    def __init__(self, *, is_pushed: bool = False) -> None:
-        self.maps, self.is_pushed = dict[int, Grid](), is_pushed
+    def __init__(self) -> None:
+        self.maps = dict[int, Grid]()
         self._decisions: list[PlanDecision] = []
 
     def add_decision(self, payload: bytes) -> None:
@@ -751,11 +750,7 @@ def decisions_value(
     others = {redone_decision.number: redone_decision for redone_decision in redone.decisions}
     decisions = []
     for decision, maps in zip(plan.decisions, maps_by_decision, strict=True):
-        values = [
-            {**_map_value(drawn_map, packing), "why": _why(drawn_map, decision, plan.is_pushed)}
-            for drawn_map in maps
-            if id(drawn_map) in kept_maps
-        ]
+        values = [_map_value(drawn_map, packing) for drawn_map in maps if id(drawn_map) in kept_maps]
         value = _decision_value(decision, values, first_ns, packing)
         redone_decision = others.get(decision.number)
         if redone_decision is not None and _outcome(redone_decision) != _outcome(decision):
@@ -845,6 +840,7 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "object": "",
         "title": "",
         "target": None,
+        "rule": "",
     }
     owner = drawn.owner
     if owner is None:
@@ -858,51 +854,8 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "object": candidate.object,
         "title": f"{candidate.object}{turn_text}",
         "target": None if owner.target is None else _target_value(owner.target),
+        "rule": candidate.rule,
     }
-
-
-def _why(drawn: _Drawn, decision: PlanDecision, is_pushed: bool) -> str:
-    """Return why the target of the chosen map is where it is; "" for other maps."""
-    owner = drawn.owner
-    if not drawn.is_chosen or owner is None or owner.target is None or not decision.HasField("margin"):
-        return ""
-    at_target = _value_at(drawn, owner.target)
-    if at_target is None:
-        return ""
-    # a refined target may be better than the middle of its cell
-    best = max(at_target, owner.target.robustness)
-    will_do, higher = int((drawn.values >= decision.margin).sum()), int((drawn.values > best).sum())
-    enough = f"{will_do:,} of {plural(drawn.values.size, 'cell')} will do"
-    in_cell, robustness = f"{at_target:.4g}", f"{owner.target.robustness:.4g}"
-    between = (
-        f" The target lies between cells and has {robustness}; demands are those in the middle of its cell, "
-        f"which has {in_cell}."
-    )
-    between *= in_cell != robustness
-    if not higher:
-        return f"{enough}, and none has a higher robustness than the target.{between}"
-    edge = decision.considered[owner.edge]
-    if edge.joint and len(edge.motions) > 1:
-        rule = f"the places of {len(edge.motions)} motions are chosen together"
-    elif is_pushed:
-        rule = "a robot that pushes takes the nearest"
-    else:
-        rule = "cells with enough room come first" if owner.candidate.HasField("room") else ""
-    return f"{enough}, {higher:,} with a higher robustness than the target{rule and f': {rule}'}.{between}"
-
-
-def _value_at(drawn: _Drawn, target: PlanTarget) -> float | None:
-    """Return the robustness in the cell of a target; None outside of the map."""
-    fractions = [
-        (number - low) / (high - low)
-        for number, low, high in zip((target.y, target.x), drawn.low[::-1], drawn.high[::-1], strict=True)
-    ]
-    if not all(0.0 <= fraction < 1.0 for fraction in fractions):
-        return None
-    row, column = (
-        int(fraction * count) for fraction, count in zip(fractions, drawn.values.shape, strict=True)
-    )
-    return float(drawn.values[row, column])
 
 
 def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -18,7 +17,7 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import UsageError
 from spatial_replay.html import Html, element
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
@@ -28,7 +27,6 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.planning.settings import settings_from_text
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.data import ReportedResult, RunReport, page_data, worst_results
@@ -61,9 +59,9 @@ _COLLECTED: Final = frozenset(
 class Collector:
     """Collects the facts of a page from the messages and scenes of a replay."""
 
-    def __init__(self, *, is_pushed: bool) -> None:
+    def __init__(self) -> None:
         self.scene = ReportedScene()
-        self.decisions, self.redone = ReportedDecisions(is_pushed=is_pushed), ReportedDecisions()
+        self.decisions, self.redone = ReportedDecisions(), ReportedDecisions()
         self.events: list[Event] = []
         self.ticks: list[bytes] = []
         self.paths: defaultdict[tuple[str, str | None], StatePath] = defaultdict(StatePath)
@@ -143,7 +141,7 @@ def report_of(
 
     Arguments and errors are those of `write_report`.
     """
-    collector = Collector(is_pushed=_is_pushed(source))
+    collector = Collector()
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     replayed = replay.run(collector.add, advance=advance)
     report = RunReport(
@@ -163,14 +161,6 @@ def report_of(
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
     replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)
     return replayed, report
-
-
-def _is_pushed(source: Source) -> bool:
-    """Return whether a log was planned for a robot that pushes."""
-    settings = dict(source.metadata()).get(log_topics.PLAN_METADATA, {}).get("settings")
-    with suppress(LogError):
-        return settings is not None and settings_from_text(settings).skill == "push"
-    return False
 
 
 def _results(

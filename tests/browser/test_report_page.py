@@ -600,7 +600,6 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     )
     titles = choice.locator("option").all_text_contents()
     assert titles[0] == "all that has to hold" and len(titles) > 1
-    expect(figure.locator(".why")).to_have_text(re.compile(r"^Why there\? [\d,]+ of [\d,]+ cells will do"))
     pictures = []
     for title in titles:
         choice.select_option(label=title)
@@ -615,6 +614,12 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     grid = messages(log)[number]
     fields = map_fields(grid)
     texts = [conjunct.text for conjunct in candidate.conjuncts]
+    robustness, margin = fields["robustness"], read_decisions(log).decisions[0].margin
+    enough, higher = (robustness >= margin).sum(), (robustness > candidate.target.robustness).sum()
+    expect(figure.locator(".why")).to_contain_text(
+        f"Why there? {enough:,} of {robustness.size:,} cells will do, {higher or 'none'} with a higher "
+        f"robustness than the target. {candidate.rule.capitalize()}."
+    )
     box = made.bounding_box()
     assert box is not None
     # by keys, the first cell is that of the target

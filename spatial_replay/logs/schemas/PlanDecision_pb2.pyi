@@ -326,6 +326,7 @@ class PlanCandidate(google.protobuf.message.Message):
     CONJUNCTS_FIELD_NUMBER: builtins.int
     CAUSES_FIELD_NUMBER: builtins.int
     ROOM_FIELD_NUMBER: builtins.int
+    RULE_FIELD_NUMBER: builtins.int
     object: builtins.str
     best: builtins.float
     """Greatest robustness of the progress set at a cell that is not blocked; -infinity if all are."""
@@ -335,6 +336,8 @@ class PlanCandidate(google.protobuf.message.Message):
     """Why it was rejected, or empty."""
     chosen: builtins.bool
     """Whether it is the one to be moved."""
+    rule: builtins.str
+    """How its target is chosen among places that will do; empty without a target."""
     @property
     def target(self) -> global___PlanTarget:
         """Where it would go; absent if it was rejected."""
@@ -368,9 +371,10 @@ class PlanCandidate(google.protobuf.message.Message):
         conjuncts: collections.abc.Iterable[global___PlanConjunct] | None = ...,
         causes: collections.abc.Iterable[global___PlanCause] | None = ...,
         room: global___PlanRoom | None = ...,
+        rule: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "room", b"room", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "causes", b"causes", "chosen", b"chosen", "conjuncts", b"conjuncts", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "room", b"room", "target", b"target"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "causes", b"causes", "chosen", b"chosen", "conjuncts", b"conjuncts", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "room", b"room", "rule", b"rule", "target", b"target"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_best", b"_best"]) -> typing.Literal["best"] | None: ...
 
 global___PlanCandidate = PlanCandidate

@@ -38,6 +38,7 @@ function makeDecision(clock, decision) {
   const meant = chosenMap(decision);
   const later = decision.edges.flatMap((edge) => (edge.aim ? edge.later : []));
   const heading = element("div", {}, title, element("p", {}, minusWords(sentence(decision.reason))),
+    ...decision.edges.filter(({aim}) => aim).map(demandsOf),
     later.length ? element("p", {}, `Planned next: ${minusWords(later.join(", then "))}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
@@ -80,16 +81,19 @@ function sentence(text) {
   return text && !/[.!?…]$/.test(text) ? `${text}.` : text;
 }
 
+// What an edge wants, and what to keep and to avoid on the way.
+function demandsOf({wanted, rules}) {
+  const row = (head, sentences) => (sentences.length ? element("p", {class: "demands"}, element("b", {}, head), ...sentences.flatMap(
+    (words, index) => [index ? "; " : " ", ...withCode(words)])) : null);
+  return element("div", {}, row(wanted.length > 1 ? "Wanted, one of" : "Wanted", wanted), row("On the way", rules));
+}
+
 function makeEdge(clock, decision, edge, number) {
-  const sentences = (texts) => element("ul", {}, ...texts.map((words) => element("li", {}, ...withCode(words))));
   const mapsOf = (place) => decision.maps.filter((map) => map.edge === number && map.candidate === place);
   return element("section", {class: "edge"},
     element("h3", {}, `${edge.aim ? "Aimed at" : "Looked into"} ${edge.path.slice(0, 2).join(" → ")}`,
       element("span", {class: "quiet"}, ` on the path ${edge.path.join(" → ")}`)),
-    element("p", {class: "quiet"}, edge.wanted.length > 1 ? "Wanted, one of" : "Wanted"),
-    sentences(edge.wanted),
-    edge.rules.length ? element("p", {class: "quiet"}, "On the way") : null,
-    edge.rules.length ? sentences(edge.rules) : null,
+    demandsOf(edge),
     element("div", {class: "candidates"},
       ...edge.candidates.map((candidate, place) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${minusWords(sentence(edge.pruned))}`) : null);

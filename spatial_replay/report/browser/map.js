@@ -44,9 +44,32 @@ function makeMap(clock, map, decision, isTitled) {
     ask(steppedCell(map, cell, step));
   });
   const layers = map.layers?.length ? layerChoice(run, map, (chosen) => { layer = chosen; redraw(); }) : null;
-  const why = map.why ? element("p", {class: "why"}, `Why there? ${map.why}`) : null;
+  const why = map.chosen ? whyThere(run, map, decision) : null;
   return element("figure", {}, made, layers, why, isTitled ? element("figcaption", {}, map.title || "a candidate") : null,
     answer);
+}
+
+// Why the target of the chosen map is where it is: the cells that will do, and the rule that chooses among them.
+function whyThere(run, map, {margin}) {
+  if (!map.target?.at || margin === null) return null;
+  const values = run.numbers(map.values), [row, column] = cellAt(map, map.target.at);
+  const [inCell, target] = [values[row * map.columns + column], map.target.robustness];
+  // a refined target may be better than the middle of its cell
+  const best = Math.max(inCell, target);
+  let enough = 0, higher = 0;
+  for (const value of values) {
+    enough += value >= margin;
+    higher += value > best;
+  }
+  const between = numberText(inCell) === numberText(target) ? ""
+    : ` The target lies between cells and has ${numberText(target)}; demands are those in the middle of its cell, which has ${numberText(inCell)}.`;
+  return element("p", {class: "why"},
+    `Why there? ${countText(enough)} of ${countText(values.length)} cells will do, ${higher ? countText(higher) : "none"} `
+    + `with a higher robustness than the target.${map.rule ? ` ${map.rule[0].toUpperCase()}${map.rule.slice(1)}.` : ""}${between}`);
+}
+
+function countText(count) {
+  return count.toLocaleString("en");
 }
 
 function rowsOf(map) {
@@ -136,8 +159,10 @@ function cellWords(run, map, decision, {place, value, cause, limit, target}) {
   const room = map.room && run.numbers(map.room)[place];
   const rest = room !== undefined && room < map.wanted_room
     ? ` The room around it is ${numberText(Math.max(room, 0))} of ${numberText(map.wanted_room)}.` : "";
-  const better = target === null ? "" : value > target ? ", more than at the target" : ", no more than at the target";
-  return [element("code", {}, demand), `${by}${better}.${rest}`];
+  if (target === null) return [element("code", {}, demand), `${by}.${rest}`];
+  const more = Math.abs(value - target) <= 1e-6 * Math.abs(target) ? "as much as" : value > target ? "more than" : "less than";
+  const rule = map.chosen && map.rule ? ` It would do, too; ${map.rule}.` : "";
+  return [element("code", {}, demand), `${by}, ${more} at the target.${rule}${rest}`];
 }
 
 function spaced(unit) {
@@ -304,10 +329,11 @@ function drawAxes(context, map, unit, at, [left, top, right, bottom]) {
   };
   context.textAlign = "center";
   context.textBaseline = "top";
-  for (const tick of ticks(0, right - left, 48)) {
+  const along = ticks(0, right - left, 48), last = along[along.length - 1];
+  for (const tick of along) {
     context.moveTo(at.x(tick), bottom);
     context.lineTo(at.x(tick), bottom + 4);
-    context.fillText(numberText(tick), at.x(tick), bottom + 6);
+    context.fillText(`${numberText(tick)}${tick === last ? spaced(unit) : ""}`, at.x(tick), bottom + 6);
   }
   context.textAlign = "right";
   context.textBaseline = "middle";
@@ -315,10 +341,6 @@ function drawAxes(context, map, unit, at, [left, top, right, bottom]) {
     context.moveTo(left - 4, at.y(tick));
     context.lineTo(left, at.y(tick));
     context.fillText(numberText(tick), left - 6, at.y(tick));
-  }
-  if (unit) {
-    context.textBaseline = "top";
-    context.fillText(unit, left - 6, bottom + 6);
   }
   context.stroke();
 }
