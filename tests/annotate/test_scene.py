@@ -426,6 +426,18 @@ def test_names_and_labels_of_an_arrow_cover_no_other_object_where_a_side_is_free
         assert y + line / 2.0 <= 1.1 or y - line / 2.0 >= 3.0, text.text
 
 
+def test_the_name_of_an_object_that_failed_moves_off_another_object_where_a_side_is_free(tmp_path: Path):
+    wall = Footprint.box(-1.0, -3.0, 30.0, -0.1)
+    source = MemorySource(run(*({"a": box_at(0.0), "b": box_at(x), "c": wall} for x in (2.0, 9.0))), "run")
+    output = tmp_path / "annotated.mcap"
+    run_replay(source, [parse_specification("spec s = G (a dist b >= 2)")], output=output)
+    with output.open("rb") as stream:
+        later = [record.data for *_, record in make_reader(stream).iter_messages(["/spatial/scene"])][1]
+    [name] = entity(SceneUpdate.FromString(later), "object/a").texts
+    assert name.text == "a ✕"
+    assert name.pose.position.y > 1.0
+
+
 def test_a_name_stands_below_an_object_that_is_too_small_for_it():
     [message] = pointed(
         "spec s = G (a dist big >= 0)",

@@ -78,6 +78,44 @@ def place_names(low: Floats, high: Floats, letters: Floats, around: Surroundings
     return middles
 
 
+def free_names(
+    middles: Floats, letters: Floats, movable: Booleans, boxes: Box, around: Surroundings
+) -> Floats:
+    """Return the middles (N, 2, K) of names, moved to a free side where they cover other objects or names.
+
+    A box that contains an object is its background: the name of the object may cover it.
+
+    Args:
+        middles: the usual places (N, 2, K); NaN without a name.
+        letters: (N,), lengths of the names.
+        movable: (N, K), the names that may be moved.
+        boxes: those of what is named, (N, 2, K) each.
+        around: the view, whose boxes do not count.
+    """
+    middles = middles.copy()
+    halves = np.stack([half_sizes(length * np.ones_like(around.line), around.line) for length in letters])
+    for number in np.flatnonzero(movable.any(axis=1)).tolist():
+        rest = np.flatnonzero(np.arange(len(middles)) != number)
+        low = np.concatenate([boxes[0][rest], (middles - halves)[rest]])
+        high = np.concatenate([boxes[1][rest], (middles + halves)[rest]])
+        own, half = (boxes[0][number], boxes[1][number]), halves[number]
+        is_background = ((low <= own[0]) & (own[1] <= high)).all(axis=1)
+        covers = _overlaps(middles[number] - half, middles[number] + half, (low, high)) & ~is_background
+        places = np.flatnonzero(covers.any(axis=0) & movable[number])
+        if not len(places):
+            continue
+        own, half = _part(own, places), half.take(places, axis=-1)
+        others = _part((np.where(is_background[:, None], np.nan, low), high), places)
+        nothing = np.empty((0, 2, len(places))), np.empty((0, 2, len(places)))
+        near = Surroundings(
+            nothing, others, _part(around.scene, places), around.margin[places], around.line[places]
+        )
+        moved = _place(half, own, own, near, _NAME_PLACES)
+        is_free = ~_is_covered(moved - half, moved + half, others)
+        middles[number][:, places[is_free]] = moved[:, is_free]
+    return middles
+
+
 def place_labels(letters: Floats, arrow: Box, around: Surroundings) -> Floats:
     """Return the middles (2, K) of one label in each of K scenes.
 
@@ -166,10 +204,15 @@ def _ranks(places: Floats, text: _Text) -> Integers:
 
 def _is_covered(begin: Floats, end: Floats, boxes: Box) -> Booleans:
     """Return (K,), whether texts from `begin` to `end` (2, K) cover any of the boxes (B, 2, K)."""
+    return np.asarray(_overlaps(begin, end, boxes).any(axis=0))
+
+
+def _overlaps(begin: Floats, end: Floats, boxes: Box) -> Booleans:
+    """Return (B, K), which of the boxes (B, 2, K) texts from `begin` to `end` (2, K) cover."""
     low, high = boxes
     covers = (begin[1] < high[:, 1]) & (low[:, 1] < end[1])
     covers &= (begin[0] < high[:, 0]) & (low[:, 0] < end[0])
-    return np.asarray(covers.any(axis=0))
+    return np.asarray(covers)
 
 
 def _candidate(number: int, text: _Text) -> tuple[Floats, Booleans]:

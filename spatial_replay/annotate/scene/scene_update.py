@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.scene.extent import VIEW, SceneExtent
-from spatial_replay.annotate.scene.placing import Box, Surroundings, place_labels, place_names
+from spatial_replay.annotate.scene.placing import Box, Surroundings, free_names, place_labels, place_names
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -428,7 +428,13 @@ def _content(
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
     messages = np.flatnonzero(found.is_shown)
-    boxes_of_objects = _boxes_of(observations[messages], low, high)
+    boxes_of_objects = _boxes_of(observations, low, high)
+    is_named = (labels[0] | labels[1]) & is_present & ~found.is_shown[:, None]
+    middles = _name_places(low, high, letters, np.repeat(view.line, is_present.sum(axis=1)))
+    lengths = np.array([len(name) + 2 for name in names], np.float64)
+    of_names = np.where(is_named, observations, -1)
+    middles = _free_places(middles, lengths, of_names, is_named & labels[1], boxes_of_objects, view)
+    boxes_of_objects = boxes_of_objects[0][..., messages], boxes_of_objects[1][..., messages]
     deciding = _deciding_boxes(names, found, arrows, boxes_of_objects, missing, regions)
     spots, label = np.zeros((len(rows), 2, 2)), np.full((len(rows), 2), np.nan)
     of_messages = _View(view.corners[messages], view.line[messages])
@@ -444,7 +450,7 @@ def _content(
         observations,
         footprints,
         rings,
-        _name_places(low, high, letters, np.repeat(view.line, is_present.sum(axis=1))),
+        middles,
         found,
         label,
         witness,
@@ -539,12 +545,42 @@ def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View)
         others: boxes of all objects.
         view: that of these messages.
     """
-    low, high = view.corners.transpose(1, 2, 0)
-    margin = VIEW / 2.0 * (high - low).max(axis=0)
-    around = Surroundings(deciding.blocked, others, (low, high), margin, view.line)
+    around = _surroundings(deciding.blocked, others, view)
     spots = place_names(deciding.low, deciding.high, deciding.letters, around)
     arrow = deciding.blocked[0][_ARROW_BOX], deciding.blocked[1][_ARROW_BOX]
     return spots.transpose(2, 0, 1), place_labels(letters, arrow, around).T
+
+
+def _surroundings(blocked: Box, others: Box, view: _View) -> Surroundings:
+    low, high = view.corners.transpose(1, 2, 0)
+    return Surroundings(blocked, others, (low, high), VIEW / 2.0 * (high - low).max(axis=0), view.line)
+
+
+def _free_places(
+    middles: Floats,
+    letters: Floats,
+    observations: Integers,
+    movable: NDArray[np.bool_],
+    boxes_of_objects: Box,
+    view: _View,
+) -> Floats:
+    """Return the middles of names (R, 2), moved where they cover other objects and a side is free.
+
+    Args:
+        letters: (N,), the lengths of names.
+        observations: (S, N), rows of objects that have their names beside them; -1 for others.
+        movable: (S, N), the names that may be moved.
+    """
+    if not movable.any():
+        return middles
+    is_named = observations.T >= 0
+    usual = np.where(is_named, middles.T[:, observations.T], np.nan).swapaxes(0, 1)
+    nothing = np.empty((0, 2, len(observations))), np.empty((0, 2, len(observations)))
+    around = _surroundings(nothing, boxes_of_objects, view)
+    free = free_names(usual, letters, movable.T, boxes_of_objects, around)
+    moved = middles.copy()
+    moved[observations.T[is_named]] = free.swapaxes(0, 1)[:, is_named].T
+    return moved
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
