@@ -90,8 +90,8 @@ class NodeStates:
     """The states of some nodes, each with a candidate for the next one.
 
     Attributes:
-        integers: (K, 6) int64, per node: its state, the times of the first and the last sample in that state;
-            the candidate, its count of samples in a row, the time of its first sample.
+        integers: (K, 6) int64, per node. Three are of the state: its code, and its first and last time.
+            Three are of the candidate: its code, its count of samples in a row, and its first time.
         worst: (K, 2), least number of the state and of the candidate.
     """
 

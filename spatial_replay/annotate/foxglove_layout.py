@@ -1,4 +1,4 @@
-"""The layout of a log for Foxglove and Lichtblick: panels by id, and a tree of splits that places them."""
+"""The layout of a log for Foxglove and Lichtblick: panels by id, and a tree of splits that arranges them."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
-"""More curves, or strips of named specs, cannot be distinguished."""
+"""Limits of curves in a plot and of strips of named specs; more cannot be distinguished."""
 
 _MOST_PLOTS: Final = 3
 _MOST_INDICATORS: Final = 6
-"""Lights in one row."""
+"""Limits of plots by unit, and of lights in the only row."""
 
 _LEGEND_PIXELS: Final = 240
-"""The width of a legend with the values at the cursor, beside the curves so that it hides none."""
+"""Width of a legend with the values at the cursor, pixels. It is next to the curves and hides none."""
 
 _LONGEST_LABEL: Final = 24
-"""The most characters of a label: what fits into a legend."""
+"""Limit of a label that fits into a legend, characters."""
 
 _INDICATOR_PIXELS: Final = 18
 _ZERO: Final = "#8c8c8c"
@@ -65,13 +65,13 @@ _STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
         for code in (SATISFIED, HOLDS_SO_FAR, PENDING, VIOLATED, UNKNOWN)
     }
 )
-"""Each number of `Standing` in words, and the colour that it has where a panel lets us choose it."""
+"""Words and colour of each number of `Standing`, in panels that accept a colour."""
 
 Config = dict[str, Any]
 
 
 class Panel(NamedTuple):
-    """A panel: its identifier, and how it is set."""
+    """A panel: its identifier and its settings."""
 
     identifier: str
     config: Config
@@ -80,9 +80,9 @@ class Panel(NamedTuple):
 def scene_panel(
     camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES, planned_for: str = ""
 ) -> Panel:
-    """Return the scene from above, with the planner's map below it and its path above.
+    """Return the scene from above, with the planner's map below it and the planned path above it.
 
-    A viewer can show the planner's redone decisions instead.
+    The planner's redone decisions are hidden; a viewer can show them instead.
     """
     displays: dict[str, Config] = {
         SCENE: {},
@@ -100,7 +100,7 @@ def scene_panel(
         "topics": {
             topic: {"visible": True, **display} for topic, display in displays.items() if topic in topics
         },
-        # axes are a metre long, whatever the scene's size
+        # viewers draw axes of 1 m, which do not fit every scene
         "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
@@ -112,10 +112,11 @@ def scene_panel(
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
-    """Return a light for each of the first results, in the colour of how it stands at the cursor.
+    """Return a light for each of the first results, in the colour of its standing at the cursor.
 
     Args:
-        outcomes: of the finished log; titles say the worst number of violated results, and when it was.
+        outcomes: outcomes over the finished log. Titles of violated results have their worst number and its
+            time.
     """
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
@@ -142,7 +143,7 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
 def sample_curves(
     trees: Sequence[ReportedTree], units: Mapping[str, str], zero: TextZero | None = None
 ) -> list[Panel]:
-    """Return the curves of the results and of named specs, those of each unit in a panel of their own."""
+    """Return panels with the curves of results and of named specs, one panel per unit."""
     results = [(tree.title, tree.formula) for tree in trees]
     return [
         panel
@@ -163,7 +164,7 @@ def sample_curves(
 
 
 def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
-    """Return the curves over the whole log of each result, then of its named specs."""
+    """Return panels with the curves over the whole log, of results and then of named specs."""
     curves = [
         _Curve(tree.title, f"{_curves_path(tree, 0)}.value[:]", unit_of(tree.formula, units))
         for tree in trees
@@ -187,15 +188,15 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
 
 
 def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Panel:
-    """Return a strip for how each result stands, then for its named specs.
+    """Return a panel with a strip of the standing of each result, then of named specs.
 
     Args:
-        by_stamp: whether the header of a message has its time. After a seek of a live source, earlier
-            messages come at the new time.
+        by_stamp: whether strips read the time in the header of messages. A live source needs that, because
+            after a seek its earlier messages arrive at the new time.
     """
     strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
     more = [(title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)]
-    # Foxglove takes its colours from here, Lichtblick from the numbers
+    # Foxglove takes its colours from these settings, Lichtblick from the numbers
     states = [
         {"value": str(number), "label": words, "color": colour}
         for number, (words, colour) in _STANDING_COLOURS.items()
@@ -214,9 +215,9 @@ def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Pa
 
 
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
-    """Return the picture of each camera that objects were found by, with the outlines that we draw on it.
+    """Return a panel for each camera that detected objects, with the outlines on its images.
 
-    A log without annotated images shows its first topic with images.
+    A log without annotated images gets a panel for its first topic with images.
     """
     cameras = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
     copied = iter([image for image in images if image not in cameras])
@@ -242,7 +243,10 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
 
 
 def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
-    """Return the name of a result, its worst number if it is violated, then words: viewers cut the end."""
+    """Return the title of a light: the result, its worst number if it is violated, then its sentence.
+
+    The sentence comes last, because viewers cut long titles at the end.
+    """
     title, words = tree.title, f": {tree.sentence}" if tree.sentence else ""
     if outcome is None or outcome.standing != VIOLATED or not math.isfinite(outcome.by):
         return f"{title}{words}"
@@ -251,12 +255,12 @@ def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
 
 
 def _with_clock(at: Instant) -> str:
-    """Return a time, and how a viewer's cursor shows it where that differs."""
+    """Return a time, also as the clock time of a viewer's cursor if that differs."""
     return f"{at} ({clock_text(at.time_ns)})" if at.first_ns else str(at)
 
 
 def _title_panel(identifier: str, title: str, config: Config) -> Panel:
-    # each of the two viewers reads a key of its own
+    # Foxglove and Lichtblick read different keys
     return Panel(identifier, {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title})
 
 
@@ -267,7 +271,7 @@ def _parts(trees: Sequence[ReportedTree]) -> list[tuple[str, Formula]]:
 
 
 class _Curve(NamedTuple):
-    """A curve: its label, the path of its numbers, and their unit."""
+    """A curve: its label, the message path of its numbers, and their unit."""
 
     label: str
     path: str
@@ -275,7 +279,7 @@ class _Curve(NamedTuple):
 
 
 def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero | None = None) -> list[Panel]:
-    """Return a plot for each unit, with a line at 0: above it, things hold."""
+    """Return a plot for each unit, with a line at 0, above which specifications hold."""
     offset = "" if text_zero is None else text_zero.offset
     panels = []
     for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
@@ -322,12 +326,12 @@ def _quote(text: str) -> str:
 
 
 class TextZero(NamedTuple):
-    """The time that texts count from, and the one that the axes of a viewer do.
+    """The zero of times in texts, and the zero of a viewer's axes.
 
     Attributes:
-        zero_ns: of the texts.
-        start_ns: of the first message that the viewer shows.
-        name: the name of what begins there.
+        zero_ns: zero of texts.
+        start_ns: zero of the axes, the time of the first message that the viewer shows.
+        name: name of the log that begins with that message.
     """
 
     zero_ns: int
@@ -336,7 +340,7 @@ class TextZero(NamedTuple):
 
     @property
     def offset(self) -> str:
-        """How far the two are apart; "" where they are the same."""
+        """The offset between both zeros in words; "" if they are equal."""
         if self.zero_ns == self.start_ns:
             return ""
         side = "after" if self.zero_ns > self.start_ns else "before"
@@ -348,26 +352,26 @@ class TextZero(NamedTuple):
 
 
 _OPENING_NS: Final = 99_000_000
-"""The time that a viewer plays by itself when it opens a log."""
+"""Stretch that a viewer plays by itself when it opens a log, nanoseconds."""
 
 
 class LayoutContents(NamedTuple):
     """Content of a layout for a log.
 
     Attributes:
-        trees: its results.
-        has_states: of each, whether the log has the states of its automaton.
-        extent: where its footprints are; None if it has none.
-        topics: all that have messages.
-        axes: those of the source, which the title of the scene says where they are not ours.
-        units: those that are declared, see `unit_of`.
-        outcomes: of each tree, what it came to; empty while that can change.
-        order: the places of the trees, the worst first; empty while that is not known.
-        images: the topics with images.
-        planned_for: the file that the planner's decisions were made for, if these results are of another one.
-        zero: the time that texts count from; None before it is known.
-        planned: the name of the result that a planner worked for; "" without any.
-        first_event_ns: the time of the first event; None without any, or before it is known.
+        trees: trees of the results.
+        has_states: whether the log has the states of each tree's automaton.
+        extent: bounds of the footprints; None without footprints.
+        topics: all topics with messages.
+        axes: axes of the source, named in the scene's title if they differ from the axes of samples.
+        units: declared units, see `unit_of`.
+        outcomes: final outcome of each tree; empty before the end of the log.
+        images: topics with images.
+        order: indices of the trees, the worst first; empty before the end of the log.
+        planned_for: specification file of the planner's decisions, if these results are of another file.
+        zero: zero of times in texts; None before it is known.
+        planned: name of the result that a planner worked for; "" without one.
+        first_event_ns: time of the first event; None without events, or before it is known.
     """
 
     trees: Sequence[ReportedTree]
@@ -386,7 +390,7 @@ class LayoutContents(NamedTuple):
 
     @property
     def first_tab(self) -> str:
-        """The title of the tab that is open at first: it shows something at once."""
+        """The title of the tab that is open at first: a tab that shows something at the start of the log."""
         if self.planned and PLAN_DECISION in self.topics:
             return "decision"
         if not self.outcomes or any(outcome.standing == VIOLATED for outcome in self.outcomes):
@@ -396,9 +400,9 @@ class LayoutContents(NamedTuple):
         return "events" if is_at_once else "specification"
 
     def worst_first(self) -> LayoutContents:
-        """Return the same with the worst results first, which then have lights and curves if not all can.
+        """Return the contents sorted by outcome, so that the worst results have lights and curves.
 
-        The result that a planner worked for comes before them.
+        The result that a planner worked for comes before all others.
         """
         order = sorted(
             self.order or range(len(self.trees)), key=lambda place: self.trees[place].name != self.planned
@@ -412,16 +416,16 @@ class LayoutContents(NamedTuple):
 
 
 def layout_attachment(contents: LayoutContents, *, live: bool = False) -> Attachment:
-    """Return the layout of a log, or of a server that replays it, as a file."""
+    """Return the layout for a log, or with `live` for a server that replays the log, as an attachment."""
     layout = layout_for_live(contents) if live else viewer_layout(contents)
     return Attachment(LAYOUT, "application/json", layout_text(layout).encode())
 
 
 def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
-    """Return the layout of a log: whether, where and when; all else is in tabs.
+    """Return the layout of a log.
 
-    The lights of the worst results are at the top, the scene on the left. On the right are the curves of one
-    unit at a time, the states of results, and a panel of tabs.
+    The lights of the worst results are at the top, and the scene is on the left. On the right are the curves
+    in one tab per unit, the strips of results, and tabs with all other panels.
     """
     contents = contents.worst_first()
     curves = sample_curves(contents.trees, contents.units, contents.zero)
@@ -429,8 +433,10 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
-    """Return the layout for a server that replays a log: with the curves of the whole log at any time, and
-    the constants that a viewer may edit."""
+    """Return the layout for a server that replays a log.
+
+    It has the curves of the whole log at all times, and the constants for editing.
+    """
     contents = contents.worst_first()
     details = _details(contents)
     if contents.trees:
@@ -447,15 +453,15 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
 
 
 _PANELS: Final = "spatial-replay.spatial-replay {}!{}"
-"""The identifier of a panel of the extension, by its name."""
+"""Format of the identifier of a panel in the extension: name of the panel, name of the instance."""
 
 
 def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
-    """Return the layout of a log for viewers that have the extension: scene, tree, curves and decisions.
+    """Return the layout of a log for viewers with the extension: scene, tree, curves and decisions.
 
     Args:
-        layout: that of the log without them (see `viewer_layout`).
-        planned: the name of the result that a planner worked for, which the panels open on.
+        layout: layout of the log without the extension (see `viewer_layout`).
+        planned: name of the result that a planner worked for, which panels show first; "" without one.
     """
     state = {"result": planned} if planned else {}
     configs = {"3D!scene": layout["configById"]["3D!scene"]}
@@ -479,13 +485,13 @@ def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
 
 
 _Details = list[tuple[str, Panel]]
-"""Panels of one place, by the titles of their tabs."""
+"""Panels that share one place, with the titles of their tabs."""
 
 
 def _details(contents: LayoutContents) -> _Details:
-    """Return the panels that are in tabs, first the one that opens."""
+    """Return the panels in tabs. The first panel is the one that is open at first."""
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
-    # the seconds in both tables are not those of the axes
+    # the seconds in both tables count from another zero than the axes
     clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
     rows = list[tuple[str, str, str, str]]()
     if trees:
@@ -493,7 +499,7 @@ def _details(contents: LayoutContents) -> _Details:
     if trees and RECENT_EVENTS in contents.topics:
         rows.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
     if trees:
-        # a list of texts is shown centred, one text is not
+        # a viewer centres a list of texts, but not a single text
         which = "0" if all(tree.file == 0 for tree in trees) else ":"
         sources = f"{SPECIFICATION}.files[{which}].source"
         title = "Specification" if zero is None else f"Specification; {zero}"
@@ -513,7 +519,7 @@ def _details(contents: LayoutContents) -> _Details:
 
 
 def layout_text(layout: Mapping[str, Any]) -> str:
-    """Return a layout as a file has it."""
+    """Return a layout as the text of its file."""
     return json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
 
 
@@ -527,7 +533,7 @@ def _layout(
     """Return a layout: lights at the top, the scene on the left, curves, states and details on the right.
 
     Args:
-        below: what is under the scene.
+        below: panel under the scene; None for no panel.
     """
     lights = indicators(contents.trees, contents.outcomes)
     scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes, contents.planned_for)
@@ -564,9 +570,9 @@ def _layout(
 
 
 def _tab_title(plot: Panel) -> str:
-    """Return the title of a plot in short: "results [m]".
+    """Return the short title of a plot for its tab, such as "results [m]".
 
-    A tab is too narrow for more than 17 letters; the plot's own title has the rest.
+    A tab has room for 17 letters; the panel itself has the whole title.
     """
     title = str(plot.config["foxglovePanelTitle"]).removeprefix("Robustness of ")
     title = title.removesuffix(f" [{unit_words(FOOTPRINT_UNITS)}]").removeprefix("named ")
@@ -574,7 +580,7 @@ def _tab_title(plot: Panel) -> str:
 
 
 def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
-    """Return the identifier of a panel with tabs, or of the only panel, and all panels."""
+    """Return the identifier of a panel with tabs (for one panel its own), and all panels."""
     panels = [panel for _, panel in titled]
     if len(panels) == 1:
         return panels[0].identifier, panels
@@ -584,11 +590,11 @@ def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, li
 
 _Tree = str | dict[str, Any]
 _LIT_SHARE: Final = 9.0
-"""How much higher the panels below the lights are than a row of these."""
+"""Ratio of the height of the panels below the lights to the height of the row of lights."""
 
 
 def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
-    """Return panels beside or below each other, as nested splits."""
+    """Return panels next to or below each other, as nested splits of two parts."""
     (first, share), *rest = parts
     if not rest:
         return first
@@ -602,7 +608,7 @@ def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
 
 
 def _camera(extent: SceneBounds | None) -> dict[str, Any]:
-    """Return a camera that looks straight down and fits the box."""
+    """Return a camera that looks straight down and shows the whole extent."""
     box = extent or SceneBounds(-1.0, -1.0, 1.0, 1.0)
     distance = VIEW * max(box.xmax - box.xmin, box.ymax - box.ymin) or 1.0
     return {

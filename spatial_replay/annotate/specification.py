@@ -77,8 +77,8 @@ class ReportedTree(NamedTuple):
     def written_texts(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object instead of the parameter.
 
-        Two kinds of nodes have canonical texts instead, because the file has no text for them: the body of a
-        `def` below its call, and operands of a quantifier for its objects.
+        Two kinds of nodes have no text of their own in the file, and get canonical texts. They are in the
+        body of a `def`, below its call, or in a quantifier, for each of its objects.
 
         Args:
             source: text of the file.

@@ -77,7 +77,7 @@ class Shade:
         """
         if not self.requirement.is_invariant or not self.least_bound:
             return part
-        # numbers are stored only in failing samples: an object without one never failed
+        # only failing samples have numbers: without one the object never failed, and held by at least 0
         number = self.least_bound.get(name, 0.0)
         return np.where(part < 0.0, number, part)
 
@@ -311,7 +311,9 @@ def worst_robustness(
 
 
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
-    """Return the violation with the arrow in some samples of a trace: the earliest that lasts.
+    """Return the violation with the arrow in some samples of a trace.
+
+    Among the violations in a sample, it is the one that was certain first.
 
     The arrow is at the deciding atom of the requirement, between the two points that attain the signed
     distance of its terms, or along the protrusion of an enclosure. In the sample that settled the formula's

@@ -1,4 +1,4 @@
-"""The extent of a scene: where its footprints are so far, and the size that texts are placed by."""
+"""The extent of a scene: the bounds of its footprints so far, and the size that scales its texts."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.trace.trace import Trace
 
 VIEW: Final = 1.5
-"""The height of the picture by the longer side of the scene; a panel may be narrower than it is high."""
+"""Height of the view, as a multiple of the scene's longer side. A panel may be narrower than it is high."""
 
 _STEP: Final = 1.5
-"""Ratio of the sizes that texts are placed by: a scene that grows goes on growing, and names seldom move."""
+"""Ratio of consecutive sizes for texts. Steps keep names in place while a scene grows."""
 
 
 class SceneBounds(NamedTuple):
-    """The box that a log's footprints lie in, in footprint units."""
+    """The bounding box of a log's footprints, in footprint units."""
 
     xmin: float
     ymin: float
@@ -30,7 +30,7 @@ class SceneBounds(NamedTuple):
 
     @classmethod
     def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
-        """Return the box of some samples and of those before; None without any footprint."""
+        """Return the box of some samples joined with the box before; None without any footprint."""
         low, high = _finite_boxes(trace.footprints.select(trace.rows[trace.rows >= 0]))
         box = cls(*low.min(axis=0, initial=np.inf).tolist(), *high.max(axis=0, initial=-np.inf).tolist())
         if not np.isfinite(box).all():
@@ -38,12 +38,12 @@ class SceneBounds(NamedTuple):
         return box if before is None else before.with_points(np.reshape(box, (2, 2)))
 
     def with_points(self, points: Floats) -> SceneBounds:
-        """Return the box around this one and some points (P, 2)."""
+        """Return the box around this box and some points (P, 2)."""
         corners = np.vstack([points, [self[:2], self[2:]]])
         return SceneBounds(*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
 
     def contains(self, footprints: FootprintBatch) -> bool:
-        """Return whether footprints surely lie inside: those with corners at NaN do not."""
+        """Return whether all footprints surely lie inside. Footprints with corners at NaN do not."""
         radius = footprints.radius.max(initial=0.0)
         columns = zip(footprints.vertices.T, self[:2], self[2:], strict=True)
         return all(
@@ -56,15 +56,16 @@ class SceneExtent(NamedTuple):
     """The extent of the samples so far.
 
     Attributes:
-        bounds: the box of their footprints; None before any.
-        size: the longer side of that box and the regions, rounded up to steps from its first length on.
+        bounds: box of the footprints; None before any footprint.
+        size: longer side of the box around footprints and regions, in steps: its first length times a power
+            of `_STEP`.
     """
 
     bounds: SceneBounds | None = None
     size: float = 0.0
 
     def with_area(self, area: SceneBounds | None) -> SceneExtent:
-        """Return the extent with the area of a planner's map, if there is one."""
+        """Return the extent joined with the area of a planner's map; None is no area."""
         if area is None:
             return self
         bounds = area if self.bounds is None else self.bounds.with_points(np.reshape(area, (2, 2)))
@@ -72,7 +73,7 @@ class SceneExtent(NamedTuple):
         return SceneExtent(bounds, float(_in_steps(np.array([side]), self.size)[0]) if self.size else 0.0)
 
     def after(self, trace: Trace, regions: Floats | None = None) -> SceneExtent:
-        """Return the extent after the next samples, see `grow`."""
+        """Return the extent after the next samples; see `grow`."""
         if not self.size:
             first = self.grow(trace.slice(0, 1), regions)[0]
             return first.after(trace, regions) if first.size else self.grow(trace, regions)[0]
@@ -84,21 +85,21 @@ class SceneExtent(NamedTuple):
         return SceneExtent(bounds, float(_in_steps(side, self.size)[0]))
 
     def grow(self, trace: Trace, regions: Floats | None = None) -> tuple[SceneExtent, Floats, Floats]:
-        """Return the extent after T samples, and for each sample the extent up to it.
+        """Return the extent after T samples, and the running extent at each sample.
 
         Args:
-            regions: their corners (P, 2).
+            regions: corners (P, 2) of the regions.
 
         Returns:
-            The extent; (T, 2, 2), low and high corners with the regions, infinite before any footprint;
-            (T,), the sizes.
+            The extent; (T, 2, 2), running low and high corners around footprints and regions, infinite before
+            any footprint; (T,), running sizes.
         """
         if self.size and self.bounds is not None and self.bounds.contains(trace.footprints):
             corners = np.reshape(_with_regions(np.array(self.bounds), regions), (1, 2, 2))
             return self, np.repeat(corners, len(trace), axis=0), np.full(len(trace), self.size)
         low, high = _finite_boxes(trace.footprints)
         before = np.array(self.bounds or (np.inf, np.inf, -np.inf, -np.inf))
-        # an absent object has the last box
+        # the row -1 of an absent object indexes the appended empty box
         lows = np.append(low, [[np.inf, np.inf]], axis=0)[trace.rows].min(axis=1, initial=np.inf)
         highs = np.append(high, [[-np.inf, -np.inf]], axis=0)[trace.rows].max(axis=1, initial=-np.inf)
         lows = np.minimum(np.minimum.accumulate(lows), before[:2])
@@ -115,7 +116,7 @@ class SceneExtent(NamedTuple):
 
 
 def map_area(plan: Mapping[str, str]) -> SceneBounds | None:
-    """Return the area of a planner's map by the metadata of its plan; None if there is none."""
+    """Return the area of a planner's map from the metadata of its plan; None without a map."""
     try:
         xmin, ymin, cell, columns, rows = map(float, json.loads(plan["settings"])["grid"])
     except (KeyError, TypeError, ValueError):
@@ -124,7 +125,7 @@ def map_area(plan: Mapping[str, str]) -> SceneBounds | None:
 
 
 def _with_regions(corners: Floats, regions: Floats | None) -> Floats:
-    """Return boxes (..., 4) around others and around the corners of regions."""
+    """Return boxes (..., 4) enlarged to contain the corners of regions."""
     if regions is None or not len(regions):
         return corners
     low = np.minimum(corners[..., :2], regions.min(axis=0))
@@ -133,7 +134,7 @@ def _with_regions(corners: Floats, regions: Floats | None) -> Floats:
 
 
 def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
-    """Return the corners of the boxes of footprints, (R, 2) each, infinite for footprints at NaN."""
+    """Return the low and high corners of the boxes of footprints, (R, 2) each; infinite for NaN corners."""
     start = footprints.vertex_start[footprints.part_start]
     radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
     low = boxes(footprints.vertices - radius, start)[0]
@@ -143,13 +144,17 @@ def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
 
 
 def _in_steps(sides: Floats, size: float) -> Floats:
-    """Return lengths (T,), which never shrink, rounded up to steps from the first one above 0 on."""
+    """Return nondecreasing lengths (T,), each rounded up to a power of `_STEP` times the first positive one.
+
+    Args:
+        size: size after the samples before; 0 before any.
+    """
     sizes, place = np.empty(len(sides)), 0
     while place < len(sides):
         end = max(int(np.searchsorted(sides, size, side="right")), place)
         sizes[place:end] = size
         if end < len(sides):
-            # repeated products are the same for any division into blocks
+            # repeated products, unlike a power, give the same bits for every cut into blocks
             size = size or float(sides[end])
             while size < sides[end]:
                 size *= _STEP

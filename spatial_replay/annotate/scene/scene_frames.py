@@ -1,4 +1,4 @@
-"""Frames of the scene as values, for a page that draws them itself; and the scene's colours."""
+"""Frames of the scene as values for pages with their own drawings, and the colours of the scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from spatial_replay.text import Instant, cut, with_unit
 def failed_objects(
     results: Sequence[EvaluatedResult], names: Sequence[str], times_ns: Integers
 ) -> NDArray[np.bool_]:
-    """Return (S, objects), by which objects a result was violated so far, as far as atoms name them."""
+    """Return (S, objects), whether an atom that settled a violation so far names the object."""
     failed = np.zeros((len(times_ns), len(names)), np.bool_)
     for settled in [result.settled for result in results if result.settled is not None]:
         for name in settled.objects:
@@ -48,13 +48,13 @@ def failed_objects(
 def labelled_objects(
     named: frozenset[str], names: Sequence[str], is_present: NDArray[np.bool_], robustness: Floats
 ) -> NDArray[np.bool_]:
-    """Return (S, objects), which objects have their names beside them.
+    """Return (S, objects), whether each object has a label.
 
-    Where a sample has very many, these are the ones that violate a specification there, the worst first, and
-    then those that it names.
+    In a crowded sample, objects that violate a specification have labels, the worst first. Objects that
+    specifications name follow, up to `_MOST_LABELS`.
 
     Args:
-        named: the objects that specifications name.
+        named: objects that specifications name.
     """
     is_crowded = is_present.sum(axis=1) >= _CROWD
     if not is_crowded.any():
@@ -69,7 +69,7 @@ def labelled_objects(
 
 _CROWD: Final = 20
 _MOST_LABELS: Final = 20
-"""From so many objects on, not all have labels; the most that then have."""
+"""Number of objects that makes a sample crowded, and limit of labels in a crowded sample."""
 
 STANDING_WORDS: Final = MappingProxyType(
     {
@@ -80,16 +80,16 @@ STANDING_WORDS: Final = MappingProxyType(
         SATISFIED: ("satisfied", POSITIVE),
     }
 )
-"""How results stand, the worst first, each in words and as a colour."""
+"""Words and colour of each standing, the worst first."""
 
 
 class ArrowTexts(NamedTuple):
     """Arrows of S messages.
 
     Attributes:
-        causes: what decides violations, in words.
-        cause: (S,), which of them decides each that is shown.
-        numbers: of each that is shown, the number with its unit; empty for the others.
+        causes: distinct causes of violations, in words.
+        cause: (S,), index of each arrow's cause.
+        numbers: number of each arrow with its unit; empty for messages without an arrow.
     """
 
     causes: tuple[CauseText, ...]
@@ -97,18 +97,18 @@ class ArrowTexts(NamedTuple):
     numbers: Sequence[bytes]
 
     def label(self, index: int) -> str:
-        """Return all that an arrow that is shown says."""
+        """Return the whole label of an arrow."""
         return f"{self.causes[self.cause[index]].text}{self.numbers[index].decode()}"
 
 
 def arrow_texts(
     results: Sequence[EvaluatedResult], found: Violations, first_ns: int, unit: str
 ) -> ArrowTexts:
-    """Return what decides violations, and their numbers.
+    """Return the causes of violations in words, and their numbers.
 
     Args:
-        first_ns: the time of the log's first sample.
-        unit: of lengths.
+        first_ns: zero of times in texts.
+        unit: unit of lengths.
     """
     messages = np.flatnonzero(found.is_shown)
     robustness = np.where(found.holds, -found.robustness, found.robustness)[messages].tolist()
@@ -136,7 +136,7 @@ def arrow_texts(
 
 
 def _outlines_then(settled: SettledViolation | None) -> tuple[float, ...]:
-    """Return the dashes of the objects that settled a violation, as they stood then: x and y in turn."""
+    """Return the dashed outlines of the objects in the sample that settled a violation, x and y in turn."""
     if settled is None or settled.sample is None:
         return ()
     sample = settled.sample
@@ -150,7 +150,7 @@ _LONGEST_CAUSE: Final = 60
 
 
 _LEAST: Final = 0.4
-"""How far the colour of the slightest robustness is from grey, so that its sign shows."""
+"""Share of the full colour at robustness 0, so that its sign is visible."""
 
 _FROM_GREY: Final = np.subtract((NEGATIVE, POSITIVE), NEUTRAL)
 _FROM_GREY.flags.writeable = False
@@ -162,25 +162,25 @@ _OPACITY: Final = 0.6
 
 _MAP_PLACES: Final = tuple(np.linspace(-1.0, 1.0, len(MAP)).tolist())
 _MAP_COLOURS: Final = tuple(zip(*(bytes.fromhex(each[1:]) for each in MAP), strict=True))
-"""Red, green and blue of a map's colours, and where they are between the worst and the best."""
+"""Positions of a map's colours from -1, the worst, to 1, the best, and their red, green and blue."""
 
 
 def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     """Return the colours (..., 3) of robustness (...): full at `scale`, grey where NaN.
 
     Args:
-        scale: above 0, in the unit of the robustness; one, or an array that goes with it.
+        scale: positive, in the unit of the robustness; a number, or an array that broadcasts with it.
     """
     values = np.asarray(robustness, np.float64)
     share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / scale, 1.0)
     share = np.where(np.isnan(values), 0.0, share)
     mixed = _FROM_GREY[(values >= 0.0).astype(np.intp)] * share[..., None] + NEUTRAL
-    # to the steps of a screen: finer ones are invisible and compress badly
+    # rounded to 8 bits: finer steps are invisible and compress badly
     return np.asarray(np.round(mixed * 255.0) / 255.0)
 
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
-    """Return robustness (...) as places in `SHADES`: what `colours` makes of it, to the step of a screen."""
+    """Return robustness (...) as indices into `SHADES`, the colours of `colours`."""
     share = np.minimum(np.abs(np.nan_to_num(robustness)), scale) / np.asarray(scale)
     codes = np.where(robustness >= 0.0, 128.0 + np.round(127.0 * share), 127.0 - np.round(126.0 * share))
     return np.where(np.isnan(robustness), 0.0, codes).astype(np.uint8)
@@ -197,28 +197,28 @@ def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
 
 def _shades() -> NDArray[np.uint8]:
     codes = np.arange(256.0)
-    # the slightest below 0 is below 0, too
+    # 1e-9 keeps code 127 negative, so that its colour is vermillion
     shares = np.where(codes < 128.0, (codes - 127.0) / 126.0 - 1e-9, (codes - 128.0) / 127.0)
     shares[0] = np.nan
     return np.asarray(np.round(255.0 * colours(shares, 1.0)), np.uint8)
 
 
 SHADES: Final = _shades()
-"""(256, 3), red, green and blue of `shade_codes`."""
+"""(256, 3), red, green and blue by code of `shade_codes`."""
 SHADES.flags.writeable = False
 
 ABSENT, DELETED, FIRST_FORM = -1, 0, 1
-"""State of an object in a message: absent, just gone, or drawn in one of the forms below."""
+"""State of an object in a message: absent, deleted, or from `FIRST_FORM` on the number of its form."""
 
 
 class DrawnEntity(NamedTuple):
     """An object or a region in one message.
 
     Attributes:
-        rings: its outlines, (n, 2) each.
+        rings: outlines, (n, 2) each.
         colour: red, green and blue, 0 to 255.
-        shades: of each result, its colour if that were the only one, a place in `SHADES`; empty for one
-            result, and for very many.
+        shades: index into `SHADES` for each result, the entity's colour by that result alone. Empty for a
+            single result, and for very many.
         is_last: whether the object is missing, and the outlines are its last ones.
     """
 
@@ -232,18 +232,18 @@ class DrawnViolation(NamedTuple):
     """The arrow at the first violation of a result in one message.
 
     Attributes:
-        ends: (2, 2), from where to where it points.
-        label: what decides it and the robustness, as it is written beside the arrow.
-        result: which of the results is violated.
-        node: id of the requirement that is violated, or of the atom that settled the violation.
-        robustness: that of the requirement, in the sign that counts.
-        leaf: what decides it, an index among the leaves of the result's program.
-        moment_ns: the time of the earlier sample that the number is of, which settled the violation; None if
-            it is of this one.
-        holds: whether it is an atom that holds and should not.
-        atom: the atom of the objects that decide a quantifier, where the leaf is one, or "".
-        dashes: see `CauseText`.
-        names: ids of the entities that the atom is about.
+        ends: (2, 2), begin and end of the arrow.
+        label: text at the arrow: the deciding atom and its robustness.
+        result: index of the violated result.
+        node: id of the violated requirement, or of the atom that settled the violation.
+        robustness: robustness of the requirement or of the settling atom, times its sign.
+        leaf: index of the deciding leaf in the result's program.
+        moment_ns: time of the earlier sample that settled the violation and has the number; None for a number
+            of this sample.
+        holds: whether the atom holds but must not.
+        atom: deciding atom of a quantifier with its objects; "" for other leaves.
+        dashes: outlines at an earlier sample, see `CauseText`.
+        names: ids of the atom's entities.
     """
 
     ends: Floats
@@ -260,7 +260,7 @@ class DrawnViolation(NamedTuple):
 
 
 def entity_ids(names: Iterable[TrackedName | RegionName]) -> tuple[str, ...]:
-    """Return the ids of the entities of objects and regions."""
+    """Return the ids of the entities for objects and regions."""
     return tuple((REGION if isinstance(name, RegionName) else OBJECT) + name.name for name in names)
 
 
@@ -268,9 +268,9 @@ class Arrows(NamedTuple):
     """The arrows of one result in S messages.
 
     Attributes:
-        result: which of the results it is.
-        violations: of the S samples.
-        texts: what decides each, and its number.
+        result: index of the result.
+        violations: violations in the S samples.
+        texts: cause and number of each violation.
     """
 
     result: int
@@ -278,7 +278,7 @@ class Arrows(NamedTuple):
     texts: ArrowTexts
 
     def at(self, index: int) -> DrawnViolation | None:
-        """Return the arrow in one message, if there is one."""
+        """Return the arrow in a message; None without one."""
         violations = self.violations
         if not violations.is_shown[index]:
             return None
@@ -305,9 +305,9 @@ class SceneFrame(NamedTuple):
     """Content of one message.
 
     Attributes:
-        entities: by their ids.
-        arrows: of the results, in the chosen messages.
-        place: which of those it is.
+        entities: entities by id.
+        arrows: arrows of each result in the chosen messages.
+        place: index of this message among the chosen ones.
     """
 
     entities: Mapping[str, DrawnEntity]
@@ -315,12 +315,12 @@ class SceneFrame(NamedTuple):
     place: int = 0
 
     def violation(self, result: int) -> DrawnViolation | None:
-        """Return the arrow at the first violation of a result, if it has one here."""
+        """Return the arrow of a result in this message; None without one."""
         return self.arrows[result].at(self.place)
 
     @property
     def corners(self) -> int:
-        """How many corners its outlines have."""
+        """The number of corners of all outlines."""
         return sum(len(ring) for entity in self.entities.values() for ring in entity.rings)
 
 
@@ -329,11 +329,11 @@ class SceneFrames:
     """Content of S messages.
 
     Attributes:
-        times_ns: (S,) int64.
-        objects, regions: (S, objects) and (S, regions), the worst robustness of their requirements.
-        object_colours, region_colours: the same with a last axis of red, green and blue, 0 to 1.
-        scale: the robustness at which colours are full.
-        chosen: (K,) int64, the messages that frames are made of, in order; None for all.
+        times_ns: (S,) int64, times of the messages.
+        objects, regions: (S, objects) and (S, regions), worst robustness of their requirements.
+        object_colours, region_colours: (S, objects, 3) and (S, regions, 3), red, green and blue, 0 to 1.
+        scale: robustness at which colours are full.
+        chosen: (K,) int64, indices of the messages with frames, in order; None for all messages.
     """
 
     times_ns: Integers
@@ -350,12 +350,12 @@ class SceneFrames:
 
     @cached_property
     def _details(self) -> tuple[Integers, Sequence[Arrows], NDArray[np.uint8], NDArray[np.uint8]]:
-        """The chosen messages, their arrows, and the shades of their objects and regions, a result each."""
+        """The chosen messages, their arrows, and the shades of their objects and regions by result."""
         messages = np.arange(len(self.times_ns)) if self.chosen is None else self.chosen
         return messages, self._find_arrows(messages), *self._find_shades(messages)
 
     def frame(self, index: int) -> SceneFrame:
-        """Return what one of the chosen messages shows."""
+        """Return the content of a chosen message."""
         messages, arrows, of_objects, of_regions = self._details
         place = int(np.searchsorted(messages, index))
         entities = {
@@ -381,20 +381,21 @@ class SceneContent(NamedTuple):
     """Columns of S messages.
 
     Attributes:
-        names: objects that are shown, or have just been.
+        names: objects in these messages, in the message before, or with a last outline.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
-        styles: (S, names), its level, whether a result was violated by it as the second last bit, and whether
-            it has a label as the last bit; -1 where it is absent.
-        missing: (S, names), which of `last` an object is that is missing; else -1.
+        styles: (S, names), -1 where an object is absent. The last bit is its label, the second last bit its
+            violation of a result, and the other bits are its level.
+        missing: (S, names), index in `last` of a missing object's outline; else -1.
+        last: last outlines of missing objects.
         observations: (S, names), rows of `rings`, `footprints` and `middles`.
-        middles: (R, 2), where names are.
-        violations: of the S samples.
-        label: (S, 2), the middle of the arrow's label.
-        arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
-        causes: what decides violations, in words.
-        numbers: of each violation that is shown, its number with its unit.
-        spots: (S, 2, 2), the middles of the names beside an arrow.
+        middles: (R, 2), centres of names.
+        violations: violations in the S samples.
+        label: (S, 2), centre of the arrow's label.
+        arrow: (S,), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the index in `causes` of the arrow.
+        causes: distinct causes of violations, in words.
+        numbers: number of each arrow with its unit.
+        spots: (S, 2, 2), centres of the names at an arrow.
     """
 
     names: tuple[str, ...]

@@ -1,7 +1,7 @@
-"""Templates of messages of /spatial/scene, and the numbers that are filled into them.
+"""Templates of messages of /spatial/scene, and the numbers that fill them.
 
 Messages of one layout have the same entities with the same primitives. Their template is encoded once, with
-`SLOT` where coordinates and colours belong; filling in those numbers makes many messages at once.
+`SLOT` instead of coordinates and colours. Filling in these numbers encodes many messages at once.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from spatial_replay.palette import LABEL, NEGATIVE, NEUTRAL
 from spatial_replay.spec.formula import Outline, RegionName, TrackedName
 
 ROUND: Final = 32
-"""Points on the ring of a rounded part."""
+"""Number of points on the ring of a rounded part."""
 
 
 class Rings(NamedTuple):
     """The rings of R footprints, as ragged rows.
 
     Attributes:
-        start: (R + 1,) int64, where each footprint's points begin.
-        points: (P, 2), counter-clockwise.
+        start: (R + 1,) int64, start of each footprint's points.
+        points: (P, 2), points of the rings, counter-clockwise.
         form: (R,) int64, index into `forms`.
-        forms: for each form, the lengths of its rings and whether it has a height.
+        forms: the distinct forms.
         has_round: whether any part is rounded, or a point.
     """
 
@@ -67,11 +67,11 @@ class Rings(NamedTuple):
 
 
 class Dashes(NamedTuple):
-    """Dashed outlines, each a row of points: two for each dash, then the place of a name.
+    """Dashed outlines.
 
     Attributes:
-        rows: (n, 2) each.
-        rings: the outlines of each, (n, 2).
+        rows: points (n, 2) of each outline: two points per dash, then the position of a name.
+        rings: rings (n, 2) of each outline.
     """
 
     rows: Sequence[Floats]
@@ -79,11 +79,11 @@ class Dashes(NamedTuple):
 
 
 _DASHES: Final = 4
-"""Parts of each side of a dashed outline: every second one is drawn."""
+"""Parts of each side of a dashed outline; every second part is drawn."""
 
 
 def dashes_of(rings: Sequence[Floats]) -> Floats:
-    """Return the ends (n, 2) of the dashes of some rings, two for each dash."""
+    """Return the ends (n, 2) of the dashes along some rings, two ends per dash."""
     shares = (np.arange(_DASHES) / _DASHES)[:, None]
     sides = [(ring[:, None], (np.roll(ring, -1, axis=0) - ring)[:, None]) for ring in rings]
     return np.concatenate([(begin + shares * along).reshape(-1, 2) for begin, along in sides])
@@ -97,7 +97,7 @@ class Form(NamedTuple):
 
 
 def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
-    """Return the rings of footprints; a bare point becomes a disc of the given radius."""
+    """Return the rings of footprints. A point without radius becomes a disc of `point_radius`."""
     counts = np.diff(footprints.vertex_start)
     is_round = (counts == 1) | (footprints.radius > 0.0)
     lengths = np.where(is_round, ROUND, counts)
@@ -135,11 +135,11 @@ def extents(footprints: FootprintBatch) -> Floats:
 
 
 def boxes(points: Floats, start: Integers) -> tuple[Floats, Floats]:
-    """Return the least and the greatest coordinates, (R, 2) each, of rows of points.
+    """Return the low and high corners, (R, 2) each, of the bounding boxes of R rows of points.
 
     Args:
-        points: (P, 2).
-        start: (R + 1,), where each row begins and the last one ends; none is empty.
+        points: (P, 2), points of all rows.
+        start: (R + 1,), start of each row, and the end of the last row. No row is empty.
     """
     if len(start) < 2:
         return np.empty((0, 2)), np.empty((0, 2))
@@ -152,11 +152,11 @@ _DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 def _rounded_rings(corners: Floats, radius: Floats) -> Floats:
-    """Return the rings (M, ROUND, 2) of M parts: the outermost point in each direction.
+    """Return the rings (M, ROUND, 2) of M rounded parts: their outermost point in each direction.
 
     Args:
-        corners: (M, n, 2).
-        radius: (M,).
+        corners: (M, n, 2), corners of the parts.
+        radius: (M,), radius of the rounding.
     """
     x, y = _DIRECTIONS[:, :1], _DIRECTIONS[:, 1:]
     reach = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
@@ -165,7 +165,7 @@ def _rounded_rings(corners: Floats, radius: Floats) -> Floats:
 
 
 def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tuple[Form, ...]]:
-    """Return (R,) the form of each footprint, and the forms."""
+    """Return (R,), the index of each footprint's form, and the distinct forms."""
     part_counts = np.diff(footprints.part_start)
     has_height = ~np.isnan(footprints.bottom)
     columns = [part_counts, has_height]
@@ -184,20 +184,22 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
 FRAME: Final = "world"
 
 FRAMES: Final = (FRAME, "spatial")
-"""The frame of the scene, and the child by which viewers know it."""
+"""The frame of the scene, and a child frame that makes the frame known to viewers."""
 
 ARROW_HEAD: Final = 0.15
-"""The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
+"""Length of an arrow's head, fraction of the objects' size; at most half of the arrow."""
 
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
 SLOT_BYTES: Final = b"\xfe" + b"\xff" * 7
 SLOT: Final[float] = struct.unpack("<d", SLOT_BYTES)[0]
-"""A number that is to be filled in: a NaN whose bytes are in no text, and in no message but where it is."""
+"""Placeholder for a number: a NaN whose bytes occur in no text and in no other number of a message.
+
+UTF-8 has no bytes 0xfe and 0xff: https://www.rfc-editor.org/rfc/rfc3629#section-1"""
 
 
 def encode_frame(time_ns: int) -> bytes:
-    """Return the message that makes the scene's frame known to viewers: a frame in the same place."""
+    """Return the message that makes the scene's frame known to viewers, by a child frame at its origin."""
     message = FrameTransform(parent_frame_id=FRAME, child_frame_id=FRAMES[1])
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
     message.rotation.w = 1.0
@@ -205,12 +207,12 @@ def encode_frame(time_ns: int) -> bytes:
 
 
 class Elevation(NamedTuple):
-    """The heights of an entity, in footprint units; `SLOT` where it is to be filled in.
+    """The heights of an entity in footprint units; `SLOT` for heights that messages fill in.
 
     Attributes:
-        fill: of its filled face, the upper one of a prism.
-        sides: from where to where a prism's sides reach: bottom and height; None for a flat entity.
-        label: of its name.
+        fill: height of the filled face: the top of an object, the floor of a region.
+        sides: bottom and height of a prism's sides; None for a flat entity.
+        label: height of the name.
     """
 
     fill: float
@@ -227,15 +229,15 @@ def draw(
     elevation: Elevation,
     opacity: float,
 ) -> None:
-    """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
+    """Add outlines, filled faces and the label to an entity, with slots for all colours except the label's.
 
-    `scene_template` fills in the numbers in this order.
+    Templates fill in the numbers in this order.
 
     Args:
-        name: what the label says; "" leaves it out.
+        name: text of the label; "" for no label.
         outlines, faces: rings (n, 2); a face is convex.
-        anchor: the position of the label.
-        opacity: of the faces.
+        anchor: position of the label.
+        opacity: opacity of the faces.
     """
     for ring in outlines:
         _add_outline(entity, ring, elevation.fill)
@@ -268,10 +270,10 @@ def _add_dashes(entity: SceneEntity, ends: Floats, z: float) -> None:
 
 
 def point_at(entity: SceneEntity, label: str, lift: float, names: Sequence[str] = ()) -> None:
-    """Add an arrow, names and its label to an entity; positions and the arrow's length are to be filled in.
+    """Add an arrow, names and the label to an entity, with slots for positions and the arrow's length.
 
     Args:
-        lift: height of flat objects above the plane, and a fifth of an arrow's width.
+        lift: height of flat objects above the plane; it also scales the arrow's width.
     """
     arrow = entity.arrows.add(
         shaft_length=SLOT, shaft_diameter=5.0 * lift, head_length=SLOT, head_diameter=12.0 * lift
@@ -335,20 +337,20 @@ REGION: Final = "region/"
 WITNESS: Final = "witness"
 
 LEVELS: Final = 8
-"""How many heights there are between large flat objects and small ones."""
+"""Number of heights from large to small flat objects."""
 
 _LABEL_LIFT: Final = 0.01
-"""The height of a region's name above it, by the region's size."""
+"""Height of a region's name above the region, fraction of the region's size."""
 
 
 class CauseText(NamedTuple):
     """Label of an arrow.
 
     Attributes:
-        text: all before the number.
-        length: how many bytes the number has with its unit.
-        dashes: of an arrow about an earlier sample, the outlines then: x and y of the ends of dashes.
-        names: the objects and regions of the atom that decides it.
+        text: text before the number.
+        length: length of the number with its unit, bytes.
+        dashes: for an arrow about an earlier sample, x and y of the dashes' ends along the outlines then.
+        names: objects and regions of the deciding atom.
     """
 
     text: str
@@ -357,23 +359,23 @@ class CauseText(NamedTuple):
     names: tuple[TrackedName | RegionName, ...] = ()
 
     def ends(self, numbers: Sequence[bytes]) -> list[bytes]:
-        """Return the last bytes of labels, in which the number is: 8 or more, as those are filled in."""
+        """Return the last bytes of labels, with the number: at least 8, because slots have 8 bytes."""
         text = self.text.encode().rjust(8)
         return [(text + number)[-max(8, self.length) :] for number in numbers]
 
     @property
     def words(self) -> list[int]:
-        """Where the words of 8 bytes begin that such an end is filled in by; the last may overlap another."""
+        """The starts of the slots of 8 bytes that fill such an end; the last two slots may overlap."""
         last = max(8, self.length) - 8
         return [*range(0, last, 8), last]
 
 
 class DrawnObject(NamedTuple):
-    """How an object is drawn.
+    """The drawing of an object.
 
     Attributes:
-        level: how small it is, 0 to `LEVELS`: what is smaller lies higher, so that nothing larger hides it.
-        label: its name, with a mark if a result was violated by it; "" for none.
+        level: height, 0 to `LEVELS`. Smaller objects are higher, so that larger ones do not hide them.
+        label: name, with a mark if the object violated a result; "" for no label.
     """
 
     name: str
@@ -383,16 +385,16 @@ class DrawnObject(NamedTuple):
 
 
 class SceneLayout(NamedTuple):
-    """Properties that determine the offsets of a message's numbers.
+    """The structure of a message, which determines the offsets of its numbers.
 
     Attributes:
-        deleted: objects that were in the message before and are gone.
-        objects: those observed.
-        missing: the names of those that a specification is about and that are not, and the lengths of their
+        deleted: objects of the previous message that are gone.
+        objects: observed objects.
+        missing: names of missing objects that a specification mentions, with the number of points of their
             last outlines (see `Dashes`).
-        witness: what decides the worst violation, which an arrow points at; "deleted" deletes the arrow of
-            the message before, and without one it is None.
-        names: those beside the arrow, in words; the message then has no others.
+        witness: label of the arrow at the violation; "deleted" to delete the previous arrow; None without
+            an arrow.
+        names: names at the arrow; the message then has no other names.
     """
 
     deleted: tuple[str, ...]
@@ -408,12 +410,12 @@ class SceneLayout(NamedTuple):
 
 
 class Region(NamedTuple):
-    """A region as it is drawn.
+    """A region with its convex parts for drawing.
 
     Attributes:
-        name: its name.
-        outline: its border, as in the specification.
-        rings: its convex parts, each (n, 2).
+        name: name of the region.
+        outline: border in the specification.
+        rings: convex parts, (n, 2) each.
     """
 
     name: str
@@ -422,34 +424,34 @@ class Region(NamedTuple):
 
     @property
     def size(self) -> float:
-        """The longer side of its bounding box."""
+        """The longer side of the region's bounding box."""
         return float(np.ptp(np.concatenate(self.rings), axis=0).max())
 
 
 @dataclass(frozen=True, eq=False)
 class SceneTemplate:
-    """Messages of one layout, but for their times, coordinates and colours.
+    """Messages of one layout, without their times, coordinates and colours.
 
     Attributes:
-        template: its words are to be filled in.
-        order: (W,) which of a message's numbers each word is; most numbers are in several places.
+        template: encoded message with words to fill in.
+        order: (W,), index of the number for each word. Most numbers fill several words.
     """
 
     template: WireTemplate
     order: Integers
 
     def encode(self, numbers: Words) -> Payloads:
-        """Encode messages by their numbers (K, N)."""
+        """Encode K messages from their N numbers, (K, N)."""
         return self.template.encode(numbers.take(self.order, axis=1))
 
 
 class EncodedRegions(NamedTuple):
-    """The regions of all messages.
+    """The encoded regions of all messages.
 
     Attributes:
-        number: how many there are.
-        entities: encoded, but for their colours and timestamps.
-        order: which of a message's numbers their fields have.
+        number: number of regions.
+        entities: encoded entities, without colours and timestamps.
+        order: index of the number for each word of the entities.
     """
 
     number: int
@@ -458,7 +460,7 @@ class EncodedRegions(NamedTuple):
 
 
 def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedRegions:
-    """Encode regions, with or without names; larger ones lie lower, so that they hide no smaller one."""
+    """Encode regions, with or without names. Larger regions are lower and do not hide smaller ones."""
     sizes = [region.size for region in regions]
     message, order = SceneUpdate(), list[int]()
     for number, (region, size) in enumerate(zip(regions, sizes, strict=True)):
@@ -474,10 +476,10 @@ def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedR
 def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> SceneTemplate:
     """Return the template of a layout.
 
-    A message has these numbers, each once: its timestamp (2), the colours of the regions (3 each), the points
-    of all objects (2 each), their colours (3 each) and the places of names (2 each). If any object has a
-    height, tops, bottoms, heights and those of names follow (4 each), then the last outlines of missing
-    objects (see `Dashes`). The arrow's numbers come last, with those of the names beside it.
+    A message has these numbers in this order: timestamp (2), colours of the regions (3 each), points of all
+    objects (2 each), colours of the objects (3 each), and positions of names (2 each). If an object has a
+    height, four numbers per object follow: top, bottom, height, and height of the name. The last outlines of
+    missing objects follow (see `Dashes`). The numbers of the arrow and of its names come last.
 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
@@ -513,9 +515,10 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
             order += [x, x + 1, middle + 2]
         order += range(middle, middle + 3 + len(label))
     objects = [_encoded_object(figure, lift) for figure in layout.objects]
-    # messages are joined by joining their bytes
+    # parsers join the lists of concatenated messages:
+    # https://protobuf.dev/programming-guides/encoding/#last-one-wins
     encoded = b"".join([_encode(gone), regions.entities, *objects, _encode(last)])
-    # the arrow's label is the last of all fields
+    # the arrow's label is the last field, so its slots are at the end
     slots = [*_offsets(encoded, SLOT_BYTES), *(len(encoded) - 8 - label[-1] + at for at in label)]
     stamps = _offsets(encoded, _STAMP_BYTES)
     payload = np.frombuffer(encoded.replace(SLOT_BYTES, bytes(8)), np.uint8)
@@ -529,12 +532,12 @@ def _encode(message: SceneUpdate) -> bytes:
 
 
 def border_of(region: Region) -> list[Floats]:
-    """Return the rings (n, 2) that outline a region: its border as it was written, or of a disc its ring."""
+    """Return the rings (n, 2) that outline a region: the ring of a disc, or the border as it is written."""
     return list(region.rings) if region.outline.is_disc else [np.array(region.outline.vertices, np.float64)]
 
 
 class _Places(NamedTuple):
-    """Where an object's numbers begin among those of a message, see `make_template`."""
+    """The starts of an object's numbers among the numbers of a message, see `make_template`."""
 
     points: int
     colour: int
@@ -543,7 +546,7 @@ class _Places(NamedTuple):
 
 
 def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
-    """Return where the numbers of each object begin, and where those of the arrow."""
+    """Return the starts of the numbers of each object, and their end."""
     counts = [2 * sum(figure.form.rings) for figure in layout.objects]
     points = len(_STAMP_WORDS) + 3 * regions
     *begins, colours = accumulate(counts, initial=points)
@@ -557,7 +560,7 @@ def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
 
 
 def _order_of_object(drawn: DrawnObject, begin: _Places) -> list[int]:
-    """Return which numbers an object's fields have, in the order of its primitives."""
+    """Return the index of the number for each word of an object, in the order of its primitives."""
     rings, form = _corners(drawn.form.rings, begin.points), drawn.form
     colour = list(range(begin.colour, begin.colour + 3))
     top, bottom, height, label = range(begin.heights, begin.heights + 4)
@@ -580,7 +583,7 @@ def _order_of_object(drawn: DrawnObject, begin: _Places) -> list[int]:
 
 
 def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
-    """Return the places of the coordinates of each ring's points."""
+    """Return the indices of x and y of each point, by ring."""
     ends = np.cumsum(rings).tolist()
     return [
         [(begin + 2 * at, begin + 2 * at + 1) for at in range(end - length, end)]
@@ -589,7 +592,7 @@ def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
 
 
 _ARROW_NUMBERS: Final = 7
-"""Number of columns of `numbers_of_witness` before those of names and of the label."""
+"""Numbers of the arrow itself: the columns of `numbers_of_witness` before names and label."""
 
 
 def numbers_of_witness(
@@ -601,16 +604,16 @@ def numbers_of_witness(
     labels: Sequence[bytes],
     words: Sequence[int],
 ) -> list[Floats]:
-    """Return what to fill in for the arrow at the worst violation.
+    """Return the columns of numbers of the arrow, its names and its label.
 
     Args:
-        points: (S, 2, 2), its begin and its end.
-        z: (S,), its height.
-        names: (S, names, 2), the middles of the names beside it.
-        label_places: (S, 2), the middles of the labels on the plane.
-        scale: the size of objects in the scene.
-        labels: the ends of S labels, of one length.
-        words: where in them words of 8 bytes begin.
+        points: (S, 2, 2), begin and end of the arrow.
+        z: (S,), height of the arrow.
+        names: (S, names, 2), centres of the names at the arrow.
+        label_places: (S, 2), centres of the labels on the plane.
+        scale: size of objects in the scene.
+        labels: last bytes of S labels, of equal lengths (see `CauseText.ends`).
+        words: starts of the slots in these bytes (see `CauseText.words`).
     """
     begin, end = points[:, 0], points[:, 1]
     length = np.hypot(*(end - begin).T)
@@ -630,10 +633,11 @@ def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
 def _add_region(entity: SceneEntity, region: Region, depth: float, *, named: bool) -> None:
     """Add a region: its border, its convex parts as faces, and its name at the upper edge.
 
-    There, objects inside do not cover the name. The face of a prism is its floor: a roof would hide them.
+    At the upper edge, objects inside seldom cover the name. Of a prism only the floor is filled, because a
+    roof would hide the objects inside.
 
     Args:
-        depth: of a flat region below the plane.
+        depth: depth of a flat region below the plane.
     """
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
@@ -653,7 +657,7 @@ def _add_region(entity: SceneEntity, region: Region, depth: float, *, named: boo
 
 @lru_cache(4096)
 def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
-    """Encode an object: most of those in a layout are in the one before, too."""
+    """Encode an object, cached because consecutive layouts share most objects."""
     message = SceneUpdate()
     rings = [np.full((length, 2), SLOT) for length in drawn.form.rings]
     elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
@@ -666,10 +670,11 @@ def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
 
 # ------------------------------------------------------------------------------------------- timestamps
 
-# Numbers of variable length may be padded: written with five bytes each, all stamps have one length.
+# Varints may be padded (https://protobuf.dev/programming-guides/encoding/#varints): with five bytes each, all
+# stamps have one length.
 _SECONDS, _NANOS = (1 << 34) - 1, (1 << 30) - 1
 _A_STAMP: Final = Timestamp(seconds=_SECONDS, nanos=_NANOS)
-# its bytes of all ones are in no text, and every other number is a slot or an ordinary constant
+# bytes of ones occur in no text, and all other numbers are slots or ordinary constants
 _STAMP_BYTES: Final = _A_STAMP.SerializeToString()
 _STAMP: Final = len(_STAMP_BYTES)
 _STAMP_WORDS: Final = (0, _STAMP - 8)
@@ -677,21 +682,21 @@ _NS: Final = 1_000_000_000
 
 
 def _offsets(payload: bytes, wanted: bytes) -> list[int]:
-    """Return where some bytes are in a payload."""
+    """Return the offsets of some bytes in a payload."""
     return [hit.start() for hit in re.finditer(re.escape(wanted), payload)]
 
 
 def encoded_stamps(times_ns: Integers) -> Words:
-    """Encode nanoseconds (S,) as the contents of timestamps: (S, 2) words that overlap, at `_STAMP_WORDS`."""
+    """Encode nanoseconds (S,) as timestamps: (S, 2) overlapping words at the offsets `_STAMP_WORDS`."""
     seconds, nanos = map(_five_bytes, np.divmod(times_ns, _NS))
-    # a tag, five bytes, another tag, five bytes; the words are its first eight bytes, and its last
+    # a timestamp is a tag, five bytes, a tag, five bytes; the words are its first and its last eight bytes
     first = 0x08 | seconds << 8 | 0x10 << 48 | nanos << 56
     last = seconds >> 24 | 0x10 << 16 | nanos << 24
     return np.stack([first, last], axis=1).view(np.uint64)
 
 
 def _five_bytes(numbers: Integers) -> Integers:
-    """Return numbers of less than 35 bits as the five bytes that they are encoded in."""
+    """Encode numbers below 2^35 as varints of five bytes."""
     padded = np.full(len(numbers), 0x80808080)
     for place in range(5):
         padded |= (numbers >> 7 * place & 0x7F) << 8 * place
