@@ -1,4 +1,4 @@
-"""Places of names and of an arrow's label: off outlines, arrows and each other."""
+"""Positions of names and of an arrow's label, free of outlines, arrows and other texts."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import numpy as np
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 
 LETTER: Final = 0.5
-"""Width of a letter by the height of a line."""
+"""Width of a letter, fraction of the line height."""
 _GAP: Final = 0.25
-"""Distance of a text from what it belongs to, by the height of a line."""
+"""Distance of a text from its object, fraction of the line height."""
 _FAR: Final = (1.5, 4.0)
-"""Further distances of labels, by the height of a line."""
+"""Larger distances of labels, multiples of the line height."""
 _SIDES: Final = np.array([(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1)], np.float64)
 _SIDES.flags.writeable = False
-"""The eight positions in the order in which they are tried: above, below, right, left, corners."""
+"""The eight positions around a box in the order of preference: above, below, right, left, corners."""
 
 _NAME_PLACES: Final = len(_SIDES)
 _LABEL_PLACES: Final = 2 * len(_SIDES) + 2 * len(_FAR) + 2 * (len(_FAR) + 1)
-"""Numbers of places that are tried for a name, and for a label."""
+"""Numbers of candidate positions for a name and for a label."""
 
 _NOWHERE: Final = 4
-"""Rank of a place that covers a blocked box; 2 is outside the view, 1 is on another object, 0 is free."""
+"""Rank of a position on a blocked box. Rank 2 is outside the view, 1 is on another object, 0 is free."""
 
 _FEW: Final = 0.7
-"""Share of scenes that still need a place, below which they are copied to look at no others."""
+"""Share of scenes without a free position, below which the remaining scenes are copied to skip the others."""
 
 Box = tuple[Floats, Floats]
-"""Low and high corners (..., 2, K) of boxes in K scenes; NaN where there is none."""
+"""Low and high corners (..., 2, K) of boxes in K scenes; NaN for no box."""
 
 
 class Surroundings(NamedTuple):
@@ -38,9 +38,9 @@ class Surroundings(NamedTuple):
     Attributes:
         blocked: (B, 2, K) each, boxes that no text may cover.
         others: (N, 2, K) each, boxes that texts avoid.
-        scene: the box of all objects.
-        margin: (K,), how far the view reaches beyond the middle of the scene.
-        line: (K,), the height of a text.
+        scene: box of all objects.
+        margin: (K,), half the size of the view, from the centre of the scene.
+        line: (K,), line height.
     """
 
     blocked: Box
@@ -50,7 +50,7 @@ class Surroundings(NamedTuple):
     line: Floats
 
     def of_scenes(self, places: Integers) -> Surroundings:
-        """Return those of some of the scenes."""
+        """Return the surroundings of some of the scenes."""
         return Surroundings(
             _part(self.blocked, places),
             _part(self.others, places),
@@ -61,12 +61,12 @@ class Surroundings(NamedTuple):
 
 
 def place_names(low: Floats, high: Floats, letters: Floats, around: Surroundings) -> Floats:
-    """Return the middles (N, 2, K) of N names in each of K scenes: each at the first of eight sides.
+    """Return the centres (N, 2, K) of N names in each of K scenes, each at the best of eight sides.
 
     Args:
-        low, high: (N, 2, K), corners of the boxes of what is named.
+        low, high: (N, 2, K), corners of the boxes of the named things.
         letters: (N, K), lengths of the names.
-        around: its last N blocked boxes are set to those of the names.
+        around: surroundings, whose last N blocked boxes receive the boxes of the names.
     """
     middles = np.empty(low.shape)
     for number in range(len(low)):
@@ -81,16 +81,16 @@ def place_names(low: Floats, high: Floats, letters: Floats, around: Surroundings
 def free_names(
     middles: Floats, letters: Floats, movable: Booleans, boxes: Box, around: Surroundings
 ) -> Floats:
-    """Return the middles (N, 2, K) of names, moved to a free side where they cover other objects or names.
+    """Return the centres (N, 2, K) of names. A name that covers another object or name moves to a free side.
 
-    A box that contains an object is its background: the name of the object may cover it.
+    A box around a named object is its background, which the object's name may cover.
 
     Args:
-        middles: the usual places (N, 2, K); NaN without a name.
+        middles: usual centres (N, 2, K); NaN without a name.
         letters: (N,), lengths of the names.
-        movable: (N, K), the names that may be moved.
-        boxes: those of what is named, (N, 2, K) each.
-        around: the view, whose boxes do not count.
+        movable: (N, K), whether each name may move.
+        boxes: boxes of the named objects, (N, 2, K) each.
+        around: the view; its boxes are ignored.
     """
     middles = middles.copy()
     halves = np.stack([half_sizes(length * np.ones_like(around.line), around.line) for length in letters])
@@ -117,34 +117,34 @@ def free_names(
 
 
 def place_labels(letters: Floats, arrow: Box, around: Surroundings) -> Floats:
-    """Return the middles (2, K) of one label in each of K scenes.
+    """Return the centres (2, K) of one label in each of K scenes.
 
-    A label is at the first free place: beside all blocked boxes, beside the arrow, above or below the scene.
+    A label has the first free position next to all blocked boxes, next to the arrow, or above or below.
 
     Args:
         letters: (K,), lengths of the labels.
-        arrow: the box of the arrow.
+        arrow: box of the arrow.
     """
     nearest = np.fmin.reduce(around.blocked[0], axis=0), np.fmax.reduce(around.blocked[1], axis=0)
     return _place(half_sizes(letters, around.line), nearest, arrow, around, _LABEL_PLACES)
 
 
 def half_sizes(letters: Floats, line: Floats) -> Floats:
-    """Return half the widths and heights (2, K) of texts."""
+    """Return half the width and half the height of texts, (2, K)."""
     return np.stack([LETTER * letters * line / 2.0, line / 2.0])
 
 
 def _place(half: Floats, nearest: Box, arrow: Box, around: Surroundings, most: int) -> Floats:
-    """Return the middles (2, K) of one text in each of K scenes: the first of the best places.
+    """Return the centres (2, K) of one text in each of K scenes, at the first position of the best rank.
 
-    A text covers other objects only if every place in the view does, and leaves the view only if every place
-    in it covers a blocked box.
+    A text covers other objects only if all positions in the view do. It leaves the view only if all
+    positions in the view cover a blocked box.
 
     Args:
         half: half the sizes of the texts.
-        nearest: the box that the text is beside.
-        arrow: the box that it is beside if there is no room.
-        most: the number of places to try.
+        nearest: box next to which the text is placed.
+        arrow: box for positions without room next to `nearest`.
+        most: number of candidate positions.
     """
     centres, ranks = np.empty(half.shape), np.full(half.shape[1], _NOWHERE)
     left, of_left = np.arange(half.shape[1]), _Text(half, nearest, arrow, around)
@@ -170,7 +170,7 @@ def _place(half: Floats, nearest: Box, arrow: Box, around: Surroundings, most: i
 
 
 class _Text(NamedTuple):
-    """One text in each of some scenes, see `_place`."""
+    """One text in each of some scenes; its fields are arguments of `_place`."""
 
     half: Floats
     nearest: Box
@@ -178,7 +178,7 @@ class _Text(NamedTuple):
     around: Surroundings
 
     def of_scenes(self, places: Integers) -> _Text:
-        """Return those of some of the scenes."""
+        """Return the text in some of the scenes."""
         return _Text(
             self.half.take(places, axis=-1),
             _part(self.nearest, places),
@@ -192,7 +192,7 @@ def _part(box: Box, places: Integers) -> Box:
 
 
 def _ranks(places: Floats, text: _Text) -> Integers:
-    """Return how bad places (2, K) of texts are, 0 for a free one."""
+    """Return (K,), the ranks of positions (2, K) of texts; see `_NOWHERE`."""
     half, around = text.half, text.around
     begin, end = places - half, places + half
     centre = (around.scene[0][1] + around.scene[1][1]) / 2.0
@@ -203,12 +203,12 @@ def _ranks(places: Floats, text: _Text) -> Integers:
 
 
 def _is_covered(begin: Floats, end: Floats, boxes: Box) -> Booleans:
-    """Return (K,), whether texts from `begin` to `end` (2, K) cover any of the boxes (B, 2, K)."""
+    """Return (K,), whether texts with corners `begin` and `end` (2, K) cover any of the boxes (B, 2, K)."""
     return np.asarray(_overlaps(begin, end, boxes).any(axis=0))
 
 
 def _overlaps(begin: Floats, end: Floats, boxes: Box) -> Booleans:
-    """Return (B, K), which of the boxes (B, 2, K) texts from `begin` to `end` (2, K) cover."""
+    """Return (B, K), whether the texts with corners `begin` and `end` (2, K) cover each box (B, 2, K)."""
     low, high = boxes
     covers = (begin[1] < high[:, 1]) & (low[:, 1] < end[1])
     covers &= (begin[0] < high[:, 0]) & (low[:, 0] < end[0])
@@ -216,7 +216,7 @@ def _overlaps(begin: Floats, end: Floats, boxes: Box) -> Booleans:
 
 
 def _candidate(number: int, text: _Text) -> tuple[Floats, Booleans]:
-    """Return one place for each text (2, K), the best first, and where it is possible (K,)."""
+    """Return a candidate position (2, K) for each text by its number, and (K,) whether it is possible."""
     half, nearest, arrow, around = text
     gap, centre = _GAP * around.line, (around.scene[0][0] + around.scene[1][0]) / 2.0
     reach = np.maximum(around.margin - half[0], 0.0)

@@ -633,8 +633,8 @@ def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
 def _add_region(entity: SceneEntity, region: Region, depth: float, *, named: bool) -> None:
     """Add a region: its border, its convex parts as faces, and its name at the upper edge.
 
-    At the upper edge, objects inside seldom cover the name. Of a prism only the floor is filled, because a
-    roof would hide the objects inside.
+    At the upper edge, objects inside seldom cover the name. The face of a prism is its floor, because a roof
+    would hide the objects inside.
 
     Args:
         depth: depth of a flat region below the plane.

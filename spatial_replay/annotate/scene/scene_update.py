@@ -1,6 +1,7 @@
-"""The scene: objects and regions in the colours of their robustness → messages of /spatial/scene.
+"""The scene: objects and regions in the colours of their robustness, as messages of /spatial/scene.
 
-The encoder also returns what the messages show as values (`SceneFrames`), for a page that draws them itself.
+The encoder also returns the content of the messages as values (`SceneFrames`), for pages with their own
+drawings.
 """
 
 from __future__ import annotations
@@ -66,23 +67,23 @@ from spatial_replay.spec.formula import Outline, RegionName
 from spatial_replay.trace.trace import Trace
 
 LIFT: Final = 0.01
-"""Height of flat objects above the plane, by the scale of the scene."""
+"""Height of flat objects above the plane, fraction of the scene's scale."""
 
 
 class SceneNumbers:
-    """The numbers of S messages that show R objects in all."""
+    """The numbers of S messages with R drawn objects in total."""
 
     def __init__(
         self, times_ns: Integers, regions: Floats, objects: Floats, content: SceneContent, scale: float
     ) -> None:
-        """Take over what the messages show.
+        """Prepare the numbers from the content of the messages.
 
         Args:
-            times_ns: (S,).
-            regions: (S, regions, 3), their colours.
-            objects: (R, 3), colours of the objects that are shown, message by message.
-            content: of the messages.
-            scale: the size of objects in the scene.
+            times_ns: (S,), times of the messages.
+            regions: (S, regions, 3), colours of the regions.
+            objects: (R, 3), colours of the drawn objects, message by message.
+            content: content of the messages.
+            scale: size of objects in the scene.
         """
         self._stamps = encoded_stamps(times_ns)
         self._regions = regions.reshape(len(times_ns), -1)
@@ -93,11 +94,11 @@ class SceneNumbers:
             self._of_objects.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
 
     def of_messages(self, layout: SceneLayout, samples: Integers) -> Words:
-        """Return (K, N) what to fill in a layout's template, each number once, in some messages (K,)."""
+        """Return (K, N), the numbers that fill a layout's template in K messages, each number once."""
         columns = [self._stamps[samples], self._regions[samples]]
         content, count = self._content, len(layout.objects)
         if count:
-            # those that are shown follow each other
+            # the drawn objects of a message are consecutive rows
             first = content.observations[samples, content.names.index(layout.objects[0].name)]
             corners = sum(sum(figure.form.rings) for figure in layout.objects)
             columns.append(_runs(content.rings.points, content.rings.start[first], corners))
@@ -119,40 +120,40 @@ class SceneNumbers:
 
 
 def _runs(rows: Floats, first: Integers, count: int) -> Floats:
-    """Return rows (R, k) side by side, `count` from each of the first ones (K,) on: (K, count * k)."""
+    """Return runs of `count` consecutive rows (R, k), one run from each start (K,), as (K, count * k)."""
     return np.asarray(rows[first[:, None] + np.arange(count)].reshape(len(first), -1))
 
 
 PERIOD_NS: Final = 20_000_000
-"""The least time between two messages; viewers warn of more."""
+"""Least time between two messages, nanoseconds; viewers warn of higher rates."""
 
 _POINT: Final = 0.02
-"""Radius of a point, by the scale of the scene."""
+"""Radius of a point, fraction of the scene's scale."""
 
 _UNSCALED: Final = 1.0
-"""The scale before any object is shown, and that of a scene of points, which have no size."""
+"""Scale before the first object, and scale of a scene of points, which have no size."""
 
 _MOST_TEMPLATES: Final = 256
 _MOST_SHADES: Final = 4_096
-"""Shades of one message, of each result and each object or region, at most."""
+"""Limit of shades in one message, which has one per result and object or region."""
 _LINE: Final = 0.05
-"""How high a line of text is, about, by the longer side of the scene; a letter is half as wide."""
+"""Estimated line height, fraction of the scene's longer side."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """State that the next message depends on, besides its own sample.
+    """The state after a message, on which the next message depends.
 
     Attributes:
-        zero_ns: the time that texts count from; None before the first sample.
-        written_ns: the time of the last message, or None before the first.
-        shown: the objects in it.
-        last: of the objects that specifications name, where they were last seen: a row of footprints.
-        is_pointing: whether it has an arrow at a violation.
-        scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
-            the objects in the first message that shows any; None before that.
-        extent: of the samples so far, by which texts are placed.
-        templates: those of the layouts so far; a cache that changes no message.
+        zero_ns: zero of times in texts; None before the first sample.
+        written_ns: time of the last message; None before the first message.
+        shown: objects in the last message.
+        last: last footprint (batch, row) of each object that specifications name.
+        is_pointing: whether the last message has an arrow at a violation.
+        scale: robustness at which colours are full, None before any object is shown. It is the median size
+            (longer side of the bounding box) of the objects in the first message with objects.
+        extent: extent of the samples so far, which scales texts.
+        templates: templates of the layouts so far; a cache that changes no message.
     """
 
     zero_ns: int | None = None
@@ -166,18 +167,18 @@ class SceneState:
 
 
 def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> SceneState:
-    """Return the scale of a run's scene (see `SceneState`), before its first message.
+    """Return the state before a run's first message, with its scale (see `SceneState`).
 
     Args:
-        trace: from the first sample on.
-        zero_ns: the time that texts count from.
+        trace: samples of the run from the first one on.
+        zero_ns: zero of times in texts.
     """
     rows = trace.rows[samples_to_write(trace.times_ns, None)]
     return SceneEncoder(regions).with_scale(SceneState(zero_ns), trace, rows)[0]
 
 
 class SceneMessages(NamedTuple):
-    """Encoded messages, their times (S,) int64, the state to go on from, and what they show if any."""
+    """Encoded messages with their times (S,) int64, the state after them, and their content if any."""
 
     times_ns: Integers
     payloads: Sequence[bytes]
@@ -188,15 +189,15 @@ class SceneMessages(NamedTuple):
 class SceneEncoder:
     """Draws traces over the regions of a specification.
 
-    Every message holds all regions and all objects that are observed, so that a viewer can jump to any of
-    them; objects that are gone are deleted, and those that a specification names leave their last outlines.
-    Blue, vermillion and grey show the worst of the requirements on an object or region (see `palette` and
-    `requirements`). Where one is violated, an arrow with its robustness points at the one that was certain
-    first (see `violations`).
+    Every message has all regions and all observed objects, so that a viewer can jump to any message. Objects
+    that are gone are deleted. If a specification names a missing object, its last outline stays. An object or
+    region has the colour of its worst requirement: blue holds, vermillion fails, grey is unknown (see
+    `palette` and `requirements`). An arrow with its robustness points at the violation that was certain first
+    (see `violations`).
 
     Attributes:
-        unit: that of lengths, "" where nothing declares it.
-        named: the objects that specifications name.
+        unit: declared unit of lengths; "" if none is declared.
+        named: objects that specifications name.
     """
 
     def __init__(
@@ -214,12 +215,12 @@ class SceneEncoder:
     def encode(
         self, trace: Trace, results: Sequence[EvaluatedResult] = (), state: SceneState | None = None
     ) -> SceneMessages:
-        """Return the messages of the next samples; into how many blocks a run is cut changes none.
+        """Return the messages of the next samples, which do not depend on the cut into blocks.
 
         Args:
-            trace: the next samples, after those of the state.
-            results: what is evaluated over these samples.
-            state: what the call before returned, or None to begin.
+            trace: the next samples, after the samples of the state.
+            results: results over these samples.
+            state: state that the previous call returned; None to begin.
         """
         state = state or SceneState()
         if state.zero_ns is None and len(trace):
@@ -276,15 +277,17 @@ class SceneEncoder:
         return SceneMessages(times_ns, join_in_order(encoded), after, frames)
 
     def pass_over(self, trace: Trace, state: SceneState) -> SceneState:
-        """Return the state after samples without a message."""
+        """Return the state after more samples, without encoding messages."""
         state = replace(state, extent=state.extent.after(trace, self._corners))
         return self._missing(trace.names, trace, state, np.empty(0, np.int64), np.empty(0))[1]
 
     def _missing(
         self, names: tuple[str, ...], trace: Trace, state: SceneState, written: Integers, lines: Floats
     ) -> tuple[tuple[Integers, Dashes], SceneState]:
-        """Return (S, names) which of some last outlines each object that is missing has, and -1 for others;
-        these outlines; and the state after the samples."""
+        """Return the last outlines of missing objects in S messages, and the state after the samples.
+
+        The array (S, names) has the index of each missing object's outline, -1 for other objects.
+        """
         last, outline_numbers = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
         outlines, rows_of = list[tuple[Floats, ...]](), list[Floats]()
         line_heights, line = np.unique(lines, return_inverse=True)
@@ -310,8 +313,10 @@ class SceneEncoder:
         return (outline_numbers, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
     def with_scale(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
-        """Return the state with its scale, once an object is shown, the scale (S, 1) of each message, and the
-        first message that shows one."""
+        """Return the state with its scale, the scale (S, 1) of each message, and the first scaled message.
+
+        The scale is set by the first message with an object.
+        """
         if state.scale is not None:
             return state, np.full((len(rows), 1), state.scale), 0
         scales = np.full((len(rows), 1), _UNSCALED)
@@ -320,14 +325,13 @@ class SceneEncoder:
             return state, scales, len(rows)
         first = int(is_shown.argmax())
         footprints = trace.footprints.select(rows[first][rows[first] >= 0])
-        # the median size of the objects
         scale = float(np.median(extents(footprints))) or _UNSCALED
         scales[first:] = scale
         return replace(state, scale=scale), scales, first
 
 
 class _View(NamedTuple):
-    """Extents of S messages: low and high corners (S, 2, 2), and the height of a line of text (S,)."""
+    """The extents of S messages: low and high corners (S, 2, 2), and line heights (S,)."""
 
     corners: Floats
     line: Floats
@@ -341,7 +345,7 @@ def _arrows_of(
     unit: str,
     chosen: Integers,
 ) -> list[Arrows]:
-    """Return the arrows of each result in some messages, as if it were the only one."""
+    """Return the arrows of each result in some messages, found for each result alone."""
     arrows = []
     for number, result in enumerate(results):
         violations = first_violations([result], trace, written[chosen])
@@ -356,9 +360,9 @@ def _shades_of(
     scales: Floats,
     chosen: Integers,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return (K, objects, R) and (K, regions, R) of some messages, as if each result were the only one.
+    """Return (K, objects, R) and (K, regions, R), shades in K messages by each of R results alone.
 
-    One result has none, as its shades are the colours; nor have very many.
+    R is 0 for a single result, whose shades equal the colours, and for more shades than `_MOST_SHADES`.
     """
     entities = len(presence.names) + len(regions)
     shaded = results if 1 < len(results) <= _MOST_SHADES // max(entities, 1) else ()
@@ -373,10 +377,10 @@ def _shades_of(
 
 
 def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
-    """Return the indices of the samples to write: each at least `PERIOD_NS` after the one before.
+    """Return the indices of the samples with a message, each at least `PERIOD_NS` after the previous one.
 
     Args:
-        written_ns: when the last message was written; None before the first.
+        written_ns: time of the last message; None before the first message.
     """
     if not len(times_ns):
         return np.empty(0, np.int64)
@@ -392,7 +396,7 @@ def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
 
 
 def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:
-    """Return (S, names), rows of the trace; below 0 where an object is absent."""
+    """Return (S, names), rows of the trace by `names`; below 0 where an object is absent."""
     of_all = np.full((len(rows), len(names)), -1, np.int64)
     of_all[:, list(map(set(trace.names).__contains__, names))] = rows
     return of_all
@@ -461,12 +465,13 @@ def _content(
 
 
 _ARROW_BOX, _THEN_BOX, _BLOCKED = 2, 3, 6
-"""Places of the boxes of the arrow and of earlier outlines among those that no text may cover: those of the
-objects come first, those of names last."""
+"""Indices of the boxes of the arrow and of earlier outlines among the blocked boxes, and count of these.
+
+The boxes of the objects come first, and the boxes of names last."""
 
 
 class _DecidingBoxes(NamedTuple):
-    """Boxes that the names beside the arrow of K messages are placed by, see `place_names`."""
+    """Arguments of `place_names` for the names at the arrows of K messages."""
 
     low: Floats
     high: Floats
@@ -482,10 +487,10 @@ def _deciding_boxes(
     missing: tuple[Integers, Dashes],
     regions: Mapping[str, Floats],
 ) -> _DecidingBoxes:
-    """Return the boxes of what decides violations, and the boxes that texts must not cover.
+    """Return the boxes of the deciding objects and regions, and the boxes that texts must not cover.
 
     Args:
-        boxes_of_objects: of the messages with an arrow, in the order of `names`.
+        boxes_of_objects: boxes in the messages with an arrow, in the order of `names`.
     """
     messages = np.flatnonzero(found.is_shown)
     ends = found.points[messages].transpose(1, 2, 0)
@@ -517,18 +522,18 @@ def _deciding_boxes(
             named[:, side][..., places] = blocked[:, side][..., places]
     blocked[0, _ARROW_BOX] = np.minimum(ends[0], ends[1])
     blocked[1, _ARROW_BOX] = np.maximum(ends[0], ends[1])
-    # an object that is gone has its name at the arrow
+    # the name of an object without a box is at the end of the arrow
     low, high = np.where(np.isnan(named), ends, named)
     return _DecidingBoxes(low, high, letters, (blocked[0], blocked[1]))
 
 
 def _box(points: Floats) -> Floats:
-    """Return the low and the high corner (2, 2) of points (n, 2)."""
+    """Return the low and the high corner of points (n, 2), as (2, 2)."""
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
-    """Return the boxes (N, 2, K) of the objects of K messages; NaN where one is absent."""
+    """Return the boxes (N, 2, K) of the objects in K messages; NaN for absent objects."""
     places = observations.T
     if not len(low):
         nowhere = np.full((len(places), 2, places.shape[1]), np.nan)
@@ -538,12 +543,12 @@ def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
 
 
 def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View) -> tuple[Floats, Floats]:
-    """Return the middles of names (K, 2, 2) and of the label (K, 2) of an arrow.
+    """Return the centres of the names (K, 2, 2) and of the label (K, 2) of an arrow.
 
     Args:
         letters: (K,), lengths of labels.
         others: boxes of all objects.
-        view: that of these messages.
+        view: view of these messages.
     """
     around = _surroundings(deciding.blocked, others, view)
     spots = place_names(deciding.low, deciding.high, deciding.letters, around)
@@ -564,12 +569,12 @@ def _free_places(
     boxes_of_objects: Box,
     view: _View,
 ) -> Floats:
-    """Return the middles of names (R, 2), moved where they cover other objects and a side is free.
+    """Return the centres of names (R, 2). A name that covers another object moves to a free side, if any.
 
     Args:
-        letters: (N,), the lengths of names.
-        observations: (S, N), rows of objects that have their names beside them; -1 for others.
-        movable: (S, N), the names that may be moved.
+        letters: (N,), lengths of names.
+        observations: (S, N), rows of objects with names; -1 for other objects.
+        movable: (S, N), whether each name may move.
     """
     if not movable.any():
         return middles
@@ -584,8 +589,8 @@ def _free_places(
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
-    """Return (R, 2) where names are: in the middle of what is large enough for them, else below it."""
-    # half the sum of the ends does not depend on the order in which points are added up
+    """Return (R, 2), the centres of names: in the middle of large objects, below small ones."""
+    # half the sum of the corners, unlike a mean of points, does not depend on the order of summation
     places = (low + high) / 2.0
     sides = high - low
     is_small = (sides[:, 1] < 1.5 * line) | (sides[:, 0] < 0.5 * line * letters)
@@ -608,7 +613,7 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
-    """Yield the layouts, each with its samples (S,)."""
+    """Yield the layouts, each with the indices of its messages."""
     lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
     keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow]
     for samples in equal_places(combined_code(keys, len(content.arrow))):
