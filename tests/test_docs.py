@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -223,3 +224,24 @@ def test_the_site_has_every_page_and_public_name_and_loads_nothing_from_elsewher
         text = page.read_text("utf-8")
         assert not re.findall(r'<(?:script|img|iframe|source)[^>]*src="(?:https?:)?//', text)
         assert not re.findall(r'<link[^>]*href="(?:https?:)?//', text)
+
+
+def test_a_tutorial_that_was_run_shows_pictures_tables_and_words(tmp_path: Path) -> None:
+    outputs = [
+        {"output_type": "stream", "name": "stdout", "text": "\x1b[1mdone\x1b[0m\n"},
+        {"output_type": "stream", "name": "stderr", "text": "a warning"},
+        {"output_type": "display_data", "data": {"image/png": "iVBORw0KGgo=", "text/plain": "<Figure>"}},
+        {"output_type": "execute_result", "data": {"text/html": "<b>table</b>", "text/plain": "table"}},
+        {"output_type": "execute_result", "data": {"text/plain": "3"}},
+    ]
+    cells = [
+        {"cell_type": "markdown", "source": ["# Title"]},
+        {"cell_type": "code", "source": ["run()"], "outputs": outputs},
+    ]
+    site = runpy.run_path(str(ROOT / "tools/site"))
+    assert site["markdown_of"](cells, tmp_path / "page.md") == (
+        "# Title\n\n```python\nrun()\n```\n\n```text\ndone\n```\n\n"
+        "![Output of the code above](page-3.png)\n\n"
+        '<div class="output"><b>table</b></div>\n\n```text\n3\n```\n'
+    )
+    assert (tmp_path / "page-3.png").read_bytes() == b"\x89PNG\r\n\x1a\n"
