@@ -98,19 +98,19 @@ def free_names(
         rest = np.flatnonzero(np.arange(len(middles)) != number)
         low = np.concatenate([boxes[0][rest], (middles - halves)[rest]])
         high = np.concatenate([boxes[1][rest], (middles + halves)[rest]])
-        own, half = (boxes[0][number], boxes[1][number]), halves[number]
-        is_background = ((low <= own[0]) & (own[1] <= high)).all(axis=1)
+        named, half = (boxes[0][number], boxes[1][number]), halves[number]
+        is_background = ((low <= named[0]) & (named[1] <= high)).all(axis=1)
         covers = _overlaps(middles[number] - half, middles[number] + half, (low, high)) & ~is_background
         places = np.flatnonzero(covers.any(axis=0) & movable[number])
         if not len(places):
             continue
-        own, half = _part(own, places), half.take(places, axis=-1)
+        named, half = _part(named, places), half.take(places, axis=-1)
         others = _part((np.where(is_background[:, None], np.nan, low), high), places)
         nothing = np.empty((0, 2, len(places))), np.empty((0, 2, len(places)))
         near = Surroundings(
             nothing, others, _part(around.scene, places), around.margin[places], around.line[places]
         )
-        moved = _place(half, own, own, near, _NAME_PLACES)
+        moved = _place(half, named, named, near, _NAME_PLACES)
         is_free = ~_is_covered(moved - half, moved + half, others)
         middles[number][:, places[is_free]] = moved[:, is_free]
     return middles
