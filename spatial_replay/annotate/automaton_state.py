@@ -289,6 +289,7 @@ def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Inte
     """Yield the samples of each distinct pair of states before and after."""
     if before.ndim == 1:
         return equal_places(combined_code([before, after], len(before)))
+    # each row becomes one opaque value, so that np.unique compares values instead of columns
     rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
     _, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
     return equal_places(groups.ravel())

@@ -47,7 +47,7 @@ Nothing known yet; pending with a value of at least 0; pending with a value belo
 final states."""
 
 OF_CURRENT, OF_CANDIDATE = -1, -2
-"""Places of worst samples before the block: of the current state, and of the candidate for the next state."""
+"""Places of a worst sample before the block, for the current state and for the candidate."""
 
 _CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
 

@@ -158,7 +158,7 @@ class Requirement(NamedTuple):
     def outcome(self, series: Floats, at: Integers) -> Floats:
         """Return (S,), the robustness of its obligation over the finished log, times the obligation's sign.
 
-        NaN if it is not known, and if a failing obligation is an alternative that the formula does not need.
+        NaN if it is not known, or if the obligation fails without violating its conjunct.
 
         Args:
             series: (N, 4, T): value, now, and lower and upper over the finished log.

@@ -81,6 +81,7 @@ def encode_robustness(
 @lru_cache(64)
 def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], final: bool) -> WireTemplate:
     """Return the template of a result's messages; blocks share it."""
+    # each number that is set becomes a slot, whatever its value
     message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(

@@ -47,6 +47,7 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     """
     ranks = _RANKS[codes]
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
+    # minus 1 puts the worst rank before other ranks, also without a violation
     order = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
     return np.asarray(order.argmin(axis=0), np.int64)
 
@@ -322,6 +323,7 @@ class StandingEncoder:
 
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""
+        # each number that is set becomes a slot, whatever its value
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
         for number, (title, unit, *_) in enumerate(self._entries):
@@ -330,6 +332,7 @@ class StandingEncoder:
         for index, over in violated:
             name, unit = self._trees[index].title, self._units[index]
             message.violated.add(name=name, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
+        # viewers draw no table without rows
         if not violated:
             message.violated.add(name="nothing is violated")
         message.header.stamp.sec = message.header.stamp.nsec = 1.0

@@ -85,7 +85,7 @@ class Shade:
         """Return (S,), the present number of a bound object.
 
         Args:
-            now: (S,), present numbers of the part, which replace unknown ones.
+            now: (S,), present numbers of the part, for samples in which the object has no number.
             at: (S,) indices of samples in the block.
         """
         numbers = self.bound.get(name)
@@ -133,6 +133,7 @@ class ShadeTracker:
             failing = trace.take(np.searchsorted(trace.times_ns, block.times_ns[fails]))
             tuples, bodies, of_fails = _numbers_of(leaf, part.sign, TraceScene(failing, self._regions))
             if bodies:
+                # exactly equal, because the quantifier's number is the least of these numbers
                 is_least = of_fails == now[fails]
                 worst[fails] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
             for names, binding_numbers in zip(tuples, of_fails, strict=True):
@@ -226,8 +227,8 @@ class Violations(NamedTuple):
         node: (S,) int64, id of the violated requirement, or of the atom that settled the violation.
         leaf: (S,) int64, index of the deciding leaf in the result's program; -1 for none.
         is_shown: (S,), whether the arrow has two ends.
-        points: (S, 2, 2), a point of the first and a point of the second thing of the pair.
-        top: (S,), upper end of the higher thing; NaN if neither has a height.
+        points: (S, 2, 2), ends of the arrow on the first and on the second object or region of the pair.
+        top: (S,), upper end of the higher one of both; NaN if neither has a height.
         robustness: (S,), at most 0, of the requirement or of the settling atom. It is in the unit of the log:
             a division by `scale` is undone.
         holds: (S,), whether the atom holds but must not.
@@ -373,7 +374,7 @@ def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray
 
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
-    """Return the requirement around a node: the last requirement with an id up to the node's."""
+    """Return the requirement that contains a node; requirements are in the order of their ids."""
     within = [requirement for requirement in result.requirements if requirement.node <= node]
     return within[-1] if within else None
 
@@ -535,9 +536,9 @@ def _iter_deciding(
 def _iter_worst(
     leaf: Formula, sign: float, scene: TraceScene, samples: Integers
 ) -> Iterator[tuple[Formula, Integers]]:
-    """Yield the body for each binding with the least number, for a quantifier with many bindings.
+    """Yield the bodies of deciding bindings for a quantifier with many bindings; see `_iter_deciding`.
 
-    The indices are those of `_iter_deciding`.
+    A binding decides in the samples in which its number is the least.
     """
     if not isinstance(leaf, Quantified):
         return

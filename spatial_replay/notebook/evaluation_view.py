@@ -246,7 +246,7 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
 
 
 def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
-    """Write names at ends (x, y, name). A name moves up or down if an earlier name is in its way."""
+    """Write each name at its position (x, y, name), moved up or down if an earlier name is in its way."""
     # the transformation is final only after the aspect is applied
     ax.apply_aspect()
     inches = ax.transData + ax.figure.dpi_scale_trans.inverted()

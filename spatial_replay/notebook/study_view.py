@@ -43,7 +43,7 @@ _MOST_RUNS: Final = 50
 _MOST_LINES: Final = 40
 """Limit of runs with a line at their change of verdict."""
 _MOST_MARGINS: Final = 10_000
-"""Margins that set the resolution of a picture with many runs; the least resolution is 25 values."""
+"""Limit of computed margins, which lowers the resolution for many runs, but not below 25 values."""
 
 
 @html.register(Tuning)
@@ -160,6 +160,7 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
     extend = "min" if least.min() < -most else "neither"
     ax.figure.colorbar(mesh, ax=ax, label="least margin of all runs (robustness)", extend=extend)
     for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
+        # matplotlib refuses contours of less than 2 x 2 values, and warns of levels outside the data
         if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
             ax.contour(
                 surface.x,
@@ -383,6 +384,7 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin
     )  # fmt: skip
     x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
     values = gradient.values[turn]
+    # matplotlib refuses contours of less than 2 x 2 cells, and warns of levels outside the data
     if margin is not None and min(values.shape) > 1 and np.nanmin(values, initial=margin) < margin:
         ax.contour(x, y, values, levels=[margin], colors=[INK], linewidths=[1.0])
     for reason, hatch in enumerate(_HATCHES):

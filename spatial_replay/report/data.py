@@ -263,7 +263,7 @@ class PageData:
 
     Attributes:
         numbers: the text of `Packing.text`.
-        omissions: sentences on what is left out to limit the size of the page.
+        omissions: sentences about data that the page leaves out to limit its size.
     """
 
     facts: Mapping[str, Any]
@@ -327,7 +327,7 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
 
 
 def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
-    """Return times that the page always has: those in sentences, of further events, and of the scene.
+    """Return times that the page always has: times in sentences, of further events, and of the scene.
 
     They are at most `most`, unless the times in sentences alone exceed it. Frames of the scene are evenly
     spaced. All panels have these times, because a cursor shows one sample.

@@ -527,7 +527,7 @@ class Session:
         return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
-        """Answer the calls of `wait_for_evaluation` from before the last `next_requests`."""
+        """Return an evaluation to all calls of `wait_for_evaluation` before the last `next_requests`."""
         with self._requested:
             due, self._due = self._due, None
         if due is not None:
@@ -612,7 +612,10 @@ class PlaybackThinning:
         )
 
     def _take(self, topic: str, count: int) -> int:
-        """Return the limit of a drawn topic in this turn, at least 1, and charge up to `count` messages."""
+        """Return how many messages a drawn topic may send in this turn, at least 1.
+
+        At most `count` messages are charged to the topic's allowance.
+        """
         left, at_s = self._left.get(topic, (float(_MOST_AT_ONCE), self._passed_s))
         left = min(left + MOST_DRAWN_A_SECOND * (self._passed_s - at_s), _MOST_AT_ONCE)
         most = max(1, math.floor(left))

@@ -169,6 +169,7 @@ class Relay:
             pass  # the viewer or the server disconnected, or the request is malformed
         finally:
             self._connections.discard(task)
+            # close() would wait until a viewer that does not read has read the buffer
             writer.transport.abort()
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -121,16 +121,16 @@ def _object(title: str, **properties: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 _CONSTANTS = {
-    "description": "Numbers, for durations in seconds, by name; the others stay as they are shown.",
+    "description": "Numbers by name of the constant, durations in seconds. Other constants stay unchanged.",
     "type": "object",
     "properties": {},
     "additionalProperties": {"type": ["number", "string"]},
 }
 
 _TIME, _PLAY, _SPEED, _ = PLAYBACK
-_SECONDS = {"description": "Seconds after the first sample.", "type": "number", "minimum": 0}
+_SECONDS = {"description": "Seconds after the zero of the log.", "type": "number", "minimum": 0}
 _TIMES = {
-    "description": "Seconds of the log in a second.",
+    "description": "Seconds of the log per second.",
     "type": "number",
     "minimum": SLOWEST,
     "maximum": FASTEST,
@@ -153,8 +153,8 @@ _SERVICES: Final[Mapping[str, _Served]] = MappingProxyType(
         "explain": _Served(
             _object(
                 "spatial_replay.ExplainRequest",
-                node={"description": "Name of a spec, wherever it stands.", "type": "string"},
-                object={"description": "Of a template, the object that it is about.", "type": "string"},
+                node={"description": "Name of a spec, a result or a part of one.", "type": "string"},
+                object={"description": "Object of a template's instance.", "type": "string"},
             ),
             {
                 "title": "spatial_replay.ExplainResponse",
@@ -418,15 +418,15 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
-        """Send the state of the playback to all viewers; replies to a request take another way."""
+        """Send the state of the playback to all viewers. Handlers return it to a single viewer."""
         self._server.broadcast_playback_state(_playback_state(state, None))
 
     def send_values(self, values: Values) -> None:
-        """Send the constants to all viewers; replies to a request take another way."""
+        """Send the constants to all viewers. Handlers return them to a single viewer."""
         self._server.publish_parameter_values(_constants(values))
 
     def send_playback(self) -> None:
-        """Send the parameters of the playback to all viewers; replies to a request take another way."""
+        """Send the parameters of the playback to all viewers. Handlers return them to a single viewer."""
         self._server.publish_parameter_values(_parameters(self.steering))
 
     @property

@@ -62,6 +62,7 @@ def labelled_objects(
     is_named = np.array([name in named for name in names], np.bool_)
     urgency = np.where(robustness < 0.0, robustness, np.where(is_named, 0.0, np.inf))
     urgency[~is_present] = np.inf
+    # sorting the order gives the rank of each object
     rank = np.argsort(np.argsort(urgency, axis=1, kind="stable"), axis=1, kind="stable")
     is_chosen = (urgency < np.inf) & (rank < _MOST_LABELS)
     return np.asarray(np.where(is_crowded[:, None], is_chosen, True))
@@ -180,7 +181,7 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
 
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
-    """Return robustness (...) as indices into `SHADES`, the colours of `colours`."""
+    """Return the index into `SHADES` for each robustness (...), with the same colour as by `colours`."""
     share = np.minimum(np.abs(np.nan_to_num(robustness)), scale) / np.asarray(scale)
     codes = np.where(robustness >= 0.0, 128.0 + np.round(127.0 * share), 127.0 - np.round(126.0 * share))
     return np.where(np.isnan(robustness), 0.0, codes).astype(np.uint8)

@@ -349,7 +349,7 @@ class CauseText(NamedTuple):
     Attributes:
         text: text before the number.
         length: length of the number with its unit, bytes.
-        dashes: for an arrow about an earlier sample, x and y of the dashes' ends along the outlines then.
+        dashes: dashed outlines at an earlier sample that the arrow is about: x and y of the dashes' ends.
         names: objects and regions of the deciding atom.
     """
 
