@@ -570,7 +570,7 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
             if candidate.chosen:
                 yield f"  there    {_place_facts(candidate, edge, decision.margin)}"
         rivals = [
-            *(f"path {_path(given)}: {Reason.from_text(given.pruned).kind}" for given in before),
+            *(f"path {_path(pruned)}: {Reason.from_text(pruned.pruned).kind}" for pruned in before),
             *_rival_texts([candidate for candidate in edge.candidates if not candidate.chosen]),
         ]
         if rivals:

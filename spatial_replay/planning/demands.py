@@ -7,7 +7,7 @@ between backquotes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import accumulate
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -60,7 +60,7 @@ def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, .
             tuple(text for text, value in cube.items() if value),
             tuple(text for text, value in cube.items() if not value),
         )
-        for cube in _simplified(
+        for cube in _simplify(
             [_literals_of(guard) for guard in guards], [_literals_of(guard) for guard in given_up]
         )
     )
@@ -77,12 +77,12 @@ def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
 
 def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
     """Return the rules for the way, with all bans of a single literal in one or two rules."""
-    kept = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
+    required = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
     avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
     others = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
     more = [f"{len(others) - _MOST_RULES} more rules"] if len(others) > _MOST_RULES else []
     return (
-        *([f"keep {_listing(kept, 'and')}"] if kept else []),
+        *([f"keep {_listing(required, 'and')}"] if required else []),
         *([f"avoid {_listing(avoided, 'and')}"] if avoided else []),
         *others[:_MOST_RULES],
         *more,
@@ -91,12 +91,12 @@ def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
 
 def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:
     """Return the goal of each alternative of a progress set, without literals that bans already name."""
-    kept = {text for ban in bans if not ban.holding and len(ban.failing) == 1 for text in ban.failing}
+    required = {text for ban in bans if not ban.holding and len(ban.failing) == 1 for text in ban.failing}
     avoided = {text for ban in bans for text in ban.holding}
     alternatives = []
-    for cube in _simplified([_literals_of(guard) for guard in guards]):
-        wanted = [text for text, value in cube.items() if text not in (kept if value else avoided)]
-        texts = [f"`{text}`" if cube[text] else f"`{text}` no longer" for text in wanted or cube]
+    for cube in _simplify([_literals_of(guard) for guard in guards]):
+        goals = [text for text, value in cube.items() if text not in (required if value else avoided)]
+        texts = [f"`{text}`" if cube[text] else f"`{text}` no longer" for text in goals or cube]
         alternatives.append(" and ".join(texts))
     return tuple(dict.fromkeys(alternatives))
 
@@ -106,29 +106,39 @@ def _literals_of(guard: str) -> dict[str, bool]:
     literals = {}
     for literal in _operands_of_and(guard):
         text = literal.removeprefix("not ")
-        literals[_unbracketed(text)] = text == literal
+        literals[_without_brackets(text)] = text == literal
     literals.pop("true", None)
     return literals
 
 
 def _operands_of_and(text: str) -> list[str]:
-    depths = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
     operands, start = [], 0
-    for place, depth in enumerate(depths):
+    for place, depth in enumerate(_depths(text)):
         if depth == 0 and text.startswith(" and ", place):
             operands.append(text[start:place])
             start = place + len(" and ")
     return [*operands, text[start:]]
 
 
-def _unbracketed(text: str) -> str:
+def _without_brackets(text: str) -> str:
     """Return a text without its outer brackets, if one pair encloses all of it."""
-    depths = list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in text))
-    is_bracketed = text.startswith("(") and text.endswith(")") and min(depths[:-1], default=0) > 0
+    is_bracketed = text.startswith("(") and text.endswith(")") and min(_depths(text)[:-1]) > 0
     return text[1:-1] if is_bracketed else text
 
 
-def _simplified(
+def _depths(text: str) -> list[int]:
+    """Return the number of open brackets and quotes after each letter; brackets in quotes do not count."""
+    depths, depth, is_quoted = [], 0, False
+    for before, letter in pairwise(f" {text}"):
+        if letter == '"' and before != "\\":
+            is_quoted = not is_quoted
+        elif not is_quoted:
+            depth += {"(": 1, ")": -1}.get(letter, 0)
+        depths.append(depth + is_quoted)
+    return depths
+
+
+def _simplify(
     cubes: Sequence[Mapping[str, bool]], ignored: Sequence[Mapping[str, bool]] = ()
 ) -> list[dict[str, bool]]:
     """Return distinct cubes without literals that do not affect the union of all cubes.
@@ -156,11 +166,11 @@ def _part_of_table(cube: Mapping[str, bool], names: Sequence[str]) -> tuple[int 
 
 def _listing(texts: Sequence[str], conjunction: str) -> str:
     """Return formulas between backquotes; a conjunction joins the last two."""
-    *first, last = [f"`{_shortened(text)}`" for text in texts] or ["anything"]
+    *first, last = [f"`{_shorten(text)}`" for text in texts] or ["anything"]
     return f"{', '.join(first)} {conjunction} {last}" if first else last
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     """Return a formula; a long one is shortened to the first operand of its "and"."""
     first, *others = _operands_of_and(text)
     return f"{first} and {len(others)} more" if others and len(text) > _LONGEST else text

@@ -210,3 +210,8 @@ def test_constraints_are_said_as_what_to_keep_and_what_to_avoid():
     assert breaches == ["`d` would hold", "`f` and `g` would hold", "`x and y` would hold before `c`"]
     wanted = wanted_of(["k and e and not c and not d", "not k and e and not m"], bans)
     assert wanted == ("`k` and `c` no longer", "`k` no longer and `m` no longer")
+
+
+def test_names_in_quotes_are_not_taken_apart():
+    bans = bans_of(['"salt and pepper" leftof "cup (old)" and not ("a) and (b" ovlp cup)'])
+    assert rules_of(bans) == ('`"salt and pepper" leftof "cup (old)"` not before `"a) and (b" ovlp cup`',)
