@@ -1,4 +1,4 @@
-"""Automata of specifications: by the compiler of the package, through MONA, and many at once."""
+"""Automata of specifications, by the package's compiler, through MONA, and in several processes at once."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def _responses(count: int) -> str:
 
 
 RESPONSES = _responses(4)
-"""Four requests, each of which is to be answered: 16 states, 256 transitions."""
+"""Four requests with responses: 16 states, 256 transitions."""
 
 MANY_S = 1.0
-"""What twelve of them may take: 4,096 states, 49,152 decisions, 16.8 million transitions."""
+"""Limit for twelve requests, seconds: 4,096 states, 49,152 decisions, 16.8 million transitions."""
 
 DEADLINES = " and ".join(f"(F[0, 300] a{n} >= 0)" for n in range(4))
 """Four tasks, each with 300 samples: 4,503 states."""
@@ -28,14 +28,14 @@ PICK_PLACE = default_specification("pick-place").source
 """The paper's pick-and-place: 32 states, 243 transitions."""
 
 DEADLINE = "G ((a >= 0) -> F[0, 1000] b >= 0)"
-"""A request that is to be answered within 1000 samples: 1002 states, which MONA does not find."""
+"""A request with a response within 1000 samples: 1002 states, which MONA does not find."""
 
 TASKS = {"4 responses": RESPONSES, "pick-place": PICK_PLACE}
 LIMIT_S = 0.05
 
 
 def bench_automaton(measure: Any) -> None:
-    """From a parsed specification to an automaton with its guards."""
+    """Time from a parsed specification to an automaton with its guards."""
     for name, text in TASKS.items():
         specification = sr.parse_specification(text)
         measure(f"{name}, own", lambda _, it=specification: sr.automaton(it, compiler="own"), limit_s=LIMIT_S)
@@ -46,7 +46,7 @@ def bench_automaton(measure: Any) -> None:
             f"{name}, MONA",
             lambda _, it=specification: sr.automaton(it, compiler="mona"),
             limit_s=LIMIT_S,
-            # the library's own way to an automaton, on another machine
+            # the library's own compiler, measured on another machine
             reference_s=23.0 if text is RESPONSES else None,
         )
     deadline = sr.parse_specification(DEADLINE)
@@ -56,7 +56,7 @@ def bench_automaton(measure: Any) -> None:
 
 
 def bench_many_responses(measure: Any) -> None:
-    """Automata whose transitions cannot be listed; 24 times the decisions may take 24 times as long."""
+    """Automata with too many transitions to list; the time may grow as the number of decisions, 24 times."""
     eight, twelve = (sr.parse_specification(_responses(count)) for count in (8, 12))
     few = measure("8 responses", lambda _: sr.automaton(eight, compiler="own"))
     many = measure("12 responses", lambda _: sr.automaton(twelve, compiler="own"), limit_s=MANY_S)
@@ -64,7 +64,7 @@ def bench_many_responses(measure: Any) -> None:
 
 
 def bench_doctor(measure: Any) -> None:
-    """What is wrong with a specification, and the shortest runs of its results, placed and evaluated."""
+    """Findings of `doctor`, and the shortest runs of results, placed and evaluated."""
     spatial = " and ".join(f"(G (a{n} leftof b{n} -> F a{n} ovlp b{n}))" for n in range(12))
     several = "\n".join(
         f"spec s{n} = G (a dist b >= 0.{n + 10}) and F (a leftof c{n} and b ovlp c{n})" for n in range(12)
@@ -83,7 +83,7 @@ def bench_doctor(measure: Any) -> None:
 
 
 def bench_automata_at_once(measure: Any) -> None:
-    """100 automata from 4 processes at once, each compared with what one process alone makes."""
+    """100 automata from 4 processes at once, each compared with the automaton of a single process."""
     compiler = "own" if shutil.which("mona") is None else "mona"
     jobs = [(list(TASKS.values())[n % 2], compiler) for n in range(100)]
     expected = [sr.automaton(sr.parse_specification(text), compiler="own") for text, _ in jobs]

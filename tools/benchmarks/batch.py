@@ -1,4 +1,4 @@
-"""Many logs: two workers against one, what a log costs beyond its evaluation, and very many results."""
+"""Many logs: two workers against one, the cost of a log beyond its evaluation, and very many results."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def bench_batch(bench: Any) -> None:
 
         text = read_specification_text(spec)
         tasks = [Task(str(log), (text,)) for log in sorted((folder / "logs").iterdir())]
-        # logs of their own, before and after, because the speed of a machine drifts
+        # separate logs before and after, because the speed of a machine drifts
         halves = tasks[:BARE_LOGS:2], tasks[1:BARE_LOGS:2]
 
         def bare(half: Sequence[Task]) -> float:
             return _seconds(lambda: [rows_from_task(task) for task in half])
 
-        # everything is compiled and loaded by the first few
+        # the first logs compile and load everything
         with only("compiled"):
             run(ThisProcess(), "few", few)
             before = _memory()
@@ -81,7 +81,7 @@ def bench_batch(bench: Any) -> None:
         bench.quantile("in this process", [one_s / count], 0.5, unit="log")
         bench.quantile("beyond its evaluation", [one_s / count - bare_s], 0.5, unit="log", limit_s=0.005)
         bench.ratio("memory after many to after ten", after / before, 1.1)
-        # a process of its own loads its code first, be there one or two
+        # each worker process loads its code first, also a single one
         worker_s, two_s = run(LocalProcesses(1), "worker"), run(LocalProcesses(2), "two")
         bench.quantile("one worker", [worker_s / count], 0.5, unit="log")
         bench.quantile("two workers", [two_s / count], 0.5, unit="log")
@@ -175,7 +175,7 @@ def write_data_set(folder: Path, episodes: int) -> None:
 
 
 def bench_evaluate_many(bench: Any) -> None:
-    """Traces of 200 samples under four specs: all of a result, one by one and together."""
+    """Traces of 200 samples under four specs, evaluated one by one and together."""
     try:
         from spatial_replay.monitor.result import evaluate_many
     except ImportError:
@@ -206,7 +206,7 @@ def bench_evaluate_many(bench: Any) -> None:
 
 
 def bench_results(bench: Any) -> None:
-    """The worst ten of very many rows, from the file."""
+    """The worst ten of very many rows, read from the file."""
     import numpy as np
     import pyarrow as pa
 
@@ -236,7 +236,7 @@ def bench_results(bench: Any) -> None:
 
 
 def _memory() -> int:
-    """The memory of this process now, in bytes."""
+    """Return the present memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 

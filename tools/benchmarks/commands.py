@@ -1,4 +1,4 @@
-"""Whole commands, as a person types them, with warm kernel caches."""
+"""Whole commands with warm kernel caches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def bench_help(measure: Any) -> None:
 
 
 def bench_short_replay(measure: Any) -> None:
-    """`spatial-replay replay` of 300 samples, and the first one on a machine, which has no compiled code."""
+    """`spatial-replay replay` of 300 samples, and the first replay on a machine, without compiled code."""
     recordings = Path(__file__).resolve().parents[2] / "recordings"
     with tempfile.TemporaryDirectory() as folder:
         log = f"{folder}/table.mcap"

@@ -1,4 +1,4 @@
-"""Diffs of specifications and of runs, and clips: compared with one evaluation, and with the whole log."""
+"""Diffs of specifications and runs against one evaluation, and clips against the whole log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LONG = 1_000_000
 
 
 def _repeated(trace: sr.Trace, count: int) -> sr.Trace:
-    """The same run again and again, with times that go on."""
+    """Return a run repeated several times, with times that continue."""
     length_ns = int(trace.times_ns[-1] - trace.times_ns[0]) + 33_000_000
     runs = [
         replace(trace, times_ns=trace.times_ns + index * length_ns)
@@ -48,7 +48,7 @@ def bench_diff(measure: Any) -> None:
     sr.diff_specifications(trace, old, new)
     sr.diff_logs(trace, moved, old)
 
-    # one after the other, so that other load on the machine slows all three down alike
+    # in turn, so that other load on the machine slows all three equally
     times_s: dict[str, list[float]] = {"one evaluation": [], "two specifications": [], "two runs": []}
     for _ in range(5):
         for name, run in (
@@ -69,7 +69,7 @@ def bench_diff(measure: Any) -> None:
 
 @dataclass(frozen=True)
 class Passing(Source):
-    """A source of a robot and a person who comes too near to it in one sample, made block by block."""
+    """A source of a robot and a person who comes too near in one sample, generated block by block."""
 
     samples: int
     name: str = "passing"

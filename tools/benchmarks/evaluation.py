@@ -1,4 +1,4 @@
-"""Evaluating specifications in memory: the first time, and after an edit."""
+"""Evaluation of specifications in memory: the first time, and after an edit."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 PUBLISHED_S = 34.3e-3
-"""What the published implementation of the logic takes for one sample of the blocks recording, every prefix,
-on a machine like this one; it grows with the number of samples before."""
+"""Time of the published implementation for one sample of the blocks recording, every prefix, on a similar
+machine. It grows with the number of earlier samples."""
 
 EDITED = (("G ((red1", "G not not ((red1"), ("F (red2", "F[0,inf] (red2"))
 
@@ -60,7 +60,7 @@ def bench_blocks(measure: Any) -> None:
 
 
 def box_trace(count: int, boxes: int, side: float = 0.1) -> sr.Trace:
-    """Return turned boxes at random places, so that some overlap and some are far from each other."""
+    """Return turned boxes at random places, some of which overlap and some of which are far apart."""
     random = np.random.default_rng(3)
     corners = 0.5 * side * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     turns = random.uniform(0.0, 2.0 * np.pi, (count, boxes))
@@ -88,7 +88,7 @@ def box_trace(count: int, boxes: int, side: float = 0.1) -> sr.Trace:
 
 
 def bench_box_distances(bench: Any) -> None:
-    """Six boxes, the distance of each two, without a specification."""
+    """Distances of all pairs of six boxes, without a specification."""
     trace = box_trace(3000, 6)
     operands = [Operand(column[:, None]) for column in trace.rows.T]
     requests = [
@@ -110,11 +110,11 @@ CORNERS = 1000
 
 
 def bench_corners(bench: Any) -> None:
-    """Objects with outlines of 1,000 corners, each with each: the signed distance, the protrusion."""
+    """Signed distances and protrusions of all pairs of objects with 1,000 corners."""
     at, turns = np.random.default_rng(1), np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
     circle = np.column_stack((np.cos(turns), np.sin(turns)))
     star = circle * (1 + 0.3 * np.sin(9 * turns))[:, None]
-    # outline, how far around, how much smaller each is than the one before, how many samples
+    # outline, largest offset of its centre, ratio of consecutive sizes, number of samples
     shapes = {
         "convex": (circle, 9.0, 1.0, 20),
         "convex, overlapping": (circle, 0.5, 1.0, 20),
@@ -156,7 +156,7 @@ spec apart = G (forall p, q in people: p dist q >= 0.5)
 
 
 def bench_crowd(bench: Any) -> None:
-    """200 people, every pair of them at least half a metre apart: 39,800 bindings a sample."""
+    """A quantifier over pairs of 200 people: 39,800 bindings per sample."""
     at = np.random.default_rng(1)
     places, steps = at.uniform(0, 60, (200, 2)), at.normal(0, 0.1, (200, 2))
     samples = []

@@ -1,4 +1,4 @@
-"""Logs of messages by others: reading and mapping beside the bare libraries, and a window of a large log."""
+"""Foreign logs: reading and mapping against the bare libraries, and a window of a large log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ START_NS = 1_700_000_000 * SECOND
 STEP_NS = SECOND // 100
 COUNT = int(os.environ.get("SPATIAL_REPLAY_BENCH_MESSAGES", "100000"))
 SHARE = 0.6
-"""Of the speed of the bare libraries."""
+"""Required speed, fraction of the speed of the bare libraries."""
 
 POSE = "geometry_msgs/msg/PoseStamped"
 ROS_MAPPING = "topics:\n  /a: {shape: {box: [4, 2]}}\n  /b: {shape: {disc: 0.5}}\n"
@@ -42,7 +42,7 @@ LARGE_MAPPING = "topics:\n  /a: {position: [x, y], shape: {disc: 0.5}}\n"
 
 
 def _poses(store: Any, count: int, *, has_sequence: bool) -> Iterator[tuple[str, int, Any]]:
-    """Two robots' poses, a hundred a second each."""
+    """Yield the poses of two robots at 100 Hz each."""
     types = store.types
     turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     for index in range(count // 2):
@@ -112,7 +112,7 @@ def _mapped(path: Path, mapping: Path) -> int:
 
 
 def _median_s(run: Callable[[], int]) -> float:
-    """Seconds for each message."""
+    """Return the median time per message in seconds."""
     run()
     times = []
     for _ in range(5):
@@ -164,7 +164,7 @@ def _unmeasured() -> Iterator[None]:
 
 
 def bench_foreign_evidence(measure: Any) -> None:
-    """Reading with evidence beside reading without, in processor time: the median of pairs."""
+    """Reading with evidence against reading without, in processor time: the median ratio of pairs."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         ros, protobuf = folder / "ros.yaml", folder / "protobuf.yaml"
@@ -191,7 +191,7 @@ def _processor_s(path: Path, mapping: Path) -> float:
 
 
 def _write_large(path: Path, size: int) -> Path:
-    """A log of poses among pictures that no mapping reads, about `size` bytes long."""
+    """Write a log of about `size` bytes, with poses and with pictures that no mapping reads."""
     picture = os.urandom(2**20)
     with path.open("wb") as stream:
         writer = McapWriter(stream, chunk_size=2**22, compression=CompressionType.NONE)
@@ -212,7 +212,7 @@ def _bytes_read() -> int:
 
 
 def bench_foreign_window(measure: Any) -> None:
-    """Two seconds out of a 1 GB log with an index: time, and how much of the file is read."""
+    """Two seconds of a 1 GB log with an index: time, and bytes read."""
     with tempfile.TemporaryDirectory() as name:
         mapping = Path(name) / "large.yaml"
         mapping.write_text(LARGE_MAPPING)
@@ -248,7 +248,7 @@ def _peak_bytes(log: Path, mapping: Path) -> int:
 
 
 def bench_foreign_memory(measure: Any) -> None:
-    """Peak memory of reading a log, and of one of four times its length."""
+    """Peak memory of reading a log, and of reading a log of four times its length."""
     with tempfile.TemporaryDirectory() as name:
         mapping = Path(name) / "ros.yaml"
         mapping.write_text(ROS_MAPPING)

@@ -1,4 +1,4 @@
-"""A running robot monitored: from a message to its verdict, many messages, and what a ring holds."""
+"""A monitored robot: latency from message to verdict, load of many messages, and a ring buffer."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _LONG_S = 600.0
 
 
 def bench_live_latency(measure: Any) -> None:
-    """100 samples a second of six objects: from a message's arrival, and from its sending, to its verdict."""
+    """Latency to the verdict from a message's arrival and from its sending, for six objects at 100 Hz."""
     run = _monitored(rate=100.0, topics=1, seconds=12.0)
     measure.quantile("arrival to verdict, median", run.delays_s, 0.5, limit_s=0.002)
     measure.quantile("arrival to verdict, 99 %", run.delays_s, 0.99, limit_s=0.010)
@@ -77,7 +77,7 @@ def bench_live_load(measure: Any) -> None:
 
 
 def bench_live_ring(measure: Any) -> None:
-    """A stream of 20 MB a second in a ring of 60 s, as fast as it is taken, within the bytes given."""
+    """A stream of 20 MB/s into a ring of 60 s: the greatest speed, within the limit of bytes."""
     most_bytes, piece = (1_400 if measure.full else 350) * 2**20, 2**20
     seconds = 60 if measure.full else 15
     with tempfile.TemporaryDirectory() as folder:
@@ -104,7 +104,7 @@ def bench_live_ring(measure: Any) -> None:
 
 
 class _Monitored(NamedTuple):
-    """A monitored server: of each sample the delay, memory over time, processor time for a sample."""
+    """Figures of a monitored server: delay of each sample, memory over time, processor time per sample."""
 
     delays_s: array[float]
     since_sent_s: array[float]
@@ -114,7 +114,7 @@ class _Monitored(NamedTuple):
 
 
 def _monitored(*, rate: float, topics: int, seconds: float) -> _Monitored:
-    """Monitor a server beside."""
+    """Monitor a server that runs at the same time."""
     more = "".join(
         f"  /more{number}: {{signals: {{value{number}: value}}}}\n" for number in range(topics - 1)
     )
@@ -126,7 +126,7 @@ def _monitored(*, rate: float, topics: int, seconds: float) -> _Monitored:
     )
     assert server.stdout is not None
     port = int(server.stdout.readline())
-    # compact, so that what is measured is not the measurement
+    # compact arrays, so that the memory of the measurement does not count
     delays_s, since_sent_s, processor_s = (array("d") for _ in range(3))
     memory: list[int] = []
     session = LiveSession(f"ws://127.0.0.1:{port}", sr.parse_specification(SPEC), mapping)
@@ -146,13 +146,13 @@ def _monitored(*, rate: float, topics: int, seconds: float) -> _Monitored:
     finally:
         server.kill()
         server.wait()
-    # the first second loads what the first samples take
+    # in the first second, the first samples load code
     first = int(rate)
     took_s = (processor_s[-1] - processor_s[first]) / (len(processor_s) - 1 - first)
     return _Monitored(delays_s[first:], since_sent_s[first:], memory, took_s, session)
 
 
 def _memory() -> int:
-    """The memory of this process now, in bytes."""
+    """Return the present memory of this process in bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()

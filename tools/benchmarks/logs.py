@@ -1,4 +1,4 @@
-"""Reading, replaying and writing logs of many samples: six quadrilaterals that move, 30 a second."""
+"""Reading, replaying and writing logs of many samples: six moving quadrilaterals at 30 Hz."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _SQUARE = np.array([[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]])
 
 @dataclass(frozen=True)
 class Moving(Source):
-    """A source of quadrilaterals that turn and drift, made block by block."""
+    """A source of turning and drifting quadrilaterals, generated block by block."""
 
     samples: int
     name: str = "moving"
@@ -87,7 +87,7 @@ def _moving(samples: np.ndarray[Any, Any]) -> Trace:
 
 
 def _peak_bytes(*arguments: str) -> int:
-    """The peak memory of a command, the largest of this process' children so far."""
+    """Return the peak memory of a command, which must be the largest child of this process so far."""
     done = subprocess.run(
         [sys.executable, "-m", "spatial_replay", *arguments], capture_output=True, check=False
     )
@@ -97,7 +97,7 @@ def _peak_bytes(*arguments: str) -> int:
 
 
 def bench_reading(measure: Any) -> None:
-    """Reading our own log, all samples into columns."""
+    """Reading all samples of our own log into columns."""
     count = 200_000
     with tempfile.TemporaryDirectory() as folder, _as_the_command_line():
         log = Path(folder) / "run.mcap"
@@ -113,7 +113,7 @@ def bench_reading(measure: Any) -> None:
 
 
 def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
-    """The compressed bytes of each chunk, with how many they are decompressed."""
+    """Return the compressed bytes of each chunk, with its decompressed size."""
     with log.open("rb") as stream:
         summary = make_reader(stream).get_summary()
         found = []
@@ -138,7 +138,7 @@ def bench_annotating(measure: Any) -> None:
         per_sample: Any = {"per": count, "unit": "sample", "runs": 5}
 
         def annotate(_: object) -> None:
-            # a file that is there is replaced once the disk has the new one
+            # replacing an existing file would wait for the disk
             annotated.unlink(missing_ok=True)
             run_replay(open_source(log), files, keep_leaves=True, output=annotated)
 
@@ -171,7 +171,7 @@ def bench_annotating_many(measure: Any) -> None:
 
 @contextmanager
 def _as_the_command_line() -> Iterator[None]:
-    """Look for garbage as seldom as the command line does."""
+    """Collect garbage as rarely as the command line does."""
     thresholds = gc.get_threshold()
     gc.set_threshold(50_000, 20, 20)
     try:
@@ -181,7 +181,7 @@ def _as_the_command_line() -> Iterator[None]:
 
 
 def _chunk_contents(log: Path) -> list[bytes]:
-    """The content of each chunk, decompressed."""
+    """Return the decompressed content of each chunk."""
     decompressor = zstandard.ZstdDecompressor()
     return [decompressor.decompress(data, max_output_size=size) for data, size in _chunk_records(log)]
 

@@ -1,4 +1,4 @@
-"""A monitor and a recorder in a loop, as the loop sees them, and other online monitors beside ours."""
+"""Times of a monitor and a recorder within a loop, and other online monitors for comparison."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ import spatial_replay as sr
 MILLION = 1_000_000
 SHORT = 100_000
 STRETCH = 10_000
-"""How many samples a median or a quantile is of."""
+"""Number of samples per median or quantile."""
 
 
 def _blocks() -> tuple[sr.Specification, list[sr.Sample]] | None:
-    """The block-pushing specification, 27 nodes, and its camera recording of six objects."""
+    """Return the block-pushing specification with 27 nodes, and its camera recording of six objects."""
     data = Path(os.environ.get("SPATIAL_REPLAY_DATA", "")) / "paper"
     if not data.is_dir():
         return None
@@ -132,8 +132,8 @@ print(time.process_time() - begin)
 
 
 def bench_first_start(bench: Any) -> None:
-    """The first `Monitor` on a machine: processor time of its process before it takes a sample."""
-    # a child process may still write there
+    """The first `Monitor` on a machine: processor time of its process before the first sample."""
+    # a child process may still write into the folder
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as cache:
         spent_s = subprocess.run(
             [sys.executable, "-c", _FIRST_START],
@@ -145,7 +145,7 @@ def bench_first_start(bench: Any) -> None:
 
 
 def bench_monitor_shapes(bench: Any) -> None:
-    """What a user pays besides the update: shapes and samples; and for many objects, known and unknown."""
+    """Costs besides the update: building shapes and samples, and many known and unknown objects."""
     corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 0.3), (0.3, 0.3), (0.3, 1.0), (0.0, 1.0)]
     makers: dict[str, Callable[[], object]] = {
         "a box": lambda: sr.Footprint.box(0.0, 0.0, 1.0, 1.0),
@@ -193,7 +193,7 @@ def _median(times: Sequence[float]) -> float:
 
 
 def _passes_over_outlines(samples: list[sr.Sample]) -> list[float]:
-    """Times of what numpy needs to join the outlines of a sample's objects, and to take a minimum."""
+    """Return times of numpy for joining the outlines of a sample's objects and taking a minimum."""
     outlines = [
         [part.vertices for each in sample.objects.values() for part in each.footprint.parts]
         for sample in samples
@@ -208,7 +208,7 @@ def _passes_over_outlines(samples: list[sr.Sample]) -> list[float]:
 
 
 def _nothing_for(duration_s: float) -> list[float]:
-    """Times of turns that only wait so long: what the machine adds to any."""
+    """Return times of turns that only wait: the delay that the machine adds to any turn."""
     times = []
     for _ in range(STRETCH):
         start = now = time.perf_counter()
@@ -248,7 +248,7 @@ def _recorded(
     hertz: float | None,
     monitor: sr.Monitor | None,
 ) -> tuple[list[float], list[float]]:
-    """What each sample cost the loop, and how much later than planned each turn of the loop began."""
+    """Return the time that each sample cost the loop, and the delay of each turn of the loop."""
     times, delays = [], []
     with sr.Recorder(path, specifications=specification, overwrite=True) as recorder:
         begun = time.perf_counter()
@@ -266,10 +266,10 @@ def _recorded(
 
 
 def bench_online_peers(bench: Any) -> None:
-    """Compare our monitor with others on the minimum of a signal over a window; all give equal values."""
+    """Our monitor against others on the minimum of a signal over a window; all give equal values."""
     values = random.Random(0)
     signal = [values.uniform(-1, 5) for _ in range(5000)]
-    # so short that few of the turns are interrupted
+    # short turns, so that few of them are interrupted
     turn = 250
 
     def turns(name: str, step: Callable[[int, float], object], limit_s: float | None = None) -> float:

@@ -1,4 +1,4 @@
-"""Temporal operators alone: over a finished signal, and sample by sample with windows below others."""
+"""Temporal operators alone: over a finished signal, and sample by sample with nested windows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from spatial_replay.monitor.online.step import OnlineRun
 MILLION = 1_000_000
 WIDTHS = (10, 1000, 100_000)
 WIDER_LIMIT = 1.2
-"""How much longer any width of a window may take than the quickest."""
+"""Limit of the ratio between the times of the slowest and of the fastest window width."""
 LIMITS_S = {"F": 20e-3, "G": 20e-3, "U": 60e-3}
 
 
@@ -47,7 +47,7 @@ def bench_operators(bench: Any) -> None:
 
 
 def _times(operator: str, bounds: list[str], values: Any, times_ns: Any) -> dict[str, list[float]]:
-    """Of each bound in turn, so that what else the machine does falls on all alike."""
+    """Return the times of each bound, measured in turn, so that other load affects all equally."""
     formulas = {bound: _formula(operator, bound) for bound in bounds}
     orders = {bound: compile_formula(formula).leaves for bound, formula in formulas.items()}
     times: dict[str, list[float]] = {bound: [] for bound in bounds}
@@ -70,11 +70,11 @@ RESPONSES = {
     "G (a -> F[0,5] G[0,w] b)": "G (p >= 0 -> F[0,5] G{bound} q >= 0)",
 }
 GENERAL = "G (a -> F[0,5] G[0,w] b)"
-"""Run backwards over its windows at each sample."""
+"""A formula whose windows are evaluated backwards at each sample."""
 
 
 def bench_online_windows(bench: Any) -> None:
-    """Bounded operators below an unbounded one, every prefix, beside `G (a -> b)`; processor time."""
+    """Bounded operators below an unbounded one, every prefix, against `G (a -> b)`; processor time."""
     compile_ahead()
     source = np.random.default_rng(0).normal(size=(1, 3, ONLINE))
     for name, text in RESPONSES.items():
@@ -95,12 +95,12 @@ def bench_online_windows(bench: Any) -> None:
         for unit, group in (("samples", in_samples), ("seconds", in_seconds)):
             flat = [fastest[width] for width in group]
             bench.ratio(f"{name}, {unit}: slowest to quickest", max(flat) / min(flat), WIDER_LIMIT)
-        # what has no window is some 35 ns a sample, of which half is to enter the numbers
+        # a formula without a window takes about 35 ns per sample, half of it for storing the numbers
         bench.ratio(f"{name}: to G (a -> b)", max(fastest.values()) / fastest[""], 8.0)
 
 
 def _online_times(texts: dict[str, str], leaves: Any) -> dict[str, list[float]]:
-    """Processor time for each sample by each formula in turn, so that other work falls on all alike."""
+    """Return processor times per sample of each formula, in turn, so that other load affects all equally."""
     programs = {
         name: compile_formula(sr.parse_specification(text).specs[0].formula) for name, text in texts.items()
     }
@@ -117,7 +117,7 @@ def _online_times(texts: dict[str, str], leaves: Any) -> dict[str, list[float]]:
 
 
 def bench_offline_peers(bench: Any) -> None:
-    """A bounded until over 10,000 samples, by us and by rtamt, value for value the same."""
+    """A bounded until over 10,000 samples, by this package and by rtamt, with equal values."""
     if importlib.util.find_spec("rtamt") is None:
         bench.remark("rtamt is not installed, and not measured")
         return

@@ -1,4 +1,4 @@
-"""A camera: frames a second from picture to verdict, and how often the truth is within what is stated."""
+"""A camera: frames per second from picture to verdict, and coverage of the stated uncertainty."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ def _axes(yaw: float) -> np.ndarray:
 def bench_camera_truth(measure: Any) -> None:
     """Runs of all simulated worlds, filmed from two sides: with --full whole ones, by script and planned.
 
-    Else their beginnings. How often the truth is outside of what is stated, and verdicts of named specs are
-    the opposite of the true ones, or unknown. The seeds are not those on which the least corner error was
-    chosen.
+    Without --full, only their beginnings. The figures are how often the truth is outside the stated
+    uncertainty, and how often verdicts of named specs are unknown or opposite to the true ones. The seeds
+    differ from the seeds that chose the least corner error.
     """
     try:
         import pybullet  # noqa: F401
@@ -111,9 +111,9 @@ def bench_camera_truth(measure: Any) -> None:
 
 
 def bench_camera_codec(measure: Any) -> None:
-    """Outlines of three moving blocks outside of their radius, sharp or blurred, by strength of coding.
+    """Outlines of three moving blocks outside their radius, sharp or blurred, by strength of coding.
 
-    It compares with what follows from reference tags alone: corners found within 0.1 pixels.
+    The reference uncertainty follows from reference tags alone, with a corner error of 0.1 pixels.
     """
     if not measure.full:
         measure.remark("camera_codec: 50 frames for each figure, in two minutes; takes --full")
@@ -139,7 +139,7 @@ _PERIOD_NS: Final = 40_000_000
 
 
 def _moving(time: float) -> dict[str, tuple[float, float, float]]:
-    """Return x, y and yaw of the blocks at a time in frames: up to 8 pixels a frame, and 2 degrees."""
+    """Return x, y and yaw of the blocks at a time in frames: motions up to 8 pixels and 2° per frame."""
     turn = 0.08 * time
     return {
         "a": (0.42 + 0.06 * math.sin(turn), -0.11 + 0.015 * math.cos(1.3 * turn), 0.3 * turn),
@@ -149,7 +149,7 @@ def _moving(time: float) -> dict[str, tuple[float, float, float]]:
 
 
 def _exposed(text: str, number: int, share: float) -> Frame:
-    """Return a frame for which light is gathered in a share of its period."""
+    """Return a frame that is exposed during a share of its period."""
     camera = Camera((850.0, 850.0), (399.5, 299.5), (800, 600))
     pose = pose_looking_at(np.array([0.9, 0.0, 0.8]), np.array([0.47, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     resting = [
@@ -173,7 +173,7 @@ def _exposed(text: str, number: int, share: float) -> Frame:
 
 
 def _coded(frames: Sequence[Frame], crf: int) -> list[Frame]:
-    """Return frames as they come out of H.264, with the usual settings of its encoder."""
+    """Return frames after encoding and decoding with H.264, with the usual settings of the encoder."""
     import av
 
     with tempfile.TemporaryDirectory() as folder:
@@ -189,7 +189,7 @@ def _coded(frames: Sequence[Frame], crf: int) -> list[Frame]:
 
 
 def _stated(text: str, frames: Sequence[Frame]) -> tuple[int, int, float]:
-    """Return how many outlines are outside of their radius, how many there are, and the median radius."""
+    """Return the number of outlines outside their radius, the number of all, and the median radius."""
     outside, radii = 0, []
     for seen in observe_cameras([frames], parse_tags(text)):
         truth = _moving(seen.sample.time_ns / _PERIOD_NS)
@@ -204,8 +204,11 @@ def _stated(text: str, frames: Sequence[Frame]) -> tuple[int, int, float]:
 
 
 class _Comparison(NamedTuple):
-    """Counts over some runs: samples; outlines, and those outside of what is stated; values of robustness,
-    and those beyond their bounds; verdicts of named specs, those that are opposite, and those unknown."""
+    """Counts over some runs.
+
+    They are of samples; of all and of wrong outlines; of all robustness values and of values beyond their
+    bounds; of all, of opposite and of unknown verdicts of named specs.
+    """
 
     samples: int = 0
     outlines: int = 0
@@ -221,7 +224,7 @@ class _Comparison(NamedTuple):
 
 
 def compared(world: str, log: Path, videos: Sequence[Path]) -> _Comparison:
-    """Compare what the videos of a world say with the log of the run."""
+    """Compare the samples from the videos of a world with the log of the run."""
     truth = sr.read_trace(log)
     tags = load_tags(videos[0].with_suffix(".tags.yaml"))
     cameras = [open_frames(video) for video in videos]
@@ -245,7 +248,7 @@ def compared(world: str, log: Path, videos: Sequence[Path]) -> _Comparison:
     for one, other in zip(real.results, read.results, strict=True):
         for node, its in zip(one.nodes, other.nodes, strict=True):
             known = ~np.isnan(node.value)
-            # a yaw has no uncertainty in samples: `oriented` is as exact as it was seen
+            # a yaw has no uncertainty in samples, so the bounds of `oriented` are as exact as the observation
             if "oriented" in node.text:
                 known = known & False
             values += int(known.sum())
@@ -259,7 +262,7 @@ def compared(world: str, log: Path, videos: Sequence[Path]) -> _Comparison:
 
 
 def _at_times(seen: sr.Trace, truth: sr.Trace) -> sr.Trace:
-    """Return samples with the times of the truth, from which those of a video differ by their rounding."""
+    """Return samples with the times of the truth. Times of a video differ from these by rounding."""
     if len(seen) != len(truth) or np.abs(seen.times_ns - truth.times_ns).max() > 10**6:
         raise ValueError("the video has not the frames of the run")
     return replace(seen, times_ns=truth.times_ns)

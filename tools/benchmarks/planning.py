@@ -27,7 +27,7 @@ spec push = (F (green rightof red and green rightof blue))
     and (G (green dist red >= 0.03 and green dist blue >= 0.03 and red dist blue >= 0.03))
 """
 RUNS = {"push": 60.0, "pick-place": 300.0, "table-setting": 300.0}
-"""How long a whole run may take, in seconds of real time."""
+"""Limit of a whole run by world, seconds of real time."""
 SEEDS = 10
 
 
@@ -45,7 +45,7 @@ def _blocks() -> sr.Sample:
 
 
 def bench_gradient_map(bench: Any) -> None:
-    """One step's progress and constraint sets for each block, 90 x 90 and 360 x 360 cells.
+    """The progress and constraint sets of one step for each block, 90 x 90 and 360 x 360 cells.
 
     The published code takes 2.1 s for 90 x 90.
     """
@@ -79,7 +79,7 @@ def bench_gradient_map(bench: Any) -> None:
 
 
 def bench_map_distances(bench: Any) -> None:
-    """A box at 90 x 90 cells among 10 boxes: the distance to each, beside the same by vectorised shapely."""
+    """Distances from a box at 90 x 90 cells to 10 boxes, against vectorised shapely."""
     import shapely
 
     random, names = np.random.default_rng(3), [f"o{number}" for number in range(11)]
@@ -108,7 +108,7 @@ def bench_map_distances(bench: Any) -> None:
 
 
 def bench_map_layers(bench: Any) -> None:
-    """What a logged map says of each cell beside its robustness: layers, what limits and what blocks it."""
+    """Data of a logged map besides robustness: layers, limits and blocks of each cell."""
     specification, sample = sr.parse_specification(PUSHING), _blocks()
     machine = automaton(specification)
     formulas = [each.formula for each in machine.propositions]
@@ -129,7 +129,7 @@ def bench_map_layers(bench: Any) -> None:
 
 
 def bench_redo(bench: Any) -> None:
-    """Deciding again on the samples of a recorded push; beside it, reading these samples."""
+    """Repeated decisions on the samples of a recorded push, and the time for reading these samples."""
     source = open_source(RECORDINGS / "push.mcap")
 
     def read(_: object) -> object:
@@ -144,7 +144,7 @@ def bench_redo(bench: Any) -> None:
 
 
 def bench_decision(bench: Any) -> None:
-    """A decision on six objects that all go into one region: the first of six motions, planned to the end."""
+    """A decision on six objects for one region: the first of six motions, planned to the end."""
     names = [f"o{number}" for number in range(6)]
     shape = sr.TrackedObject(sr.Footprint.box(-0.04, -0.04, 0.04, 0.04), yaw=0.0)
     places = [(0.1 + 0.16 * (number % 3), 0.15 + 0.3 * (number // 3)) for number in range(6)]

@@ -1,4 +1,4 @@
-"""Two seconds out of a large log of images behind a slow network, against the mcap library over fsspec."""
+"""Two seconds of a large log of images behind a slow network, against the mcap library over fsspec."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ IMAGE = Channel("/camera/image", "protobuf", Schema("foxglove.CompressedImage", 
 
 
 class Traffic:
-    """What a server sent: bytes, requests, and rounds: requests that overlap in time are one."""
+    """The traffic of a server: bytes, requests, and rounds of requests that overlap in time."""
 
     def __init__(self) -> None:
         self.sent = self.requests = self.rounds = self._active = 0
@@ -54,7 +54,7 @@ class Traffic:
 
 @contextmanager
 def _behind_latency(path: Path) -> Iterator[tuple[str, Traffic]]:
-    """Serve ranges of a file, each after the latency."""
+    """Serve ranges of a file, each after a latency."""
     traffic, size = Traffic(), path.stat().st_size
 
     class Handler(BaseHTTPRequestHandler):
@@ -89,7 +89,7 @@ def _behind_latency(path: Path) -> Iterator[tuple[str, Traffic]]:
 
 
 def _write(path: Path, size: int) -> None:
-    """Write samples and images, 20 of both a second, until the log is so large."""
+    """Write samples and images at 20 Hz until the log has a size."""
     random = np.random.default_rng(1)
     objects = protobuf_channel(OBJECTS, ObjectStates)
     count = size // IMAGE_BYTES
@@ -107,7 +107,7 @@ def _write(path: Path, size: int) -> None:
 
 
 def _needed(path: Path) -> int:
-    """How many bytes the chunks of the window have."""
+    """Return the bytes in the chunks of the window."""
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     start_ns, end_ns = WINDOW_NS
@@ -122,7 +122,7 @@ def _by_fsspec(address: str, size: int) -> int:
 
     class File(AbstractBufferedFile):
         def _fetch_range(self, start: int, end: int) -> bytes:
-            # as servers take it: the last byte is included
+            # ranges in HTTP include the last byte: RFC 9110, section 14.1.2
             with urlopen(Request(address, headers={"Range": f"bytes={start}-{end - 1}"})) as answer:
                 return bytes(answer.read())
 
@@ -132,7 +132,7 @@ def _by_fsspec(address: str, size: int) -> int:
 
 
 def bench_remote(measure: Any) -> None:
-    """A window of two seconds out of 200 MB, or 1 GB with --full: time, rounds and bytes."""
+    """A window of two seconds in 200 MB, or in 1 GB with --full: time, rounds and bytes."""
     try:
         import fsspec  # noqa: F401
         import obstore  # noqa: F401

@@ -1,4 +1,4 @@
-"""The report of a long run: processor time to write it, and from a move of the cursor to the picture."""
+"""The report of a long run: processor time of writing it, and latency from the cursor to the picture."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def bench_report(measure: Any) -> None:
         page = Path(folder) / "run.html"
         specification = sr.parse_specification(SPECIFICATION)
         source = MemorySource(_run(SAMPLES))
-        # compiles what is not compiled yet
+        # the first run compiles
         write_report(source, [specification], page)
         start = time.process_time()
         write_report(source, [specification], page)
@@ -73,7 +73,7 @@ def bench_report(measure: Any) -> None:
 
 
 def _run(count: int) -> sr.Trace:
-    """Discs that swing beside each other, at 100 Hz."""
+    """Return a run of discs that swing next to each other, at 100 Hz."""
     times, phases = np.arange(count), np.arange(OBJECTS)
     x = np.sin(times[:, None] / 50 + phases) + 1.5 * phases
     y = np.cos(times[:, None] / 70 + 2 * phases)

@@ -1,4 +1,4 @@
-"""A log served live, as a viewer on the same machine waits for it."""
+"""A log served live: the latencies of a viewer on the same machine."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from spatial_replay.trace.trace import Trace
 
 SAMPLES = 100_000
 WINDOWS = ("0,600", "0,10000", "0s,1s")
-"""Of the operator below another one; a change costs the same with each."""
+"""Windows of an inner operator; a change costs the same for each."""
 OUTER = ("0,5", "0s,0.2s")
-"""Of the window above another one, which is kept at each position that is open."""
+"""Windows of an outer operator, which is evaluated at each pending position."""
 FLAT = (
     "G O F[0,60] {a}",
     "G ({a} -> {b} U[0.5s,2s] {c})",
@@ -44,20 +44,20 @@ FLAT = (
     "G ((F[0,6000] {a}) xor {b})",
     "(G ({a} -> F[0,600] {b})) U (F[0,600] {c})",
 )
-"""Further formulas of which a change costs the same however wide their windows are."""
+"""Further formulas for which the cost of a change does not depend on the width of windows."""
 OPEN = (
     "G ({a} -> F[0,60] ({b} and F[0,60] {c}))",
     "G ({a} -> F ({b} and G[0,60] {c}))",
     "G[0,50000] ({a} -> F ({b} and F[0,60] {c}))",
     "G ({a} -> O[0,60] ({b} and F[0,60] {c}))",
 )
-"""Formulas of which more is kept at each position that is open."""
+"""Formulas with more state per pending position."""
 DEEP = (
     "G ({a} -> F[0,600] G[0,600] {b})",
     "G ({a} -> F[0s,10s] ({b} and F[0s,10s] {c}))",
     "G ({a} -> F[0,30] ({b} and F[0,30] ({c} and F[0,30] ({a} and G[0,10] {b}))))",
 )
-"""The longest of these."""
+"""The slowest of these formulas."""
 WIDE = (
     "G ({a} -> F[0,6000] G[0,6000] {b})",
     "G ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
@@ -74,7 +74,7 @@ WIDE = (
     "G[0,50000] ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
     "G ({a} -> O[0,600] ({b} and F[0,600] {c}))",
 )
-"""Longer ones."""
+"""Slower formulas."""
 LONGEST = (
     "G ({a} -> F[0,6000] ({b} and F[0,6000] ({c} and F[0,6000] {a})))",
     "G ({a} -> F[600,1200] ({b} and F[0,600] {c}))",
@@ -83,9 +83,9 @@ LONGEST = (
     "G[0,50000] ({a} -> F ({b} and F[0,600] {c}))",
     "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
 )
-"""What costs more, without a limit."""
+"""Formulas with higher costs, without a limit."""
 FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[6])
-"""Of all these, over a run that is worse with every sample, so that all that is open matters: no limit."""
+"""Formulas for a run that worsens with every sample, so that all pending positions matter; no limit."""
 CHANGES = 9
 PATIENCE_S = 60.0
 
@@ -110,13 +110,13 @@ class Viewer:
         self._send(op="unsubscribe", subscriptionIds=[self._channels[topic]])
 
     def change(self, topic: str) -> None:
-        """Give the constant `near` a value that it did not have, and wait for what comes of it."""
+        """Give the constant `near` a new value, and wait for the next message of a topic."""
         value = float(next(self._values))
         self._send(op="setParameters", parameters=[{"name": "near", "value": value, "type": "float64"}])
         self.wait_for(topic)
 
     def ask(self) -> None:
-        """Ask for the parameters, and wait for them."""
+        """Request the parameters, and wait for the response."""
         self._send(op="getParameters", parameterNames=[], id="asked")
         while True:
             received = self._connection.recv(PATIENCE_S)
@@ -135,7 +135,7 @@ class Viewer:
 
 
 def bench_serve(measure: Any) -> None:
-    """The block-pushing specification over its camera recording, again and again to 100,000 samples."""
+    """The block-pushing specification over its camera recording, repeated up to 100,000 samples."""
     data = _data()
     if not data.is_dir():
         return
@@ -176,14 +176,14 @@ def bench_serve_windows(measure: Any) -> None:
 
 
 def bench_what_if(bench: Any) -> None:
-    """Time from a constant to the curves of all, beside numpy over as many numbers; and that of all cores."""
+    """Time from a constant to all curves, against numpy over as many numbers; and time of all cores."""
     data = _data()
     if not data.is_dir():
         return
     trace = _trace(data)
     blocks = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
     cases = [("block pushing", blocks.replace("closeto ", "closeto[near] "), 25.0)]
-    # parsing and the encoding of curves weigh more beside few numbers
+    # parsing and encoding of curves weigh more for few numbers
     cases += [(f"window [{window}]", _response(window), 90.0) for window in WINDOWS]
     cases += [(f"a window below one [{outer}]", _nested(outer), 200.0) for outer in OUTER]
     cases += [(text.format_map(_NAMES), _spec(text), 200.0) for text in FLAT]
@@ -195,7 +195,7 @@ def bench_what_if(bench: Any) -> None:
 
 
 def bench_what_if_longest(bench: Any) -> None:
-    """The same of wide windows of which much is open."""
+    """The same for wide windows with many pending positions."""
     data = _data()
     if data.is_dir():
         trace = _trace(data)
@@ -204,7 +204,7 @@ def bench_what_if_longest(bench: Any) -> None:
 
 
 def bench_what_if_falling(bench: Any) -> None:
-    """The same over signals that fall all the time: whatever is open may still become the worst."""
+    """The same for falling signals, for which every pending position may become the worst."""
     rng, falling = np.random.default_rng(3), np.linspace(0.0, -1000.0, SAMPLES)
     x, y, z = (falling + rng.normal(size=(3, SAMPLES))).tolist()
     trace = sr.Trace.from_samples(
@@ -222,7 +222,7 @@ def _measure_changes(bench: Any, name: str, trace: Trace, text: str, most: float
     """Measure changes of a constant.
 
     Args:
-        most: so many times what a pass of numpy takes is the limit; None for no limit.
+        most: limit as a multiple of a numpy pass; None for no limit.
     """
     loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
     numbers = np.concatenate([each.series for each in loaded.evaluate().stretches])
@@ -241,7 +241,7 @@ def _curves_with(loaded: LoadedLog, near: float) -> bytes:
 
 
 def _spent(run: Callable[[], object]) -> tuple[float, float]:
-    """Return how long a run takes, on the clock and in processor time of all cores, in seconds."""
+    """Return the wall time and the processor time of all cores for a run, in seconds."""
     start_s, spent_s = time.perf_counter(), time.process_time()
     run()
     return time.perf_counter() - start_s, time.process_time() - spent_s
@@ -266,7 +266,7 @@ def _response(window: str) -> str:
 
 
 def bench_serve_relay(measure: Any) -> None:
-    """A question and its answer through the server's door, which looks at every frame of an older viewer."""
+    """A request and its response through the relay, which reads every frame of an older viewer."""
     trace = sr.Trace.from_samples(
         sr.Sample(index * 10**8, {"a": sr.Footprint.box(index, 0, index + 1, 1)}) for index in range(10)
     )
@@ -276,7 +276,7 @@ def bench_serve_relay(measure: Any) -> None:
 
 
 def bench_standing(measure: Any) -> None:
-    """Messages on how results stand: one and eight results over the camera recording, at most 50 a second."""
+    """Messages of standing: one and eight results over the camera recording, at most 50 per second."""
     data = _data()
     if not data.is_dir():
         return
@@ -301,7 +301,7 @@ def _encode(times_ns: Any, blocks: Any, over: list[str], encoder: StandingEncode
 
 @contextmanager
 def viewing(trace: Trace, text: str, protocol: str = "foxglove.sdk.v1") -> Iterator[Viewer]:
-    """A viewer of a log and a specification with the constant `near`."""
+    """Yield a viewer of a log and a specification with the constant `near`."""
     loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
     with (
         open_server(loaded.evaluate(), port=0) as server,
@@ -319,7 +319,7 @@ def _trace(data: Path) -> Trace:
 
 
 def _long(trace: Trace) -> Trace:
-    """The trace, again and again."""
+    """Return the trace, repeated."""
     step_ns = int(np.median(np.diff(trace.times_ns)))
     length_ns = int(trace.times_ns[-1] - trace.times_ns[0]) + step_ns
     repeated = [

@@ -1,4 +1,4 @@
-"""Finding constants over many logs, and evaluating a specification that was saved."""
+"""Tuning of constants over many logs, and evaluation of a saved specification."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spatial_replay.tuning.tuned import Tuning
 
 LOGS, FEW_LOGS = 1_000, 50
 SEVERAL, FEW_SEVERAL = 100, 10
-"""Logs with --full, and otherwise; figures are for one log."""
+"""Numbers of logs with and without --full; figures are for one log."""
 
 ONE = """
 const near = 70 in [0, 400]
@@ -41,7 +41,7 @@ spec seen = F (red1 dist blue2 <= lane)
 
 
 def bench_tune(measure: Any) -> None:
-    """One constant over MCAP logs, which are read and measured in the same run."""
+    """One constant over MCAP logs, including reading and measuring."""
     trace = _trace()
     if trace is None:
         return
@@ -124,12 +124,12 @@ def _trace() -> Trace | None:
 
 
 def _shifted(trace: Trace, number: int) -> Trace:
-    """The recording, begun at another sample and continued from its start."""
+    """Return the recording, rotated to begin at another sample."""
     return replace(trace, rows=np.roll(trace.rows, -31 * number, axis=0))
 
 
 def _spoilt(trace: Trace, number: int) -> Trace:
-    """The recording with the blocks meeting later than they do, or with one that stays where it is."""
+    """Return the recording with blocks that meet later, or with a block that does not move."""
     shift, kind = divmod(number, 3)
     if kind == 0:
         return _shifted(trace, -1 - shift % 14)

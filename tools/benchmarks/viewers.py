@@ -1,4 +1,4 @@
-"""The extension's panels, in a page that stands for a viewer: from a seek, or a pointer, to the picture."""
+"""The extension's panels in a page that simulates a viewer: latency from seek or pointer to picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from browser.viewer_page import differences, write_viewer_page  # noqa: E402
 SEEKS = 1_000
 MOVES = 200
 PARTS = 250
-"""A spec of so many parts has twice as many nodes, and one."""
+"""Number of parts of a spec, which then has 2 PARTS + 1 nodes."""
 SAMPLES = 200
 
 _TIMES = """async ([times, isHover]) => {
@@ -80,7 +80,7 @@ def bench_viewer_panels(measure: Any) -> None:
 
 
 def _large(log: Path) -> Path:
-    """A log whose specification has as many parts."""
+    """Write a log whose specification has `PARTS` parts."""
     parts = " and ".join(f"(G (a dist b >= {k / 100}))" for k in range(PARTS))
     specification = sr.parse_specification(f"spec apart = {parts}")
     with sr.Recorder(log, specifications=[specification]) as recorder:
@@ -91,7 +91,7 @@ def _large(log: Path) -> Path:
 
 
 def _page(browser: Browser, log: Path) -> Page:
-    """The panel of the specification in a viewer that has the log open."""
+    """Return the specification panel in a viewer with the log."""
     write_viewer_page(log, log.with_suffix(".html"), topics=("specification", "robustness", "events"))
     page = browser.new_page(viewport={"width": 700, "height": 800})
     page.goto(log.with_suffix(".html").as_uri())
