@@ -91,7 +91,7 @@ class AutomatonRun:
         self._possible[automaton.initial] = True
         self._are_nodes = all(self._is_node)
         self._state: int | None = automaton.initial
-        # whether `step` has moved `_state` on since `_possible` was set
+        # whether `_state` is newer than `_possible`, because `step` updates only `_state`
         self._is_behind = False
         self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)

@@ -119,7 +119,7 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
 def find_leaf(
     below: LeavesBelow, ends: tuple[Floats, Floats], number: float, time_ns: int, *, low: bool
 ) -> DecidingLeaf | None:
-    """Return the first leaf below a node whose number in a sample gives the node its number.
+    """Compare the leaves below a node with the node's number in a sample, and return the first equal leaf.
 
     Args:
         ends: (A,), low and high end of each of the program's leaves in the sample.

@@ -344,7 +344,7 @@ _LISTED: Final = frozenset({"specification", "object", "node", "verdict", "sign"
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
     """Encode an external event, such as a lost connection."""
-    # verdicts that become unknown by it are reported with the samples
+    # changes of verdicts that the event causes are reported with the samples
     facts = {"occurrence": what, "verdict": str(Verdict.UNKNOWN), "message": sentence}
     at = _stamp(time_ns)
     event = Event(start_time=at, end_time=at)

@@ -562,7 +562,7 @@ def _iter_worst(
 def _point_at(
     scene: TraceScene, pair: Pair, samples: Integers, places: Integers, violations: Violations
 ) -> None:
-    """Set the ends of the arrows at `places`, from the pair in some samples of a scene."""
+    """Set the ends of the arrows at `places`, measured between the pair in some samples of a scene."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
     first, second = (Operand(operand.rows[samples], operand.enlargement) for operand in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)

@@ -553,7 +553,7 @@ def _last(values: Floats) -> float:
 
 
 def _apart(places: Sequence[float]) -> list[float]:
-    """Move places apart to a distance of at least `_GAP`, keeping their order and staying below 1."""
+    """Return places moved apart by at least `_GAP`, in the same order, and at most 1."""
     apart = list(places)
     order = sorted(range(len(places)), key=places.__getitem__)
     below = -np.inf
@@ -662,7 +662,7 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
 
 def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
     """Draw a curve with an arrow head, and the guard next to it."""
-    # Graphviz gives the tip of the head first, as e,X,Y: https://graphviz.org/docs/attr-types/splineType/
+    # Graphviz writes the tip of the head first, as e,X,Y: https://graphviz.org/docs/attr-types/splineType/
     head, *points = (_point(point.removeprefix("e,")) for point in edge["pos"].split())
     draw_curve(ax, points, _ARROW)
     ax.annotate(

@@ -194,9 +194,9 @@ class NodeSeries(NamedTuple):
 def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) -> Integers:
     """Return the sorted indices of at most `most` samples that represent a run.
 
-    A quarter of `most` is spread evenly, and the first and last samples of all curves are added. Samples
-    around changes of sign follow, up to five eighths of `most`. Then each curve adds its extrema within even
-    stretches. Where the limit leaves samples out, the added ones are spread evenly.
+    First come evenly spaced samples, a quarter of `most`, and the first and the last sample of each curve.
+    Samples around changes of sign follow, up to five eighths of `most`, and then the extrema of each curve
+    within equal stretches. If the limit cuts a group, its samples are thinned evenly.
 
     Args:
         times_ns: (T,) int64, times of all samples.
@@ -390,7 +390,7 @@ def _decided_text(reported: ReportedResult) -> str:
 
 
 def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
-    """Return the arrow at the deciding atom of a result that is not satisfied, with its time."""
+    """Return the arrow at the deciding atom of an unsatisfied result, and the time at which it is visible."""
     witness, deciding = reported.witness, reported.deciding
     if reported.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None

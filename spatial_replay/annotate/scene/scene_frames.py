@@ -151,7 +151,7 @@ _LONGEST_CAUSE: Final = 60
 
 
 _LEAST: Final = 0.4
-"""Share of the full colour at robustness 0, so that its sign is visible."""
+"""Share of the full colour at the slightest robustness, so that its sign is visible."""
 
 _FROM_GREY: Final = np.subtract((NEGATIVE, POSITIVE), NEUTRAL)
 _FROM_GREY.flags.writeable = False
