@@ -456,6 +456,6 @@ def test_windows_equal_the_definitions_where(formula, numbers, ends, spread, til
 @pytest.mark.parametrize("shape", [(1, 1, 5), (1, 2, 4), (3, 2, 5), (2, 5)])
 def test_leaves_that_do_not_fit_are_refused(shape):
     run = OnlineRun(compile_formula(ahead("G", 0, 5, Boolean("->", (P, ahead("F", 0, 2, Q))))))
-    with pytest.raises(ValueError, match="leaves of shape"):
+    with pytest.raises(ValueError, match="leaves have the shape"):
         run.extend(np.zeros(shape), np.arange(5))
     assert len(run) == 0

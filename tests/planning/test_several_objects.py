@@ -484,7 +484,7 @@ def test_planning_times_are_asked_for_where_a_planner_is_attached(tmp_path):
     planner = Planner(sr.parse_specification("F (a rightof b)"), TABLE)
     with (
         sr.Recorder(tmp_path / "run.mcap", planner=planner) as recorder,
-        pytest.raises(sr.UsageError, match="leave them out"),
+        pytest.raises(sr.UsageError, match="leave timings out"),
     ):
         sr.plan(planner, Robot(dict(THINGS), planner), recorder, timings=True)
 
