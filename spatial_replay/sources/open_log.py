@@ -166,7 +166,7 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             if {"format.json", "rows"}.issubset(names):
                 remedy = "`results` shows them, and compares two such folders"
                 raise MissingFileError(f"{path}: this folder has results of a batch; {remedy}")
-            logs = [name for name in names if name.endswith((".mcap", ".bag", ".jsonl", ".jsonl.gz", ".csv"))]
+            logs = [name for name in names if name.lower().endswith(LOG_ENDINGS)]
             what = "no file of a ROS 2 bag (.db3, .mcap)" if names else "nothing"
             such = f", such as {printable(str(file / logs[0]))}; batch takes a folder" if logs else ""
             if inside := _data_set_in(file):
