@@ -1,1 +1,1 @@
-"""Attacks on the program, each a source of cases that a seed determines; `tools/campaign` runs them."""
+"""Attacks on the program. Each attack draws cases from a seed; `tools/campaign` runs them."""

@@ -1,6 +1,6 @@
-"""Cases of an attack: drawn from a seed, run one after the other, kept as files where they find something.
+"""Cases of an attack: drawn from a seed, run in turn, and written as files if they find a problem.
 
-A case is JSON: what it takes to run it again. `draw` makes one, `run` runs it and says what is wrong.
+A case is JSON, with all that a second run needs. `draw` returns a case; `run` runs a case and returns its problems.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from typing import Any, Protocol
 Case = dict[str, Any]
 
 MOST_MEMORY_BYTES = 500 * 10**6
-"""What a process under attack may hold at most."""
+"""Maximum memory of a process under attack, bytes."""
 
 
 @dataclass
 class Outcome:
-    """What came of a case.
+    """Outcome of a case.
 
     Attributes:
-        problems: what is wrong, each in a sentence; none if all is as it should be.
-        counts: figures that are added up over cases.
-        worst: figures of which the greatest counts.
+        problems: a sentence for each problem.
+        counts: figures whose sum over cases counts.
+        worst: figures whose maximum over cases counts.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -48,8 +48,8 @@ class Attack(Protocol):
     """A source of cases.
 
     Attributes:
-        name: as it is given on the command line.
-        most_cpu_s: the processor time that a case may take; None for no limit.
+        name: name of the attack on the command line.
+        most_cpu_s: maximum processor time of a case, seconds; None for no limit.
         uses_files: whether a case needs a folder.
     """
 
@@ -64,17 +64,17 @@ class Attack(Protocol):
         """Run a case in an empty folder."""
 
     def kept(self, case: Case, folder: Path) -> Case:
-        """Return the case as it is kept, independent of how cases are drawn."""
+        """Return the case in its stored form, which does not depend on the drawing of cases."""
 
     def ready(self) -> None:
-        """Prepare what the first case would otherwise pay for."""
+        """Prepare shared data before the first case is timed."""
 
 
 def run_case(attack: Attack, case: Case, *, is_timed: bool) -> Outcome:
     """Run a case in a folder of its own.
 
     Args:
-        is_timed: whether processor time and memory count; a case that takes too long is run twice.
+        is_timed: whether to check processor time and memory; a slow case runs twice.
     """
     outcome, cpu_s = _timed(attack, case)
     limit = attack.most_cpu_s
@@ -92,7 +92,7 @@ def run_case(attack: Attack, case: Case, *, is_timed: bool) -> Outcome:
 
 
 def memory_bytes(process: int | str = "self") -> int:
-    """Return the most memory that a process has held."""
+    """Return the peak memory of a process."""
     # what `getrusage` returns is inherited from the process that started this one
     status = Path(f"/proc/{process}/status").read_text()
     return int(status.partition("VmHWM:")[2].split()[0]) * 1024
@@ -118,13 +118,13 @@ def run_cases(
     current: Path | None = None,
     is_timed: bool = False,
 ) -> Outcome:
-    """Run cases; the outcome has the problems of all of them.
+    """Run cases; the outcome has the problems of all cases.
 
     Args:
-        seed: with the number of a case, it determines the case.
-        goes_on: called with the number of cases so far.
-        findings: a folder for cases that found something.
-        current: a file whose first line is the case that is running, for a parent that outlives this process.
+        seed: determines each case, together with the number of the case.
+        goes_on: takes the number of cases so far; returns whether to go on.
+        findings: folder for cases with problems.
+        current: file whose first line is the running case, for a parent that outlives this process.
     """
     total = Outcome(counts={"cases": 0, "findings": 0})
     attack.ready()
@@ -157,7 +157,7 @@ def _counting(goes_on: Callable[[int], bool]) -> Iterator[int]:
 
 
 def keep(attack: Attack, case: Case, problems: list[str], findings: Path) -> Path:
-    """Write a case as a file that a test replays."""
+    """Write a case to a file, which a test replays."""
     with TemporaryDirectory(prefix="campaign-") as folder:
         text = json.dumps(
             {"attack": attack.name, "found": problems, "case": attack.kept(case, Path(folder))}, indent=1
@@ -169,6 +169,6 @@ def keep(attack: Attack, case: Case, problems: list[str], findings: Path) -> Pat
 
 
 def read_finding(path: Path) -> tuple[str, Case]:
-    """Return the name of an attack and its case, as `keep` wrote them."""
+    """Return the name of the attack and the case in a file of `keep`."""
     document = json.loads(path.read_text())
     return document["attack"], document["case"]

@@ -1,4 +1,4 @@
-"""Hostile clients of the live server: whatever they send, the next viewer is served."""
+"""Hostile clients of the live server; the server must serve the next viewer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OPS = (
 
 
 class Clients:
-    """Broken handshakes, frames and requests, and clients that leave; then a viewer that behaves."""
+    """Broken handshakes, frames and requests, and clients that leave; then a correct viewer."""
 
     name = "clients"
     most_cpu_s = None
@@ -85,10 +85,10 @@ class Clients:
         return outcome
 
     def _look(self) -> None:
-        """Connect as a viewer does, and ask for the constants.
+        """Connect like a viewer, and ask for the constants.
 
         Raises:
-            Exception: the server does not answer as it should.
+            Exception: the server gives no correct answer.
         """
         from websockets.sync.client import connect
         from websockets.typing import Subprotocol
@@ -109,7 +109,7 @@ class Clients:
 
 
 def _connection(rng: random.Random) -> list[str]:
-    """Return what a client sends, in hexadecimal."""
+    """Return the bytes that a client sends, in hexadecimal."""
     if rng.random() < 0.3:
         return [_handshake(rng, is_sound=False).hex()]
     frames = [_frame(rng) for _ in range(rng.randint(1, 6))]
@@ -187,7 +187,7 @@ def _request(rng: random.Random) -> dict[str, Any]:
 
 
 def _masked(rng: random.Random, opcode: int, payload: bytes) -> bytes:
-    """Return a frame as a client sends it."""
+    """Return a masked frame, which a client sends."""
     mask, size = rng.randbytes(4), len(payload)
     if size < 126:
         head = bytes([0x80 | opcode, 0x80 | size])

@@ -1,4 +1,4 @@
-"""Damaged machine code on disk: compiled again, never run, and no word of it."""
+"""Damaged machine code on disk: it must be compiled again without a message, and never run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(total(np.arange(100.0)))
 
 
 class Code:
-    """A folder of machine code with some random edits of its files, and a program that loads from it."""
+    """A folder of machine code with random edits of its files, and a program that loads from the folder."""
 
     name = "code"
     most_cpu_s = None
@@ -62,7 +62,7 @@ class Code:
 
 @cache
 def _sound() -> Path:
-    """Return the program, with its machine code in the folder `cache` next to it."""
+    """Return the program; its machine code is in the folder `cache` next to it."""
     program = Path(mkdtemp(prefix="campaign-")) / "work.py"
     program.write_text(_PROGRAM)
     if problems := _problems(program, program.with_name("cache")):
@@ -71,7 +71,7 @@ def _sound() -> Path:
 
 
 def _problems(program: Path, cached: Path) -> list[str]:
-    """Run the program with a folder of machine code; return what is wrong with what it prints."""
+    """Run the program with a folder of machine code; return the problems of its output."""
     own = {**os.environ, "SPATIAL_REPLAY_CACHE": str(cached), "SPATIAL_REPLAY_KERNELS": "compiled"}
     done = subprocess.run(
         [sys.executable, str(program)], env=own, capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""Commands on logs with hostile names, on a terminal; and commands that are interrupted."""
+"""Commands on logs with hostile names on a terminal, and interrupted commands."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGINT, signal.SIGTERM)
 
 
 class Names:
-    """Names that would steer a terminal, in logs and specifications: nothing unprintable reaches it."""
+    """Names with control sequences in logs and specifications: no unprintable character may reach the terminal."""
 
     name = "names"
     most_cpu_s = None
@@ -61,7 +61,7 @@ class Names:
 
 
 def _commands(folder: Path, name: str, other: str, third: str, signal_name: str) -> list[list[str]]:
-    """Write a log and a specification with names; return commands that show them."""
+    """Write a log and a specification with these names; return commands that print them."""
     square = [[0, 0], [1, 0], [1, 1]]
     objects = [
         {"name": f"{name}\nforged", "class": f"{other}\nforged", "polygon": square},
@@ -91,7 +91,7 @@ def _commands(folder: Path, name: str, other: str, third: str, signal_name: str)
 
 
 class Interrupts:
-    """Commands that get Ctrl-C or SIGTERM at a random moment: exit code 130, and no partial file."""
+    """Commands with Ctrl-C or SIGTERM at a random moment: exit code 130, and no partial file."""
 
     name = "interrupts"
     most_cpu_s = None

@@ -1,4 +1,4 @@
-"""Damaged logs of every format: typed errors, no silently changed verdict, all saved that can be."""
+"""Damaged logs of every format: typed errors, no silently changed verdict, and full recovery."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ _NUMBERS = (b"NaN", b"1e999", b"-1", b"null", b"[]", b'"', b"9" * 30, b"1e-320",
 
 
 class Format(NamedTuple):
-    """How logs of a format are made.
+    """A format of logs.
 
     Attributes:
         write: writes the log into a folder; returns its file or folder.
-        mapping: what it is read with.
-        is_checked: whether checksums cover its samples, so that no verdict may change unnoticed.
-        is_text: whether its bytes are text.
-        recovers: whether `recover` takes it.
-        names: what its two objects are called.
+        mapping: mapping for reading the log.
+        is_checked: whether checksums cover the samples, so that no verdict may change silently.
+        is_text: whether the format is text.
+        recovers: whether `recover` accepts the format.
+        names: names of the two objects.
     """
 
     write: Callable[[Path], Path]
@@ -57,7 +57,7 @@ class Format(NamedTuple):
 
 
 class Damage:
-    """A log with some random edits of its bytes, under several commands."""
+    """A log with random edits of its bytes, read by several commands."""
 
     name = "damage"
     most_cpu_s = 5.0
@@ -79,7 +79,7 @@ class Damage:
         return {"format": kind, "edits": edits, "more": more}
 
     def kept(self, case: Case, folder: Path) -> Case:
-        """See `Attack`: with the bytes of the damaged log."""
+        """See `Attack`; the stored form has the bytes of the damaged log."""
         files = {name: b64encode(zlib.compress(data)).decode() for name, data in _damaged(case).items()}
         return {**case, "files": files}
 
@@ -124,7 +124,7 @@ class Damage:
 
 
 def _recovered(log: Path, folder: Path, options: list[str], found: Any, kind: str) -> list[str]:
-    """Recover a log, and what was recovered again; return what is wrong with either."""
+    """Recover a log, and recover the result again; return the problems of both."""
     form = FORMATS[kind]
     once, twice = folder / "once.mcap", folder / "twice.mcap"
     first = said_by(["recover", str(log), "-o", str(once)])
@@ -150,7 +150,7 @@ def _recovered(log: Path, folder: Path, options: list[str], found: Any, kind: st
 
 
 def verdicts_of(said: Said) -> list[list[Any]] | None:
-    """Return name, verdict and robustness of each result in the JSON that a replay printed, if it did."""
+    """Return name, verdict and robustness of each result in the printed JSON of a replay, if there is one."""
     try:
         document = json.loads(said.printed)
     except ValueError:
@@ -160,7 +160,7 @@ def verdicts_of(said: Said) -> list[list[Any]] | None:
 
 
 def _edit(rng: random.Random, data: bytes, *, is_text: bool) -> list[Any]:
-    """Return a random edit: its name, a place and what it takes."""
+    """Return a random edit: its name, position and arguments."""
     at = rng.randrange(max(1, len(data)))
     length = min(len(data) - at, rng.choice((1, 2, 8, 100, 4096)))
     kinds = ["flip", "flip", "flip", "byte", "cut", "zero", "remove", "insert", "repeat", "length", "swap"]
@@ -226,7 +226,7 @@ def _damaged(case: Case) -> dict[str, bytes]:
 
 
 def _placed(case: Case, folder: Path) -> Path:
-    """Write the files of a case; return the log among them."""
+    """Write the files of a case; return the path of the log."""
     for name, data in _damaged(case).items():
         path = folder / name
         path.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Specification texts guided by coverage: atheris changes those that reach new code of the language."""
+"""Specification texts guided by coverage: atheris edits texts that reach new code of the parser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LONGEST = 2_000
 
 
 def fuzz(seconds: float, seed: str, findings: Path) -> int:
-    """Run for some seconds; texts that find something become files. Ends the process."""
+    """Run for some seconds, and write texts with problems to files. Ends the process."""
     try:
         import atheris
     except ImportError:

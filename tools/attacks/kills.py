@@ -1,4 +1,4 @@
-"""Recorders that are killed: of what they wrote, less than the last second may be missing."""
+"""Killed recorders: less than the last second of their samples may be missing in the log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FORK = multiprocessing.get_context("fork")
 
 
 class Kills:
-    """A recorder in a process of its own, at up to 1 kHz, killed at a random moment while others compute."""
+    """A recorder in its own process, at up to 1 kHz, killed at a random moment on a busy machine."""
 
     name = "kills"
     most_cpu_s = None
@@ -97,7 +97,7 @@ class Kills:
 
 
 class _Run:
-    """A recorder, and the memory in which it leaves the time of each sample, and when that was written."""
+    """A recorder, and shared memory with the time of each sample and the time of its `write`."""
 
     def __init__(self, folder: Path, about: Case) -> None:
         folder.mkdir()
@@ -117,20 +117,23 @@ class _Run:
         _COUNT.pack_into(self.shared, 0, number + 1)
 
     def written(self) -> Integers:
-        """Return the time of each sample, and when it was written."""
+        """Return the time of each sample, and the time of its `write`."""
         end = _COUNT.size + _WRITTEN.size * self.count
         return np.frombuffer(bytes(self.shared[_COUNT.size : end]), "<i8").reshape(-1, 2)
 
 
 def _queueing_ns(process: int | None) -> dict[str, int]:
-    """Return how long each thread of a process has waited for a processor so far."""
+    """Return the time that each thread of a process has waited for a processor, nanoseconds."""
     tasks = Path(f"/proc/{process}/task")
     return {task.name: int((task / "schedstat").read_text().split()[1]) for task in tasks.iterdir()}
 
 
 def _in_fork(work: Callable[[], list[Outcome]]) -> list[Outcome]:
-    """Return what a forked process finds: reading starts threads, and a process with threads cannot be
-    forked safely, as this one is for the recorders of the next case."""
+    """Return the findings of a forked process.
+
+    Reading starts threads, and a process with threads cannot be forked safely. This process is forked again for
+    the recorders of the next case, so it must not read.
+    """
     ours, theirs = _FORK.Pipe(duplex=False)
     process = _FORK.Process(target=lambda: theirs.send(work()), daemon=True)
     process.start()
@@ -182,7 +185,7 @@ def _outcome(run: _Run) -> Outcome:
 
 
 def _record(run: _Run) -> None:
-    """Write samples at a rate until killed; each time is in the shared memory once it was written."""
+    """Write samples at a rate until killed; store the time of each written sample in the shared memory."""
     about = run.about
     specifications = [sr.parse_specification(SPECIFICATION)] if about["specified"] else []
     boxes = [sr.Footprint.box(x, 0, x + 1, 1) for x in range(about["objects"])]

@@ -1,4 +1,4 @@
-"""The program under attack: in this process, or in one of its own that is forked from it."""
+"""The program under attack, in this process or in a forked process."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _OURS = re.compile(
 
 
 class Said(NamedTuple):
-    """What a command printed.
+    """Output of a command.
 
     Attributes:
-        printed, said: on standard output, and on standard error.
+        printed, said: standard output, and standard error.
     """
 
     arguments: Sequence[str]
@@ -48,7 +48,7 @@ def said_by(arguments: Sequence[str]) -> Said:
 
 
 def problems_of(said: Said, codes: Sequence[int] = CODES) -> list[str]:
-    """Return what is wrong with what a command printed, and with its exit code."""
+    """Return the problems of a command's output and exit code."""
     problems = []
     command = " ".join(said.arguments[:1])
     if said.code not in codes:
@@ -63,7 +63,7 @@ def problems_of(said: Said, codes: Sequence[int] = CODES) -> list[str]:
 
 
 def unprintable(text: str) -> str:
-    """Return what is not printable in a text for a terminal, but for our colours and the progress bar."""
+    """Return the unprintable parts of a text for a terminal, except our colours and the progress bar."""
     plain = _OURS.sub("", text)
     return "".join(each for each in plain if not each.isprintable() and each != "\n")[:40]
 
@@ -71,10 +71,10 @@ def unprintable(text: str) -> str:
 def on_terminal(
     arguments: Sequence[str], during: Callable[[int], None] = lambda process: None
 ) -> tuple[int, bytes]:
-    """Run a command in a forked process whose output is a terminal; return its exit code and what it wrote.
+    """Run a command in a forked process on a terminal; return its exit code and its output.
 
     Args:
-        during: called with the number of the process while it runs.
+        during: called with the process id while the process runs.
     """
     ours, theirs = os.openpty()
     # a signal waits until the program is there to take it
@@ -102,7 +102,7 @@ def on_terminal(
 
 
 def _become(terminal: int, arguments: Sequence[str]) -> None:
-    """Run the program in place of this process, and end it."""
+    """Run the program in this process, and end the process."""
     code = 70
     try:
         for descriptor in (0, 1, 2):
@@ -129,7 +129,7 @@ def _become(terminal: int, arguments: Sequence[str]) -> None:
 
 
 def interrupt_after(seconds: float, number: int) -> Callable[[int], None]:
-    """Return what sends a process a signal after some time."""
+    """Return a function that sends a signal to a process after some time."""
 
     def send(process: int) -> None:
         time.sleep(seconds)

@@ -1,4 +1,4 @@
-"""Damaged folders of results: no verdict, count or exit code that changes without a word."""
+"""Damaged folders of results: no verdict, count or exit code may change silently."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SPECIFICATION = "spec apart = G (a dist b >= 0.3)\nspec near = F (a dist b <= 0
 
 
 class Results:
-    """A folder of results with some random edits of its files, read and gone on with."""
+    """A folder of results with random edits of its files, which is read and continued."""
 
     name = "results"
     most_cpu_s = 5.0
@@ -60,7 +60,7 @@ class _Sound(NamedTuple):
 
 @cache
 def _sound() -> _Sound:
-    """Make logs and the results of a batch over them, once for this process."""
+    """Write logs and the results of a batch over them, once for this process."""
     folder = Path(mkdtemp(prefix="campaign-"))
     (folder / "logs").mkdir()
     (folder / "s.spatial").write_text(_SPECIFICATION)
@@ -106,7 +106,7 @@ def edit_file(
     """Edit a file of the folder; return its name.
 
     Args:
-        keeps_time: whether it seems not to have been written since.
+        keeps_time: whether the file keeps its modification time.
     """
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     if not files:

@@ -1,4 +1,4 @@
-"""Specification texts, valid and broken: each is parsed or refused with a typed error, within a second."""
+"""Valid and broken specification texts: each is parsed, or refused with a typed error, within a second."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HOSTILE = (
 
 
 class Texts:
-    """Random specifications; about half of them damaged by random edits."""
+    """Random specifications; about half of them have random edits."""
 
     name = "texts"
     most_cpu_s = 1.0
@@ -116,7 +116,7 @@ def _atom(rng: random.Random, terms: Sequence[str]) -> str:
 
 
 def _edited(rng: random.Random, text: str) -> str:
-    """Return a text with something deleted, inserted, repeated, swapped or replaced."""
+    """Return a text with a part deleted, inserted, repeated, swapped or replaced."""
     at, to = sorted((rng.randint(0, len(text)), rng.randint(0, len(text))))
     to = min(to, at + 30)
     words = text.split(" ")
