@@ -1,6 +1,6 @@
 """Cases of an attack: drawn from a seed, run in turn, and written as files if they find a problem.
 
-A case is JSON, with all that a second run needs. `draw` returns a case; `run` runs a case and returns its problems.
+A case is JSON, with all data of a second run. `draw` returns a case; `run` runs it and returns its problems.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGINT, signal.SIGTERM)
 
 
 class Names:
-    """Names with control sequences in logs and specifications: no unprintable character may reach the terminal."""
+    """Names with control sequences in logs and specifications: none may reach the terminal unescaped."""
 
     name = "names"
     most_cpu_s = None

@@ -131,8 +131,8 @@ def _queueing_ns(process: int | None) -> dict[str, int]:
 def _in_fork(work: Callable[[], list[Outcome]]) -> list[Outcome]:
     """Return the findings of a forked process.
 
-    Reading starts threads, and a process with threads cannot be forked safely. This process is forked again for
-    the recorders of the next case, so it must not read.
+    Reading starts threads, and a process with threads cannot be forked safely. This process is forked again
+    for the recorders of the next case, so it must not read.
     """
     ours, theirs = _FORK.Pipe(duplex=False)
     process = _FORK.Process(target=lambda: theirs.send(work()), daemon=True)
