@@ -160,24 +160,28 @@ class Payloads(Sequence[bytes]):
     def concatenate(cls, parts: Sequence[Sequence[bytes]]) -> Payloads:
         """Concatenate messages. Small buffers are merged into one, to keep the number of buffers low."""
         groups = [cls.of(part) for part in parts if len(part)]
-        small = [buffer for group in groups for buffer in group.buffers if len(buffer) < _JOINED_BYTES]
-        buffers = [np.concatenate(small)] if small else []
-        starts = iter(np.cumsum([0, *map(len, small)]).tolist())
-        numbers, starts_of = list[int](), list[int]()
+        small_buffers = [
+            buffer for group in groups for buffer in group.buffers if len(buffer) < _JOINED_BYTES
+        ]
+        buffers = [np.concatenate(small_buffers)] if small_buffers else []
+        small_starts = iter(np.cumsum([0, *map(len, small_buffers)]).tolist())
+        new_buffers, new_starts = list[int](), list[int]()
         for buffer in (buffer for group in groups for buffer in group.buffers):
             is_small = len(buffer) < _JOINED_BYTES
-            numbers.append(0 if is_small else len(buffers))
-            starts_of.append(next(starts) if is_small else 0)
+            new_buffers.append(0 if is_small else len(buffers))
+            new_starts.append(next(small_starts) if is_small else 0)
             if not is_small:
                 buffers.append(buffer)
-        firsts = np.cumsum([0, *(len(group.buffers) for group in groups)]).tolist()
-        old = [group.buffer + first for group, first in zip(groups, firsts, strict=False)]
-        places = np.concatenate([np.empty(0, np.int64), *old])
+        first_buffers = np.cumsum([0, *(len(group.buffers) for group in groups)]).tolist()
+        old_buffers = [
+            group.buffer + first_buffer for group, first_buffer in zip(groups, first_buffers, strict=False)
+        ]
+        old_buffer = np.concatenate([np.empty(0, np.int64), *old_buffers])
         start = np.concatenate([np.empty(0, np.int64), *(group.start for group in groups)])
         size = np.concatenate([np.empty(0, np.int64), *(group.size for group in groups)])
-        if not len(places):
-            return cls((), places, start, size)
-        return cls(buffers, np.array(numbers)[places], start + np.array(starts_of)[places], size)
+        if not len(old_buffer):
+            return cls((), old_buffer, start, size)
+        return cls(buffers, np.array(new_buffers)[old_buffer], start + np.array(new_starts)[old_buffer], size)
 
     def __len__(self) -> int:
         return len(self.size)
@@ -216,17 +220,17 @@ class Payloads(Sequence[bytes]):
 
     def copy_into(self, target: Bytes, starts: Integers) -> None:
         """Copy each message into a buffer, at its offset in `starts` (M,)."""
-        for places in equal_places(combined_code([self.buffer, self.size], len(self))):
-            source, size = self.buffers[self.buffer[places[0]]], int(self.size[places[0]])
-            if len(places) < _FEW:
-                for begin, end in zip(self.start[places].tolist(), starts[places].tolist(), strict=True):
+        for messages in equal_places(combined_code([self.buffer, self.size], len(self))):
+            source, size = self.buffers[self.buffer[messages[0]]], int(self.size[messages[0]])
+            if len(messages) < _FEW:
+                for begin, end in zip(self.start[messages].tolist(), starts[messages].tolist(), strict=True):
                     target[end : end + size] = source[begin : begin + size]
             elif size:
-                step = max(1, _CACHED_BYTES // size)
-                for begin in range(0, len(places), step):
-                    some = places[begin : begin + step]
+                batch_size = max(1, _CACHED_BYTES // size)
+                for begin in range(0, len(messages), batch_size):
+                    batch = messages[begin : begin + batch_size]
                     # void elements copy whole messages, without an index for each byte
-                    stretches(target, size)[starts[some]] = stretches(source, size)[self.start[some]]
+                    stretches(target, size)[starts[batch]] = stretches(source, size)[self.start[batch]]
 
 
 def stretches(buffer: Bytes, size: int) -> NDArray[np.void]:

@@ -151,7 +151,7 @@ def _first_group(group: Group | None, prefix: str) -> Group | None:
     return group.group(min(keys, key=natural_key)) if group is not None and keys else None
 
 
-def _body(poses: Any | None, name: str, place: str, order: str) -> Body:
+def _body(poses: Any | None, name: str, place: str, component_order: str) -> Body:
     """Return a body from an array of poses, whose rows begin with a position and a quaternion.
 
     Raises:
@@ -166,7 +166,9 @@ def _body(poses: Any | None, name: str, place: str, order: str) -> Body:
             f"{place} has a quaternion of length {lengths[off[0]]:.3g} at row {off[0]}; an orientation has"
             " length 1, so these are other numbers"
         )
-    return Body(name, values[:, :3], quaternions if order == "xyzw" else quaternions[:, [1, 2, 3, 0]])
+    return Body(
+        name, values[:, :3], quaternions if component_order == "xyzw" else quaternions[:, [1, 2, 3, 0]]
+    )
 
 
 def _pose_rows(poses: Any | None, place: str, rows: slice = slice(None)) -> Floats:
@@ -319,9 +321,9 @@ class _IsaacLab(_Demonstrations):
 
     def poses(self, run: Run, count: int) -> EpisodeColumns:
         times_ns = super().poses(run, count).times_ns
-        order, bodies = run.reading.order or self._decide_order(), []
+        component_order, bodies = run.reading.order or self._decide_order(), []
         for name, place, poses in self._bodies_in(run.episode, run.group):
-            body = _body(poses, name, place, order)
+            body = _body(poses, name, place, component_order)
             if len(body.positions) != count:
                 rows = len(body.positions)
                 raise LogError(f"{place} has {rows} poses, and the first body {count}; record it again")
