@@ -90,8 +90,8 @@ class _Assembling:
         self._faults = FaultKinds() if self._is_live else FaultList()
         for topic, reason in plan.lost:
             # some reasons begin with the topic
-            what = reason.removeprefix(f"topic {topic!r}: ")
-            self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
+            cause = reason.removeprefix(f"topic {topic!r}: ")
+            self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {cause}")
         self._remarks = Remarks(name, plan.mapping)
         self._doubts: list[Doubt] = []
         self._tree = FrameTree()

@@ -274,25 +274,25 @@ def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
 
 
 def _radians(evidence: TopicEvidence, log: Log) -> str | None:
-    layout, turn = evidence.planned.layout, evidence.turn
-    most = max(turn.greatest, -turn.least)
-    if layout is None or abs(layout.angle_scale) != 1.0 or not most > MANY_TURNS:
+    layout, angles = evidence.planned.layout, evidence.turn
+    greatest_angle = max(angles.greatest, -angles.least)
+    if layout is None or abs(layout.angle_scale) != 1.0 or not greatest_angle > MANY_TURNS:
         return None
     # degrees stay within 360; read as radians, they would turn more than once a second, which few robots do
-    is_fast = evidence.motions.turn_rate.quantile(0.9) > 2 * pi and most <= _A_TURN
+    is_fast = evidence.motions.turn_rate.quantile(0.9) > 2 * pi and greatest_angle <= _A_TURN
     if _is_unwrapped(evidence, 2 * pi) and not is_fast:
         return None
-    return f"its angles reach {number_text(most)} and are read as radians"
+    return f"its angles reach {number_text(greatest_angle)} and are read as radians"
 
 
 def _some_turns(evidence: TopicEvidence, log: Log) -> str | None:
-    layout, turn = evidence.planned.layout, evidence.turn
-    most = max(turn.greatest, -turn.least)
-    if layout is None or abs(layout.angle_scale) != 1.0 or not most > 2 * pi + _ROUNDING:
+    layout, angles = evidence.planned.layout, evidence.turn
+    greatest_angle = max(angles.greatest, -angles.least)
+    if layout is None or abs(layout.angle_scale) != 1.0 or not greatest_angle > 2 * pi + _ROUNDING:
         return None
     if _radians(evidence, log):
         return None
-    return f"its angles reach {number_text(most)} and are read as radians"
+    return f"its angles reach {number_text(greatest_angle)} and are read as radians"
 
 
 _ROUNDING: Final = 0.01

@@ -679,8 +679,8 @@ class TopicEvidence:
             return
         with np.errstate(all="ignore"):
             step = np.abs(np.diff(values, axis=0))
-            least = np.minimum(step[1:], step[:-1])
-            is_back = np.abs(values[2:] - values[:-2]) < least / 4
+            smaller_step = np.minimum(step[1:], step[:-1])
+            is_back = np.abs(values[2:] - values[:-2]) < smaller_step / 4
             is_switch = (np.fmin.reduce(values) == 0) & (np.fmax.reduce(values) == 1)
         self.signal_chances += len(is_back)
         self.signal_returns[: values.shape[1]] += np.where(is_switch, 0, is_back.sum(axis=0))

@@ -938,14 +938,16 @@ def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
 
 def _superseded_messages(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
     """Return the indices of messages that a later message of the same time replaces, wholly or in part."""
-    followed = np.append(times_ns[1:] == times_ns[:-1], False)
-    if is_complete or not followed.any():
-        return np.flatnonzero(followed)
+    has_successor = np.append(times_ns[1:] == times_ns[:-1], False)
+    if is_complete or not has_successor.any():
+        return np.flatnonzero(has_successor)
     message = detections.message
     order = np.lexsort((message, detections.name, times_ns[message]))
-    name, at, message = detections.name[order], times_ns[message[order]], message[order]
-    is_again = (name[1:] == name[:-1]) & (at[1:] == at[:-1]) & (message[1:] != message[:-1])
-    return np.unique(message[:-1][is_again])
+    name, time_ns, message = detections.name[order], times_ns[message[order]], message[order]
+    has_later_message = (
+        (name[1:] == name[:-1]) & (time_ns[1:] == time_ns[:-1]) & (message[1:] != message[:-1])
+    )
+    return np.unique(message[:-1][has_later_message])
 
 
 def _changes(transforms: Transforms) -> Integers:
