@@ -135,10 +135,10 @@ PLAN_SHA256 = "plan_sha256"
 
 def plan_sha256(plan: Mapping[str, str]) -> str:
     """Return the SHA-256 of the metadata of a planned run: names and values, in the order of names."""
-    total = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, value in sorted(plan.items()):
-        total.update(_text(name) + _text(value))
-    return total.hexdigest()
+        digest.update(_text(name) + _text(value))
+    return digest.hexdigest()
 
 
 def specifications_json(files: Sequence[Specification]) -> str:

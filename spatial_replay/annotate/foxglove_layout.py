@@ -579,12 +579,12 @@ def _tab_title(plot: Panel) -> str:
     return title.replace(" units]", "]")
 
 
-def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
+def _tabs(identifier: str, titles_and_panels: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
     """Return the identifier of a panel with tabs (for one panel its own), and all panels."""
-    panels = [panel for _, panel in titled]
+    panels = [panel for _, panel in titles_and_panels]
     if len(panels) == 1:
         return panels[0].identifier, panels
-    tabs = [{"title": title, "layout": panel.identifier} for title, panel in titled]
+    tabs = [{"title": title, "layout": panel.identifier} for title, panel in titles_and_panels]
     return identifier, [*panels, Panel(identifier, {"activeTabIdx": 0, "tabs": tabs})]
 
 

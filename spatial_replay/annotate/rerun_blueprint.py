@@ -122,9 +122,12 @@ def _strips(line: LinePrimitive) -> list[_Strip]:
     """Return the strips of a line; a list of segments has a strip for each segment."""
     corners = [(point.x, point.y, line.pose.position.z) for point in line.points]
     colour = _number(hexadecimal((line.color.r, line.color.g, line.color.b)))
-    step = 2 if line.type == LinePrimitive.LINE_LIST else max(len(corners), 1)
-    end = corners[: line.type == LinePrimitive.LINE_LOOP]
-    return [(corners[start : start + step] + end, colour) for start in range(0, len(corners), step)]
+    strip_length = 2 if line.type == LinePrimitive.LINE_LIST else max(len(corners), 1)
+    closing_corner = corners[: line.type == LinePrimitive.LINE_LOOP]
+    return [
+        (corners[start : start + strip_length] + closing_corner, colour)
+        for start in range(0, len(corners), strip_length)
+    ]
 
 
 def _curves(unit: str, rows: Sequence[BlueprintRow]) -> Any:

@@ -545,17 +545,17 @@ class _Places(NamedTuple):
     heights: int
 
 
-def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
+def _places(layout: SceneLayout, region_count: int) -> tuple[list[_Places], int]:
     """Return the starts of the numbers of each object, and their end."""
-    counts = [2 * sum(figure.form.rings) for figure in layout.objects]
-    points = len(_STAMP_WORDS) + 3 * regions
-    *begins, colours = accumulate(counts, initial=points)
-    middles = colours + 3 * len(counts)
-    heights = middles + 2 * len(counts)
-    end = heights + (4 * len(counts) if layout.has_heights else 0)
+    point_numbers = [2 * sum(figure.form.rings) for figure in layout.objects]
+    first_begin = len(_STAMP_WORDS) + 3 * region_count
+    *point_begins, colour_begin = accumulate(point_numbers, initial=first_begin)
+    middle_begin = colour_begin + 3 * len(point_numbers)
+    height_begin = middle_begin + 2 * len(point_numbers)
+    end = height_begin + (4 * len(point_numbers) if layout.has_heights else 0)
     return [
-        _Places(begin, colours + 3 * index, middles + 2 * index, heights + 4 * index)
-        for index, begin in enumerate(begins)
+        _Places(point_begin, colour_begin + 3 * index, middle_begin + 2 * index, height_begin + 4 * index)
+        for index, point_begin in enumerate(point_begins)
     ], end
 
 

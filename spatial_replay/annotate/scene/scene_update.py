@@ -406,19 +406,19 @@ def _content(
     trace: Trace,
     names: tuple[str, ...],
     rows: Integers,
-    before: SceneState,
-    found: Violations,
+    last_state: SceneState,
+    violations: Violations,
     arrows: ArrowTexts,
-    labels: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    label_flags: tuple[NDArray[np.bool_], NDArray[np.bool_]],
     missing: tuple[Integers, Dashes],
     regions: Mapping[str, Floats],
     view: _View,
 ) -> SceneContent:
     is_present = rows >= 0
     is_drawn = is_present | (missing[0] >= 0)
-    was_present = np.concatenate([np.isin([names], before.shown), is_drawn[:-1]])
+    was_present = np.concatenate([np.isin([names], last_state.shown), is_drawn[:-1]])
     footprints = trace.footprints.select(rows[is_present])
-    rings = rings_of(footprints, _POINT * (before.scale or _UNSCALED))
+    rings = rings_of(footprints, _POINT * (last_state.scale or _UNSCALED))
     observations = np.full(rows.shape, -1, np.int64)
     observations[is_present] = np.arange(len(footprints))
     forms = np.where(was_present & (missing[0] < 0), DELETED, ABSENT)
@@ -426,25 +426,34 @@ def _content(
     styles = np.full(rows.shape, -1, np.int64)
     low, high = boxes(rings.points, rings.start)
     sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
-    has_label, failed = (flags[is_present] for flags in labels)
-    styles[is_present] = 4 * _levels(sizes, before.scale or _UNSCALED) + 2 * failed + (has_label | failed)
-    was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
-    witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
-    letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
-    messages = np.flatnonzero(found.is_shown)
+    has_label, failed = (flags[is_present] for flags in label_flags)
+    styles[is_present] = 4 * _levels(sizes, last_state.scale or _UNSCALED) + 2 * failed + (has_label | failed)
+    was_pointing = np.append(last_state.is_pointing, violations.is_shown[:-1])
+    arrow = np.where(violations.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
+    name_lengths = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
+    arrow_messages = np.flatnonzero(violations.is_shown)
     boxes_of_objects = _boxes_of(observations, low, high)
-    is_named = (labels[0] | labels[1]) & is_present & ~found.is_shown[:, None]
-    middles = _name_places(low, high, letters, np.repeat(view.line, is_present.sum(axis=1)))
-    lengths = np.array([len(name) + 2 for name in names], np.float64)
-    of_names = np.where(is_named, observations, -1)
-    middles = _free_places(middles, lengths, of_names, is_named & labels[1], boxes_of_objects, view)
-    boxes_of_objects = boxes_of_objects[0][..., messages], boxes_of_objects[1][..., messages]
-    deciding = _deciding_boxes(names, found, arrows, boxes_of_objects, missing, regions)
-    spots, label = np.zeros((len(rows), 2, 2)), np.full((len(rows), 2), np.nan)
-    of_messages = _View(view.corners[messages], view.line[messages])
-    letters_of_label = np.array([len(cause.text) + cause.length for cause in arrows.causes], np.float64)
-    letters_of_label = letters_of_label[arrows.cause[messages]] if len(messages) else np.empty(0)
-    spots[messages], label[messages] = _places(deciding, letters_of_label, boxes_of_objects, of_messages)
+    is_named = (label_flags[0] | label_flags[1]) & is_present & ~violations.is_shown[:, None]
+    object_name_centres = _name_places(low, high, name_lengths, np.repeat(view.line, is_present.sum(axis=1)))
+    text_lengths = np.array([len(name) + 2 for name in names], np.float64)
+    named_observations = np.where(is_named, observations, -1)
+    object_name_centres = _free_places(
+        object_name_centres,
+        text_lengths,
+        named_observations,
+        is_named & label_flags[1],
+        boxes_of_objects,
+        view,
+    )
+    boxes_of_objects = boxes_of_objects[0][..., arrow_messages], boxes_of_objects[1][..., arrow_messages]
+    deciding_boxes = _deciding_boxes(names, violations, arrows, boxes_of_objects, missing, regions)
+    name_centres, label_centres = np.zeros((len(rows), 2, 2)), np.full((len(rows), 2), np.nan)
+    arrow_view = _View(view.corners[arrow_messages], view.line[arrow_messages])
+    label_lengths = np.array([len(cause.text) + cause.length for cause in arrows.causes], np.float64)
+    label_lengths = label_lengths[arrows.cause[arrow_messages]] if len(arrow_messages) else np.empty(0)
+    name_centres[arrow_messages], label_centres[arrow_messages] = _places(
+        deciding_boxes, label_lengths, boxes_of_objects, arrow_view
+    )
     return SceneContent(
         names,
         rows,
@@ -454,13 +463,13 @@ def _content(
         observations,
         footprints,
         rings,
-        middles,
-        found,
-        label,
-        witness,
+        object_name_centres,
+        violations,
+        label_centres,
+        arrow,
         arrows.causes,
         arrows.numbers,
-        spots,
+        name_centres,
     )
 
 
