@@ -475,8 +475,8 @@ def words_text(automaton: Automaton) -> str:
     for state, transitions in _by_source(automaton).items():
         lines.append(f"  state {state}: {state_words(automaton, state)}")
         for transition in transitions:
-            to = "stays" if transition.target == state else f"to {transition.target}"
-            lines.append(f"    {to} if {_guard_text(automaton, transition)}")
+            move = "stays" if transition.target == state else f"to {transition.target}"
+            lines.append(f"    {move} if {_guard_text(automaton, transition)}")
     if not automaton.is_listable:
         lines.append(f"  … {_left_out(automaton)}")
     return "\n".join(lines)

@@ -47,11 +47,11 @@ def require_translatable(skeleton: Skeleton) -> None:
         NoAutomatonError: the formula is too deep or has too many subformulas.
     """
     depth, size = _depth_and_size(skeleton)
-    formula = "with its bounds unrolled the formula"
+    subject = "with its bounds unrolled the formula"
     if depth > _MAX_DEPTH:
-        raise NoAutomatonError(f"{formula} nests {depth} deep, at most {_MAX_DEPTH} can be translated")
+        raise NoAutomatonError(f"{subject} nests {depth} deep, at most {_MAX_DEPTH} can be translated")
     if size > _MAX_SIZE:
-        raise NoAutomatonError(f"{formula} has more than {_MAX_SIZE} subformulas to translate")
+        raise NoAutomatonError(f"{subject} has more than {_MAX_SIZE} subformulas to translate")
 
 
 def mona_program(skeleton: Skeleton) -> str:
@@ -217,29 +217,31 @@ class _Cube(NamedTuple):
     target: int
 
 
-def _machine(printed: str, propositions: int) -> Machine:
+def _machine(output: str, proposition_count: int) -> Machine:
     """Parse the automaton that MONA printed; its state 0 only leads to the state in which a run begins."""
-    header, accepting, count = (pattern.search(printed) for pattern in (_HEADER, _ACCEPTING, _COUNT))
-    if header is None or accepting is None or count is None:
-        raise NoAutomatonError(f"it printed no automaton: {printed.strip()[:200]!r}")
-    order = [int(name.removeprefix("P")) for name in header[1].split()]
-    states = int(count[1])
-    moves_printed = _MOVE.findall(printed)
-    if len(moves_printed) > _MAX_MOVES:
-        raise NoAutomatonError(f"the automaton has {states} states and more than {_MAX_MOVES} moves")
-    cubes: list[list[_Cube]] = [[] for _ in range(states)]
-    for state, symbol, target in moves_printed:
-        letters = ["X"] * propositions
-        for number, letter in zip(order, symbol, strict=True):
+    header, accepting, state_count_match = (
+        pattern.search(output) for pattern in (_HEADER, _ACCEPTING, _COUNT)
+    )
+    if header is None or accepting is None or state_count_match is None:
+        raise NoAutomatonError(f"it printed no automaton: {output.strip()[:200]!r}")
+    numbers = [int(name.removeprefix("P")) for name in header[1].split()]
+    state_count = int(state_count_match[1])
+    printed_moves = _MOVE.findall(output)
+    if len(printed_moves) > _MAX_MOVES:
+        raise NoAutomatonError(f"the automaton has {state_count} states and more than {_MAX_MOVES} moves")
+    cubes: list[list[_Cube]] = [[] for _ in range(state_count)]
+    for state, symbol, target in printed_moves:
+        letters = ["X"] * proposition_count
+        for number, letter in zip(numbers, symbol, strict=True):
             letters[number] = letter
         cubes[int(state)].append(_Cube("".join(letters), int(target)))
     if not all(cubes):
         raise NoAutomatonError("it printed an automaton without moves from some state")
     diagrams = Diagrams()
     moves = tuple(_node(diagrams, cubes_of_state, 0) for cubes_of_state in cubes)
-    first = cubes[0][0].target
+    initial = cubes[0][0].target
     accepts = {int(number) for number in accepting[1].split()}
-    return machine_of(diagrams, moves, [state in accepts for state in range(states)], moves[first])
+    return machine_of(diagrams, moves, [state in accepts for state in range(state_count)], moves[initial])
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
@@ -579,39 +581,39 @@ class _Joining:
         rows = np.array(self._rows, np.int64).reshape(-1, 3)
         return Machine(np.array(moves, np.int64), rows, accepting, start)
 
-    def _place(self, one: int, other: int) -> int:
-        if one in self._decided[0] or other in self._decided[1]:
+    def _place(self, left: int, right: int) -> int:
+        if left in self._decided[0] or right in self._decided[1]:
             return self._state(-1, -1)
-        if one < 0 and other < 0:
-            return self._state(~one, ~other)
-        place = self._known.get((one, other))
+        if left < 0 and right < 0:
+            return self._state(~left, ~right)
+        place = self._known.get((left, right))
         if place is None:
-            place = self._known[one, other] = self._decision(one, other)
+            place = self._known[left, right] = self._decision(left, right)
             if len(self._known) > MAX_PAIRS:
                 raise NoAutomatonError(f"joining its operands takes more than {MAX_PAIRS} steps")
         return place
 
-    def _decision(self, one: int, other: int) -> int:
-        before, low, high = self._left[one] if one >= 0 else (LEAF, one, one)
-        after, low_other, high_other = self._right[other] if other >= 0 else (LEAF, other, other)
-        if before < after:
-            low_other = high_other = other
-        elif after < before:
-            low = high = one
-        when_false, when_true = self._place(low, low_other), self._place(high, high_other)
+    def _decision(self, left: int, right: int) -> int:
+        left_variable, left_low, left_high = self._left[left] if left >= 0 else (LEAF, left, left)
+        right_variable, right_low, right_high = self._right[right] if right >= 0 else (LEAF, right, right)
+        if left_variable < right_variable:
+            right_low = right_high = right
+        elif right_variable < left_variable:
+            left_low = left_high = left
+        when_false, when_true = self._place(left_low, right_low), self._place(left_high, right_high)
         if when_false == when_true:
             return when_false
-        self._rows.append((min(before, after), when_false, when_true))
+        self._rows.append((min(left_variable, right_variable), when_false, when_true))
         return len(self._rows) - 1
 
-    def _state(self, one: int, other: int) -> int:
+    def _state(self, left: int, right: int) -> int:
         """Return the place of a pair of states; (-1, -1) is any pair with a state that decides the result."""
-        number = self._states.get((one, other))
+        number = self._states.get((left, right))
         if number is None:
-            number = self._states[one, other] = len(self._pairs)
+            number = self._states[left, right] = len(self._pairs)
             if number >= MAX_PRODUCT:
                 raise NoAutomatonError(f"joining its operands takes more than {MAX_PRODUCT} states")
-            self._pairs.append((one, other))
+            self._pairs.append((left, right))
         return ~number
 
 
@@ -851,6 +853,6 @@ def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
         return specification.results[0]
     if name not in specs_by_name:
         hint = nearest_hint(name, specs_by_name)
-        others = f"{f'{hint} ' if hint else ''}there are {', '.join(specs_by_name)}"
-        raise UsageError(f"no spec {name!r} in {specification.filename}; {others}")
+        remedy = f"{f'{hint} ' if hint else ''}there are {', '.join(specs_by_name)}"
+        raise UsageError(f"no spec {name!r} in {specification.filename}; {remedy}")
     return specs_by_name[name]

@@ -120,13 +120,18 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     Args:
         visited: states that are drawn first, with their transitions, if there are too many.
     """
-    first = {automaton.initial, *visited}
-    others = [state for state in automaton.states if state not in first]
-    drawn_states = sorted([*sorted(first), *others][:MOST_STATES])
+    first_states = {automaton.initial, *visited}
+    other_states = [state for state in automaton.states if state not in first_states]
+    drawn_states = sorted([*sorted(first_states), *other_states][:MOST_STATES])
     places = _places(automaton, drawn_states)
     distances = automaton.distances
-    ends = [(source, to) for source in drawn_states for to in automaton.successors[source] if to in places]
-    ends.sort(key=lambda move: move[0] not in first)
+    ends = [
+        (source, target)
+        for source in drawn_states
+        for target in automaton.successors[source]
+        if target in places
+    ]
+    ends.sort(key=lambda pair: pair[0] not in first_states)
     moves = [
         move for move_ends in ends[:MOST_MOVES] if (move := automaton.transition(*move_ends)) is not None
     ]
