@@ -219,10 +219,10 @@ class Judgement:
             is_repeated = row.seed is not None or name != row.log
             if row.is_success is not None and is_repeated:
                 outcomes[name if row.seed is None else (row.task, row.seed)].append(row.is_success)
-        most = min(map(len, outcomes.values()), default=0)
+        fewest_runs = min(map(len, outcomes.values()), default=0)
         return {
             k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes.values())
-            for k in range(2, min(most, _MOST_RUNS) + 1)
+            for k in range(2, min(fewest_runs, _MOST_RUNS) + 1)
         }
 
     @property
@@ -387,16 +387,16 @@ class PreparedJudgement:
         """
         paths = {log.name: log.path for log in self.case.logs}
         batch = _part_of_batch(batch, set(paths))
-        rows_by_log: dict[str, Values] = {}
+        row_by_log: dict[str, Values] = {}
         for row in worst_rows(_rows_of(batch.table, self.spec), len(batch.table)):
             # rows are sorted, so the first one of a template is the worst object
-            rows_by_log.setdefault(row["log"], row)
-        episodes = _episode_names(list(paths))
+            row_by_log.setdefault(row["log"], row)
+        episode_by_log = _episode_names(list(paths))
         rows = tuple(
             _judged_episode(
-                episodes[log],
+                episode_by_log[log],
                 path,
-                rows_by_log[log],
+                row_by_log[log],
                 self.labels.by_path.get(path, SuccessLabel(None)),
                 allow,
             )
@@ -608,8 +608,8 @@ def _first_failures(table: pa.Table, file: str) -> dict[str, _Failure]:
     failures: dict[str, _Failure] = {}
     for row in rows:
         time_ns = row["satisfied_at_ns"]
-        at = None if time_ns is None else (time_ns - row["zero_ns"]) / 1e9
-        failures.setdefault(row["log"], _Failure(row["title"] or row["spec"], at))
+        time_s = None if time_ns is None else (time_ns - row["zero_ns"]) / 1e9
+        failures.setdefault(row["log"], _Failure(row["title"] or row["spec"], time_s))
     return failures
 
 

@@ -87,8 +87,8 @@ def read_labels(
         elif not is_address(log.path) and not log.path.lower().endswith(DATA_SET_ENDINGS):
             # a data set that cannot be opened has no episodes for labels
             folders[Path(log.path).parent] = None
-    near = [folder / name for folder in folders for name in LABEL_FILES]
-    files = [Path(labels or "")] if is_file else [file for file in near if file.is_file()]
+    candidates = [folder / name for folder in folders for name in LABEL_FILES]
+    files = [Path(labels or "")] if is_file else [file for file in candidates if file.is_file()]
     for file in files:
         successes = _labels_of(file, logs)
         if is_file and not successes:

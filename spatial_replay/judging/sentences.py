@@ -86,13 +86,13 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
 
 def failure_lines(judgement: Judgement) -> Iterator[str]:
     """Yield a line per first failure: its name, its number of episodes, and the first of them."""
-    failed = sum(map(len, judgement.failures.values()))
-    yield f"first failures of the {plural(failed, 'episode')} that fail `{judgement.result}`"
+    episode_count = sum(map(len, judgement.failures.values()))
+    yield f"first failures of the {plural(episode_count, 'episode')} that fail `{judgement.result}`"
     names = {name: name or "another failure" for name in judgement.failures}
     width = max(map(len, names.values()), default=0)
     for name, rows in judgement.failures.items():
         episodes = listing([row.episode for row in rows], _MOST_IN_LINE)
-        yield f"  {names[name]:<{width}}  {len(rows):>{len(str(failed))},}  {episodes}"
+        yield f"  {names[name]:<{width}}  {len(rows):>{len(str(episode_count))},}  {episodes}"
 
 
 def stage_lines(judgement: Judgement) -> Iterator[str]:

@@ -99,7 +99,7 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
     place_of_stage = {name: place for place, name in enumerate(names)}
     indices = np.full(len(table), -1, np.int64)
     progress = np.full(len(table), np.nan, np.float32)
-    rows: list[list[dict[str, Any]]] = [[] for _ in times_s]
+    language_rows: list[list[dict[str, Any]]] = [[] for _ in times_s]
     for number in np.unique(episodes).tolist():
         run, places = runs.get(number), np.flatnonzero(episodes == number)
         if run is None or len(run.numbers) != len(places):
@@ -108,14 +108,14 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
         indices[places] = np.array([place_of_stage[stage.name] for stage in run.stages])[run.numbers]
         progress[places] = run.progress
         changes = [0, *(np.flatnonzero(np.diff(run.numbers)) + 1).tolist()]
-        persistent = [_subtask(run[change].name, times_s[places[change]]) for change in changes]
+        run_rows = [_subtask(run[change].name, times_s[places[change]]) for change in changes]
         for place in places.tolist():
-            rows[place] = persistent
+            language_rows[place] = run_rows
     columns = {
         SUBTASK: pa.array(indices),
         PROGRESS: pa.array(progress),
         # the types of lerobot's own annotations
-        LANGUAGE: pa.array(rows, pa.list_(_row_type())),
+        LANGUAGE: pa.array(language_rows, pa.list_(_row_type())),
     }
     # the metadata describes the old columns only
     table = table.drop_columns([name for name in columns if name in table.column_names])
