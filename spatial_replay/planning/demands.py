@@ -6,8 +6,9 @@ between backquotes.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import accumulate
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ _LONGEST: Final = 100
 """Maximum length of a formula, characters."""
 _MOST_RULES: Final = 4
 """Maximum number of listed bans with several literals."""
+_QUOTED: Final = re.compile(r'"(?:[^"\\]|\\.)*"')
+"""A name in quotes."""
 
 
 class Ban(NamedTuple):
@@ -128,14 +131,8 @@ def _without_brackets(text: str) -> str:
 
 def _depths(text: str) -> list[int]:
     """Return the number of open brackets and quotes after each letter; brackets in quotes do not count."""
-    depths, depth, is_quoted = [], 0, False
-    for before, letter in pairwise(f" {text}"):
-        if letter == '"' and before != "\\":
-            is_quoted = not is_quoted
-        elif not is_quoted:
-            depth += {"(": 1, ")": -1}.get(letter, 0)
-        depths.append(depth + is_quoted)
-    return depths
+    letters = _QUOTED.sub(lambda name: f"({' ' * (len(name[0]) - 2)})", text)
+    return list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in letters))
 
 
 def _simplify(

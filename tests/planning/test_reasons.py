@@ -215,3 +215,6 @@ def test_constraints_are_said_as_what_to_keep_and_what_to_avoid():
 def test_names_in_quotes_are_not_taken_apart():
     bans = bans_of(['"salt and pepper" leftof "cup (old)" and not ("a) and (b" ovlp cup)'])
     assert rules_of(bans) == ('`"salt and pepper" leftof "cup (old)"` not before `"a) and (b" ovlp cup`',)
+    # in quotes, a backslash stands for itself only if it is doubled
+    bans = bans_of([r'"C:\\" ovlp cup and not "a \" and b" ovlp cup'])
+    assert rules_of(bans) == (r'`"C:\\" ovlp cup` not before `"a \" and b" ovlp cup`',)
