@@ -664,7 +664,7 @@ def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: b
         yield f"    {_candidate_text(candidate)}"
         yield from rows
     if len(edge.motions) > 1:
-        yield f"    planned   {', then '.join(place_text(motion) for motion in edge.motions)}"
+        yield f"    planned     {', then '.join(place_text(motion) for motion in edge.motions)}"
     if edge.pruned:
         yield f"    given up: {Reason.from_text(edge.pruned).kind}"
 
