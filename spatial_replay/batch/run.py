@@ -185,7 +185,8 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
     Args:
         folder: base of relative paths.
 
-        Raises: UsageError: patterns without a log; all are listed, with their places.
+    Raises:
+        UsageError: patterns without a log; all are listed, with their places.
         RemoteError: a bucket cannot be listed.
     """
     logs_by_path: dict[str, FoundLog] = {}

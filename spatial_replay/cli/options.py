@@ -522,7 +522,8 @@ def refuse_values(options: Mapping[str, object], why: str) -> None:
         options: values by the names of options.
         why: rest of the message, after the name of the option.
 
-        Raises: UsageError: an option has a value.
+    Raises:
+        UsageError: an option has a value.
     """
     for name, value in options.items():
         if value:

@@ -380,7 +380,8 @@ def verify_certificate(
         advance: called with the number of samples of each block that is done.
         explain: find the first differences, which takes another evaluation.
 
-        Raises: UsageError, LogError, SpecificationError: the log cannot be evaluated.
+    Raises:
+        UsageError, LogError, SpecificationError: the log cannot be evaluated.
     """
     metadata = dict(log.metadata())
     recorded, about = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
