@@ -64,7 +64,7 @@ def is_latched(qos: str) -> bool:
 
 
 _MOST_FILES = 1_000
-"""Most files in a descriptor set."""
+"""Maximum number of files in a descriptor set."""
 
 _WELL_KNOWN = (any_pb2, duration_pb2, empty_pb2, field_mask_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
 """Modules of well-known types, which do not import each other."""

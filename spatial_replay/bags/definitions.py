@@ -23,9 +23,9 @@ LONGEST_TEXT = 2**18
 MOST_TYPES = 1_000
 MOST_FIELDS = 4_000
 MOST_VALUES = 4_000
-"""Most values that a definition requires in every message; each value becomes lines of generated code."""
+"""Maximum number of values that a definition requires; each value becomes lines of generated code."""
 MOST_VALUES_IN_ALL = 12_000
-"""Most values of a type and of all types that it uses."""
+"""Maximum number of values of a type and of all types that it uses."""
 
 BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("bool", "byte", "char", "octet", "int8", "uint8"), 1),

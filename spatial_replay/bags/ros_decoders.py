@@ -39,7 +39,7 @@ _DISTRIBUTIONS = ("jazzy", "kilted", "lyrical", "iron", "humble", "galactic", "f
 # parameter lists and XCDR 2 have other identifiers and another layout
 _PLAIN = (b"\x00\x01", b"\x00\x00")
 _MOST_AROUND = 7
-"""Most bytes of a message outside its fields: a head of four bytes, and up to three bytes of padding."""
+"""Maximum size of a message outside its fields: a head of four bytes, and up to three bytes of padding."""
 _LONGEST_IDL = 2**17
 _MOST_ANNOTATIONS = 500
 _IDL_ASIDE = re.compile(r'"(?:\\"|[^"])*"|\'(?:[^\'\\\n]|\\.)*\'|//[^\n]*|/\*.*?\*/', re.DOTALL)

@@ -262,11 +262,11 @@ _MOST_TOPICS = 100_000
 _STEPS = 10_000
 """Steps of SQLite's virtual machine between two checks of the limit."""
 _STEPS_A_BYTE = 20
-"""Most steps for each byte of a file; the limit is needed since pages of a damaged file can form a cycle."""
+"""Maximum number of steps for each byte of a file, because pages of a damaged file can form a cycle."""
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000
-"""Most parts of a damaged table that are tried; the other parts count as lost."""
+"""Maximum number of tried parts of a damaged table; the other parts count as lost."""
 
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.formats.episodes import DataSet, EpisodeColumns, EpisodeReading, Feature
 
 _MOST_LABELS: Final = 1_000
-"""Episodes whose labels are counted, at most."""
+"""Maximum number of episodes whose labels are counted."""
 _MOST_TASKS: Final = 5
 _MOST_NAMED: Final = 5
 """Episodes that a warning names."""
@@ -250,7 +250,7 @@ def _label_text(data_set: DataSet, columns: EpisodeColumns) -> str:
 
 
 def _ranges(feature: Feature, columns: EpisodeColumns) -> Iterator[dict[str, Any]]:
-    """Yield the first, least and greatest number of each place of a feature; null for none."""
+    """Yield the first, least and greatest number in each place of a feature; null if no number is finite."""
     if feature.name not in columns.features:
         return
     rows = columns.features[feature.name].reshape(len(columns.times_ns), -1)

@@ -103,7 +103,7 @@ _KINDS: Final[Mapping[str, DeclarationKind]] = MappingProxyType(
     }
 )
 _MOST_CHANGES: Final = 32
-"""Most declarations that edits are traced to; texts with more differences are hardly versions of one text."""
+"""Maximum number of declarations that edits are traced to; more differences mean unrelated texts."""
 
 
 class TextPlace(NamedTuple):

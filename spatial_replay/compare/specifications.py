@@ -48,7 +48,7 @@ from spatial_replay.text import (
 from spatial_replay.trace.trace import Trace
 
 _MOST_EVALUATIONS: Final = 256
-"""Most formulas that are evaluated for the cause of one change; then the cause found so far is returned."""
+"""Maximum number of formulas evaluated for one cause; at the limit, the cause so far is returned."""
 
 
 class EditOutcome(NamedTuple):
@@ -319,7 +319,7 @@ class SpecDiff(Displayed):
 
 
 _MOST_LISTED: Final = 8
-"""Most edits without effect in the text; JSON lists all."""
+"""Maximum number of edits without effect in the text; JSON lists all."""
 
 
 def outcome_text(result: SpecResult) -> str:

@@ -51,7 +51,7 @@ from spatial_replay.trace.trace import Sample
 from spatial_replay.version import __version__
 
 _MOST_FAILURES: Final = 20
-"""Most failures in the text; JSON lists all."""
+"""Maximum number of failures in the text; JSON lists all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -717,7 +717,7 @@ FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
-"""Most times that a value is moved half way to rest, if the failure needs a value other than rest."""
+"""Maximum number of moves of a value half way to rest, if the failure needs a value other than rest."""
 _BARREN: Final = 50
 """Rounds without a new case after which the search ends."""
 _DRAWN: Final = 10

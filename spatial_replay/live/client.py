@@ -32,16 +32,16 @@ LARGEST_FRAME: Final = 64 * 2**20
 
 MOST_WAITING: Final = 8_192
 MOST_WAITING_BYTES: Final = 64 * 2**20
-"""Most messages, and most bytes, that wait for evaluation; beyond that, the oldest are dropped."""
+"""Maximum number of messages, and of bytes, that wait for evaluation; the oldest are dropped first."""
 
 MOST_WARNINGS: Final = 1_000
-"""Most warnings of a server that are shown in one run."""
+"""Maximum number of shown warnings of a server in one run."""
 
 _MOST_CHANNELS: Final = 100_000
 _MOST_DEFINITION_BYTES: Final = 64 * 2**20
-"""Most bytes of the definitions of all channels."""
+"""Maximum number of bytes of the definitions of all channels."""
 _FRAMES: Final = 4
-"""Most frames of up to `LARGEST_FRAME` bytes that wait to be decoded."""
+"""Maximum number of frames of up to `LARGEST_FRAME` bytes that wait to be decoded."""
 _LONGEST_TURN_S: Final = 0.02
 _OPEN_S: Final = 10.0
 _ALIVE_S: Final = 10.0

@@ -795,7 +795,7 @@ class LiveSession:
 
 
 _WAITING = 65_536
-"""Most samples, and most messages, that wait for a recorder, because a robot does not wait for a disk."""
+"""Maximum number of waiting samples, and of waiting messages: a robot does not wait for a disk."""
 
 
 class _RunRecorder(Recorder):

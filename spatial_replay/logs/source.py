@@ -21,7 +21,7 @@ from spatial_replay.trace.track_evidence import TrackEvidence
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 BLOCK_SAMPLES = 12_288
-"""Most samples of a block; the limit bounds memory for logs of any length."""
+"""Maximum number of samples of a block; the limit bounds memory for logs of any length."""
 
 
 SAMPLES_A_GAP: Final = 10

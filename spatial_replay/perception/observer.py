@@ -27,7 +27,7 @@ from spatial_replay.text import listing, plural
 from spatial_replay.trace.trace import Sample
 
 _STEP: Final = 1e-3
-"""Step of corners for derivatives, pixels."""
+"""Step of corners in numerical derivatives, pixels."""
 
 _SIZE_TOLERANCE: Final = 0.02
 """Relative error of a tag's stated size, which is allowed in addition to noise."""
@@ -336,7 +336,7 @@ def camera_names(cameras: Sequence[Any]) -> list[str]:
 # ------------------------------------------------------------------------------------------------- one camera
 
 _MOST_AVERAGED: Final = 30
-"""Most detections of a reference tag that are averaged."""
+"""Maximum number of detections of a reference tag that are averaged."""
 
 _MOST_NAMED: Final = 8
 

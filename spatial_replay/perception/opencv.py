@@ -24,7 +24,7 @@ Image = NDArray[np.uint8]
 """(height, width) grey or (height, width, 3) blue, green, red."""
 
 LARGEST_PICTURE: Final = 64_000_000
-"""Most pixels of one image; no camera has more, but a damaged header may claim more."""
+"""Maximum number of pixels of one image; no camera has more, but a damaged header may claim more."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}

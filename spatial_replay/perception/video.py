@@ -39,7 +39,7 @@ _HARMLESS: Final = "SEI"
 """Prefix of FFmpeg's messages about malformed SEI units, which are harmless."""
 
 _MOST_WAITING: Final = 32
-"""Most packets that wait for their frames; codecs delay a frame by at most 16 packets."""
+"""Maximum number of packets that wait for their frames; codecs delay a frame by at most 16 packets."""
 
 _TURN = threading.Lock()
 """Lock for decoding, because FFmpeg has one log level for all threads."""
@@ -311,7 +311,7 @@ _KEY_FRAMES: Final = 30
 _NS: Final = Fraction(1, 10**9)
 _TICK: Final = Fraction(1, 90_000)
 _MOST_BOXES: Final = 1000
-"""Most boxes of an .mp4 that are searched for its index."""
+"""Maximum number of boxes of an .mp4 that are searched for its index."""
 
 
 class VideoFile:

@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 
 
 _MOST_DIGITS = 18
-"""Digits of a valid count in the metadata of a log, at most."""
+"""Maximum number of digits of a valid count in the metadata of a log."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Limits of the samples kept in memory for explanations, bytes: per result and in total."""
 _SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
@@ -288,7 +288,7 @@ class LogAccount:
         )
 
     def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
-        """Return the departures of all specifications by time, each once."""
+        """Return the distinct departures of objects in all specifications, sorted by time."""
         by_start = {
             (departure.start_ns, departure.name): departure
             for departures in self._departures

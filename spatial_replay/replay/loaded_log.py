@@ -434,7 +434,7 @@ class LoadedLog:
 
 
 _MOST_NAMED: Final = 5
-"""Results and constants that a summary names, at most."""
+"""Maximum number of results, and of constants, that a summary names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -594,10 +594,10 @@ _LOOK_BACK_NS: Final = 2_000_000_000
 """Time before a seek that is searched for the latest message of each topic, nanoseconds."""
 
 _MOST_EVENTS: Final = 500
-"""Earlier events that a seek sends, at most."""
+"""Maximum number of earlier events that a seek sends."""
 
 _MOST_CHANGES: Final = 100
-"""Earlier changes of verdicts that a seek sends, at most."""
+"""Maximum number of earlier changes of verdicts that a seek sends."""
 
 
 class Playback:

@@ -69,7 +69,7 @@ from spatial_replay.trace.trace import Sample, Trace
 # ------------------------------------------------------------------------------------------------------- sums
 
 MAX_INEQUALITIES: Final = 64
-"""Most inequalities of one relation; a relation with more is an opaque proposition."""
+"""Maximum number of inequalities of one relation; a relation with more is an opaque proposition."""
 
 Quantity: TypeAlias = Measurement | Signal
 Weights: TypeAlias = tuple[tuple[Quantity, Fraction], ...]
@@ -327,7 +327,7 @@ def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
 # ------------------------------------------------------------------------------------------------- conditions
 
 MAX_DECISIONS: Final = 200_000
-"""Most nodes in the diagrams of conditions."""
+"""Maximum number of nodes in the diagrams of conditions."""
 
 
 class Fact(NamedTuple):

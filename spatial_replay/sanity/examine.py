@@ -44,13 +44,13 @@ from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, oth
 from spatial_replay.text import json_fields, named_arguments, number_text, plural, shortened_formula
 
 MAX_PAIRS: Final = 300
-"""Most compared pairs of specs."""
+"""Maximum number of compared pairs of specs."""
 
 MAX_ANTECEDENTS: Final = 40
-"""Most examined antecedents of one spec."""
+"""Maximum number of examined antecedents of one spec."""
 
 _SHOWN: Final = 3
-"""Most exclusions in one sentence."""
+"""Maximum number of exclusions in one sentence."""
 
 Kind: TypeAlias = Literal["unsatisfiable", "always true", "idle antecedent", "implied", "contradiction"]
 

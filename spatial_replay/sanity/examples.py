@@ -90,10 +90,10 @@ def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
 # -------------------------------------------------------------------------------------------------- placement
 
 MAX_SOLUTIONS: Final = 300
-"""Most systems of inequalities that one placement solves."""
+"""Maximum number of systems of inequalities that one placement solves."""
 
 MAX_TURNED: Final = 5
-"""Most objects with an orientation; each has four candidate yaws, and all combinations are tried."""
+"""Maximum number of objects with an orientation; all combinations of their four candidate yaws are tried."""
 
 _TOLERANCE: Final = 1e-9
 """Tolerance of bounds."""
@@ -480,10 +480,10 @@ def _round(value: float) -> float:
 # --------------------------------------------------------------------------------------------------- examples
 
 MAX_SAMPLES: Final = 40
-"""Most samples of a placed run; longer runs are shown only in words."""
+"""Maximum number of samples of a placed run; longer runs are shown only in words."""
 
 MAX_WORDS: Final = 20
-"""Most runs of one length whose placement is tried."""
+"""Maximum number of runs of one length whose placement is tried."""
 
 _SECOND_NS: Final = 10**9
 _TENTH_NS: Final = 10**8

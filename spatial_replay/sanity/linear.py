@@ -22,7 +22,7 @@ Coefficients: TypeAlias = tuple[tuple[Hashable, Real], ...]
 _Pair: TypeAlias = tuple[Real, Real]
 
 MAX_PIVOTS: Final = 4000
-"""Most pivots of one search."""
+"""Maximum number of pivots of one search."""
 
 _TOLERANCE: Final = 1e-9
 """Tolerance of bounds for floats."""

@@ -40,10 +40,10 @@ Cube: TypeAlias = dict[int, bool]
 """Required values of facts in one sample, by number of the fact."""
 
 MAX_NODES: Final = 100_000
-"""Most nodes in the diagrams of runs of one length."""
+"""Maximum number of nodes in the diagrams of runs of one length."""
 
 MAX_CONFLICTS_OF_A_LENGTH: Final = 400
-"""Most combinations of facts that geometry excludes before a length is given up."""
+"""Maximum number of combinations of facts that geometry excludes before a length is given up."""
 
 
 class TooManyConflictsError(Exception):
@@ -262,20 +262,20 @@ Word: TypeAlias = tuple[Cube, ...]
 """Requirements on each sample of a run; other facts do not change the outcome."""
 
 MAX_STEPS: Final = 100_000
-"""Most steps of one question; a step is a visited decision of a diagram."""
+"""Maximum number of steps of one question; a step is a visited decision of a diagram."""
 
 MAX_ALL_STEPS: Final = 400_000
-"""Most steps of all questions about one specification."""
+"""Maximum number of steps of all questions about one specification."""
 
 _STEPS_OF_GEOMETRY: Final = 50
 """Steps that one check of geometry counts as."""
 
 MAX_CONFLICTS: Final = 2000
-"""Most combinations of facts that geometry excludes before a question is given up."""
+"""Maximum number of combinations of facts that geometry excludes before a question is given up."""
 
 
 MAX_LENGTHS: Final = 4
-"""Most lengths that are tried without a product, from the least possible length on."""
+"""Maximum number of lengths that are tried without a product, from the least possible length on."""
 
 MAX_SHORT: Final = 12
 """Longest run that is searched for without a product, samples."""
@@ -284,7 +284,7 @@ _ON_ONE_LEVEL: Final = "no gap in height"
 """Text that is added to an exclusion that does not hold for objects above each other."""
 
 MAX_PAIRS: Final = 200
-"""Most pairs of automata that are tested for excluding each other."""
+"""Maximum number of pairs of automata that are tested for excluding each other."""
 
 Runs: TypeAlias = tuple[tuple[Side, ...], ...]
 """Alternatives: the runs that have the outcomes of all sides of at least one alternative."""

@@ -56,7 +56,7 @@ from spatial_replay.text import is_text_number, names_from_unit, text_number
 
 _NO_CHOICE: Mapping[str, str] = MappingProxyType({})
 _LISTED = 12
-"""Most names that a hint lists."""
+"""Maximum number of names that a hint lists."""
 _R2U2_SIGNS = frozenset({"&&", "||"})
 _TIGHTNESS = MappingProxyType({"IFF": 0, "IMPLIES": 1, "OR": 2, "XOR": 3, "AND": 4})
 """Precedence of binary operators; the highest binds most tightly."""

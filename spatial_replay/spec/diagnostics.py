@@ -13,10 +13,10 @@ from spatial_replay.text import escape_text
 from spatial_replay.text import nearest_hint as nearest_hint
 
 MAX_FAULTS = 100
-"""Most faults in one report; further faults are only counted."""
+"""Maximum number of faults in one report; further faults are only counted."""
 
 _MAX_SUGGESTION_EFFORT = 10_000
-"""Most name comparisons for the hints of one text; faults in every line would otherwise need millions."""
+"""Maximum number of name comparisons for the hints of one text, which might otherwise need millions."""
 # not str.splitlines, which also splits at form feeds and Unicode line separators
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
@@ -63,7 +63,7 @@ class Diagnostic:
 
 
 _SHOWN = 200
-"""Most characters of a source line in a message; a longer line is cut around the fault."""
+"""Maximum number of characters of a source line in a message; a longer line is cut around the fault."""
 _SHOWN_BEFORE = 100
 """Characters before the fault in a cut line."""
 

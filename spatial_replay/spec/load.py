@@ -674,7 +674,7 @@ class Elaborator:
 
 
 MAX_LENGTH = 256 * 1024
-"""Most characters of a text."""
+"""Maximum number of characters of a text."""
 
 _MAX_WARNINGS = 100
 _RELATION_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")

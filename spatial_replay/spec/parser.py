@@ -67,10 +67,10 @@ from spatial_replay.spec.tokens import (
 )
 
 MAX_DEPTH = 100
-"""Most nested brackets or operators."""
+"""Maximum number of nested brackets or operators."""
 
 MAX_EXCLUDED = 1000
-"""Most objects after `except` in one term."""
+"""Maximum number of objects after `except` in one term."""
 
 MAX_DURATION_NS = 2**63 - 1
 """Longest duration, ns: times in logs are signed 64-bit integers."""

@@ -413,7 +413,7 @@ MAX_SAMPLES = 2**53
 """Largest number of samples; all integers up to 2**53 are exact as floating-point numbers."""
 
 MAX_SIZE = 20_000
-"""Most operators, atoms and terms of one text after expansion of macros, quantifiers and named specs."""
+"""Maximum number of operators, atoms and terms of one text, with macros, quantifiers and specs expanded."""
 
 
 @dataclass(frozen=True, slots=True)

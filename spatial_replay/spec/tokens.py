@@ -668,7 +668,7 @@ def span_of(token: Token) -> Span:
 
 
 MAX_TOKENS = 40_000
-"""Most words, numbers and signs of a text."""
+"""Maximum number of words, numbers and signs of a text."""
 
 
 def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token]:

@@ -51,7 +51,7 @@ _LESS: Final = 0.5
 _NEVER: Final = 0.3
 """Weight of a bad run in an order whose first event never happens; a line about the end says more."""
 _DISTANCES: Final = 2
-"""Most distances from landmarks for one object; two distances leave two possible places in the plane."""
+"""Maximum number of distances from landmarks for one object; two leave two possible places in the plane."""
 _LEAST_BITS_PLACED: Final = 2.0
 """Least information of a distance from the nearest landmark and of an object inside a landmark, bits."""
 _SHARE_OF_ALWAYS: Final = 1 / 3
@@ -376,7 +376,7 @@ def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
 MOST_LINES: Final = 100
 DEFAULT_LINES: Final = 20
 _MOST_MISSED: Final = 10
-"""Most missed bad runs in the text; JSON lists all."""
+"""Maximum number of missed bad runs in the text; JSON lists all."""
 _FOLDS: Final = 10
 _FEWEST_SAMPLES: Final = 3
 _MOST_NAMED: Final = 3

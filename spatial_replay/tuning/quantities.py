@@ -36,7 +36,7 @@ MOST_PAIRS: Final = 400
 MOST_MEMBERS: Final = 30
 """Limits of the comparison: objects, pairs of objects, members of a class."""
 MOST_MEASURED: Final = 1 << 26
-"""Most measurements, pairs times samples; two pairs are always measured."""
+"""Maximum number of measurements, pairs times samples; two pairs are always measured."""
 MOST_SIGNALS: Final = 50
 _SAMPLED: Final = 33
 """Samples of the first run that order the pairs: those that come nearest are measured first."""
@@ -240,7 +240,7 @@ def _atom(relation: str, a: TrackedName | Variable, b: TrackedName | Variable, p
 # ---------------------------------------------------------------------------------------------------- one run
 
 _AT_ONCE: Final = 1 << 22
-"""Most numbers of a run in memory at once."""
+"""Maximum count of a run's numbers in memory at once."""
 _SAMPLED_OF_A_RUN: Final = 64
 """Samples of a run that estimate how often a relation holds."""
 

@@ -108,13 +108,13 @@ def evolve(
 
 
 _MOST_EVALUATIONS: Final = 8_000
-"""Most evaluations of runs for one decision or one widest margin; beyond them it is undecided."""
+"""Maximum number of evaluations of runs for one decision or margin; beyond it, the result is undecided."""
 _MOST_BOXES: Final = 2_000
-"""Most boxes for one margin; neighbouring boxes share cached evaluations."""
+"""Maximum number of boxes for one margin; neighbouring boxes share cached evaluations."""
 _LEVELS, _PRECISION = 40, 1e-3
-"""Most margins that are tried for the widest one, and relative precision of the widest margin."""
+"""Maximum number of margins tried for the widest one, and relative precision of the widest margin."""
 _CONTRACTION: Final = 4
-"""Most bisections of one side of a box in one contraction."""
+"""Maximum number of bisections of one side of a box in one contraction."""
 
 
 class Feasibility(NamedTuple):
@@ -289,9 +289,9 @@ def _with(numbers: Sequence[int], axes: Sequence[int], number: int) -> list[int]
 _PARTS: Final = 1 << 20
 """Steps in which all constants are tightened together."""
 _ROUNDS: Final = 6
-"""Most rounds of adding runs to the deciding runs."""
+"""Maximum number of rounds of adding runs to the deciding runs."""
 _MOST_LINES, _SECANTS = 64, 24
-"""Most lines of the grid in a complete search, and most steps on one line."""
+"""Maximum number of lines of the grid in a complete search, and of steps on one line."""
 _FAR: Final = 1e12
 """Substitute for an infinite margin."""
 
@@ -650,7 +650,7 @@ MOST_SAMPLES: Final = 1 << 25
 """Limits of memory: runs, and samples of all runs."""
 MOST_CONSTANTS: Final = 10
 _MOST_NAMED: Final = 5
-"""Most conflicting runs in one sentence."""
+"""Maximum number of conflicting runs in one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -664,8 +664,8 @@ class TunedConstant:
         tried: tried range.
         step: least difference of two values; seconds for a duration.
         direction: 1 if greater values are looser, -1 if they are tighter, None if unknown.
-        is_decided: whether runs decide the value. If not, no bad run limits looser values, and the constant
-            keeps the written value or the nearest value that fits.
+        is_decided: whether runs decide the value. An undecided value may be loosened without admitting a
+            bad run: it is the written value, or the nearest value that fits.
     """
 
     name: str

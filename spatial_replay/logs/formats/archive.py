@@ -29,7 +29,7 @@ _LARGEST_ATTRIBUTE: Final = 2**24
 _DEEPEST: Final = 12
 """Deepest nesting of groups, and longest chain of soft links."""
 _WIDEST: Final = 4096
-"""Most numbers per frame; more numbers are an image."""
+"""Maximum width of a feature per frame, in numbers; a wider one is an image."""
 _COPY: Final = "copy its data into the file"
 
 

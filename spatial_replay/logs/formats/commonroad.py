@@ -24,7 +24,7 @@ from spatial_replay.trace.trace import LATEST_NS, Trace
 LARGEST_FILE = 512 * 2**20
 """Largest file, decompressed, bytes."""
 MOST_ELEMENTS = 500_000
-"""Most elements inside one obstacle."""
+"""Maximum number of elements inside one obstacle."""
 DEEPEST = 64
 LONGEST_TEXT = 4096
 _PIECE = 2**16
@@ -172,7 +172,7 @@ ReportFault = Callable[[int, str], None]
 """Receiver of faults: (line, text)."""
 
 _LONGEST_STEP = 15
-"""Most digits of a time step."""
+"""Maximum number of digits of a time step."""
 _LONGEST_INTERVAL = 100_000
 """Longest interval, time steps."""
 _SHAPES = "<rectangle>, <circle> or <polygon>"

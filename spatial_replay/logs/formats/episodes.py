@@ -318,7 +318,7 @@ class DataSet:
 
 
 MOST_BYTES: Final = 8 * 2**30
-"""Most bytes of numbers that are read at once, uncompressed."""
+"""Maximum number of bytes of numbers that are read at once, uncompressed."""
 SECOND_RUN: Final = "more than one run is in the episode, so it is not judged; record each run as an episode"
 
 

@@ -30,7 +30,7 @@ LARGEST_ASSET: Final = 2**27
 DEEPEST: Final = 200
 """Deepest nesting of elements."""
 MOST_COPIES: Final = 10_000
-"""Most copies of elements that a model may generate by `count`."""
+"""Maximum number of copies of elements that a model may generate by `count`."""
 RIM_CORNERS: Final = 32
 """Number of corners of each rim of a tilted cylinder."""
 ELLIPSE_CORNERS: Final = 64

@@ -127,7 +127,7 @@ _SIZE_BYTES = 8
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Channel and offset of a message index; the offset is not read."""
 _LOOSE_BYTES = 2**22
-"""Most bytes of messages outside chunks that are read together; single messages would take a seek each."""
+"""Maximum number of bytes of messages outside chunks in one read; single messages would take a seek each."""
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
 """Read size of a search for the next chunk, bytes."""

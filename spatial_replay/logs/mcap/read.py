@@ -73,7 +73,7 @@ ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 _ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
 """Limits of messages that wait for earlier chunks: bytes, and multiple of the log; the larger one counts."""
 _AHEAD_BYTES: Final = 2**24
-"""Most decompressed bytes of chunks that are read ahead, if these are more than one chunk per core."""
+"""Maximum decompressed bytes of chunks read ahead, if these are more than one chunk per core."""
 BLOCK_BYTES = 64 * 2**20
 """Size of messages at which a block is closed, bytes."""
 AFTER_ALL_NS = 2**64

@@ -45,7 +45,7 @@ REPEAT_NS = 5 * 10**9
 Declarations in every chunk would add 15 % to an annotated log; these add up to 5 %.
 """
 WAITING_BYTES = 64 * 2**20
-"""Most bytes of chunks that wait for compression; images and point clouds make large chunks."""
+"""Maximum bytes of chunks that wait for compression; images and point clouds make large chunks."""
 _PART_BYTES: Final = 4 * 2**20
 """Size of messages that are laid out as records at once, bytes."""
 COMPRESSION_LEVEL: Final = 1
