@@ -240,7 +240,7 @@ class Skeleton:
         if id(formula) in self._written:
             self._operator = formula
         formula = expand(formula)
-        # an expansion belongs to its formula, so its id stays valid
+        # the formula keeps its expansion in memory, so the id of the expansion stays valid
         key = (id(formula), positive)
         if key not in self._known:
             self._known[key] = self._build(formula, positive)

@@ -623,7 +623,7 @@ def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
-    """Return the conditions that rows depend on, without constants: the meaning has their values."""
+    """Return the conditions that rows depend on. Values of constants are part of the meaning instead."""
     mapping = conditions.mapping
     return [
         None if mapping is None else load_mapping(mapping).identity,

@@ -73,9 +73,9 @@ def falsify(
     """Search for runs of a simulated world that violate a specification.
 
     An optimiser varies noise, mishaps and starts, with the robustness of each run as its cost. Each violating
-    run is a log in DIR/runs. DIR/smaller has it with as few changes as possible, and DIR/clips the shortest
-    part that shows the violation. Equal options give equal files, with any number of jobs. Needs the extras
-    `sim` and `falsify`.
+    run is a log in DIR/runs. DIR/smaller has the violating runs with as few changes as possible, and
+    DIR/clips the shortest parts that show the violations. Equal options give equal files, with any number of
+    jobs. Needs the extras `sim` and `falsify`.
 
     Exits with 1 if a run violates, 4 if none does and any is unknown, 0 if none was found.
 

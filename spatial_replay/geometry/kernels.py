@@ -270,7 +270,7 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
 
 @reference_free
 def _part_protrusion(rows: Rows, a: int, p: int, b: int, enlargement: float) -> float:
-    """Return the protrusion of part p of row a from row b: the least over b's parts."""
+    """Return the least protrusion of part p of row a from the parts of row b."""
     start, radius = rows.vertex_start, rows.radius
     least = np.inf
     for q in range(rows.part_start[b], rows.part_start[b + 1]):

@@ -68,7 +68,9 @@ def e_value(won: int, lost: int) -> float:
 
 
 def more_pairs(won: int, lost: int, pairs: int) -> int | None:
-    """Return the number of further pairs that decide with 80 % probability, at the same shares.
+    """Return the number of further pairs for a significant difference with 80 % probability.
+
+    The shares of won and lost pairs are assumed to stay the same.
 
     None if neither side is ahead, or no number up to 100,000 suffices.
     """

@@ -386,7 +386,7 @@ class RemoteFile(PathLike[str]):
         """Request the version without the content; return `version` if the server refuses that.
 
         Raises:
-            MissingFileError, RemoteError: it cannot be read.
+            MissingFileError, RemoteError: the file cannot be read.
         """
         try:
             return self._version_of(self._get({"head": True}).meta)
@@ -532,7 +532,7 @@ def open_file(file: LogFile) -> BinaryIO:
 
 
 def file_size(file: LogFile) -> int:
-    """Return its size in bytes."""
+    """Return the size of a log's file in bytes."""
     return file.size if isinstance(file, RemoteFile) else file.stat().st_size
 
 
@@ -540,7 +540,7 @@ def obstore_library() -> Any:
     """Return obstore.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: obstore is not installed.
     """
     with importing("addresses need obstore", extra="remote"):
         import obstore
@@ -636,7 +636,7 @@ def local_copy(path: str | PathLike[str]) -> Path:
     Raises:
         UsageError: an address that names no file, or obstore is not installed.
         LogError: the file exceeds the limit of all copies.
-        MissingFileError, RemoteError: it cannot be read.
+        MissingFileError, RemoteError: the file cannot be read.
         OutputError: the copy cannot be written.
     """
     file = log_file(path)
@@ -653,7 +653,7 @@ def download(file: RemoteFile, reason: str = "") -> Path:
 
     Raises:
         LogError: the file exceeds the limit of all copies.
-        MissingFileError, RemoteError: it cannot be read.
+        MissingFileError, RemoteError: the file cannot be read.
         OutputError: the copy cannot be written.
     """
     return download_files([file], str(file), reason) / _name(file)

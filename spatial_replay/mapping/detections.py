@@ -364,7 +364,8 @@ class Detections:
         solids: solids of the objects.
         height: (R, 2) bottom and top above each object's origin; None for the heights of the solids.
         uncertainty: (R,) radius.
-        covariance: (R, 3, 3) covariance of each position, times the squared number of deviations, or None.
+        covariance: (R, 3, 3) covariance of each position, times the square of the number of standard
+            deviations; or None.
         lifetime_ns: (R,), 0 for no limit; None if the topic has no lifetimes.
         is_locked: (R,) whether an object moves with its frame; None if no object does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.

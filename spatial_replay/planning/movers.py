@@ -201,7 +201,7 @@ class MotionTimes:
         self._newest, self._stood = 0.0, 0
 
     def observe(self, length: float, least: float) -> None:
-        """Add the distance that the object moved between two samples; up to `least` it counts as standing."""
+        """Add the distance that the object moved between two samples; a distance up to `least` is a stand."""
         if length <= least:
             self._newest = 0.0
             self._stood += 1

@@ -195,8 +195,8 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
     """Return the sorted indices of at most `most` samples that represent a run.
 
     First come evenly spaced samples, a quarter of `most`, and the first and the last sample of each curve.
-    Samples around changes of sign follow, up to five eighths of `most`, and then the extrema of each curve
-    within equal stretches. If the limit cuts a group, its samples are thinned evenly.
+    Samples around changes of sign follow, up to five eighths of `most`. The extrema of each curve in equal
+    stretches come last. If the limit cuts a group, its samples are thinned evenly.
 
     Args:
         times_ns: (T,) int64, times of all samples.

@@ -780,7 +780,7 @@ def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
 
 
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
-    """Yield the maps of a decision. If the log does not record their owners, yield the maps of its time."""
+    """Yield the maps of a decision, or the maps of its time if the log does not record the owners of maps."""
     owners = {
         named.number: _Owner(edge, place, candidate, named.turn)
         for edge, considered in enumerate(decision.considered)

@@ -420,9 +420,12 @@ class LeafCode:
         return row
 
     def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
-        """Return the row of an expansion, given the rows of the original operands, by `id`.
+        """Return the row of an expansion.
 
         An expansion repeats operands; to compile each repetition would take 2**depth steps.
+
+        Args:
+            rows: rows of the original operands, by the `id` of the operand.
         """
         if id(formula) in rows:
             return rows[id(formula)]

@@ -277,7 +277,7 @@ class TraceScene:
         return self._reports[source]
 
     def _step(self, terms: tuple[TrackedName | Variable | Group, ...]) -> Floats:
-        """Return the shortest time between two reports of terms in seconds, (T,) of the whole trace."""
+        """Return the shortest time between the last two reports of a term at each sample, (T,), seconds."""
         if terms not in self._steps:
             shortest = np.full(len(self.trace), np.inf)
             for term in terms:
