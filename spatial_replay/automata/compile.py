@@ -489,7 +489,7 @@ def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
         propositions: number of propositions.
 
     Raises:
-        NoAutomatonError: it would take more states or decisions than are explored.
+        NoAutomatonError: the machine exceeds the limit of explored states or decisions.
     """
     return _Composition(skeleton, propositions).machine(skeleton.root)
 
@@ -814,7 +814,7 @@ def _compose_least(shape: _Shape) -> Machine:
     """Return the least machine of a shape, by this package.
 
     Raises:
-        NoAutomatonError: it would take more states or decisions than are explored.
+        NoAutomatonError: the machine exceeds the limit of explored states or decisions.
     """
     return least(machine_by_composition(shape.skeleton, shape.propositions))
 
@@ -831,7 +831,7 @@ def _check_size(automaton: Automaton) -> Automaton:
     """Return the automaton, unless it has too many states or decisions.
 
     Raises:
-        NoAutomatonError: it has more than `MAX_ROWS`.
+        NoAutomatonError: the automaton has more than `MAX_ROWS` states or decisions.
     """
     rows = max(len(automaton.entries), len(automaton.decisions))
     if rows > MAX_ROWS:

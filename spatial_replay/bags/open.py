@@ -432,7 +432,7 @@ def open_messages(path: LogFile) -> MessageReader:
 
     Raises:
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: it is not a log of messages.
+        LogError: the file or folder is not a log of messages.
     """
     head = _head(path)
     if head is None and isinstance(path, Path):

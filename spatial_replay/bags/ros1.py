@@ -100,7 +100,7 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
     """Decompress the records of a chunk.
 
     Raises:
-        DamageError: it does not decompress to `size` bytes.
+        DamageError: the records do not decompress to `size` bytes.
     """
     most = max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data))
     if size > LARGEST_CHUNK or (compression != b"none" and size > most):

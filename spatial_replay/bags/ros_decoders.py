@@ -96,7 +96,7 @@ def ros_decoder(
     """Return a decoder for the messages of a type.
 
     Raises:
-        LogError: its definition is missing or invalid.
+        LogError: the definition of the type is missing or invalid.
     """
     choices = ros_definitions(type_name, encoding, schema, distribution)
     decoders = [_decoder(type_name, encoding, definitions) for definitions in choices]
@@ -289,7 +289,7 @@ def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | N
     """Return the definition of a standard type, for a copy of a log that has none.
 
     Raises:
-        LogError: it is not a standard type.
+        LogError: the type is not a standard type.
     """
     definitions = ros_definitions(type_name, encoding, None, distribution)[0]
     text = msg_from_definitions(definitions, type_name).encode()

@@ -65,7 +65,7 @@ def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
     """Parse the first `LARGEST_METADATA` + 1 bytes of a metadata.yaml; a longer file is refused.
 
     Raises:
-        LogError: it is not YAML, or does not describe a bag.
+        LogError: the file is not YAML, or does not describe a bag.
     """
     try:
         document = _plain(data.decode())
@@ -245,7 +245,7 @@ def decompress_message(payload: bytes) -> bytes:
     """Decompress a single message.
 
     Raises:
-        LogError: it does not decompress, or exceeds the limits of a chunk of an MCAP log.
+        LogError: the message does not decompress, or exceeds the limits of a chunk of an MCAP log.
     """
     try:
         size = zstandard.frame_content_size(payload)

@@ -67,7 +67,7 @@ def open_output(output: Path, durability: Durability = "process", *, overwrite: 
 
     Raises:
         UsageError: an unknown durability, or a file that must not be overwritten.
-        OutputError: it cannot be written, or is open for writing in this or another program.
+        OutputError: the file cannot be written, or is open for writing in this or another program.
     """
     if durability not in get_args(Durability):
         raise UsageError(f"durability is {durability!r}; give 'process' or 'disk'")
@@ -156,7 +156,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     """Check that an output may be written.
 
     Raises:
-        UsageError: it is an input or a folder, lies in an input folder, or its own folder does not exist.
+        UsageError: the output is an input or a folder, is in an input folder, or its folder does not exist.
     """
     refuse_addresses(output)
     try:
@@ -183,7 +183,7 @@ def refuse_ending(output: Path) -> None:
     """Check that the name of a log does not end like a file of another kind, such as .csv.
 
     Raises:
-        UsageError: it does.
+        UsageError: the name has such an ending.
     """
     commands = {".csv": "export", ".parquet": "export", ".html": "report", ".json": "", ".jsonl": ""}
     command = commands.get(output.suffix.lower())
@@ -207,7 +207,7 @@ def refuse_addresses(output: Path, remedy: str = "write to this machine, and cop
     """Check that an output is on this machine.
 
     Raises:
-        UsageError: it is an address.
+        UsageError: the output is an address.
     """
     if output.parts and output.parts[0] in _SCHEMES:
         address = str(output).replace(":/", "://", 1)

@@ -370,7 +370,7 @@ class RemoteFile(PathLike[str]):
 
         Raises:
             MissingFileError: there is no such file, or access is denied.
-            RemoteError: it cannot be read.
+            RemoteError: the file cannot be read.
         """
         with self._opening:
             if self._version is None:
@@ -402,7 +402,7 @@ class RemoteFile(PathLike[str]):
         """Return the bytes of a range; fewer at the end of the file.
 
         Raises:
-            MissingFileError, RemoteError: it cannot be read, or has changed.
+            MissingFileError, RemoteError: the file cannot be read, or has changed.
         """
         end = min(end, self.version.size)
         # a read of more than half of the cache is not cached, because it would evict its own beginning

@@ -193,7 +193,7 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
     """Bind an entry with a position.
 
     Raises:
-        UsageError: its places do not fit the feature.
+        UsageError: the places of the entry do not fit the feature.
     """
     columns: dict[NumberPlace, int] = {}
 

@@ -128,7 +128,7 @@ def suggest_feature_mapping(data_set: DataSet) -> str:
 
     Raises:
         UsageError: the data set has no poses, or needs no mapping.
-        LogError: it cannot be read.
+        LogError: the data set cannot be read.
     """
     if reason := why_poseless(data_set):
         raise UsageError(reason)

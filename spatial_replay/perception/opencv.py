@@ -562,7 +562,7 @@ def _load() -> Any:
     """Import OpenCV.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: OpenCV is not installed.
     """
     with importing("cameras need OpenCV", extra="vision"):
         import cv2

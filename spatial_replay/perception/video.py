@@ -114,7 +114,7 @@ class Decoder:
             of: object that is returned with its frame.
 
         Raises:
-            av.FFmpegError: it cannot be decoded; later frames are not true until the next key frame.
+            av.FFmpegError: the packet cannot be decoded; later frames are not true until the next key frame.
         """
         av = load_av()
         sent = _Sent(of, self._losses, self._losses, None, None)
@@ -291,7 +291,7 @@ def load_av() -> Any:
     """Import PyAV.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: PyAV is not installed.
     """
     with importing("videos need PyAV", extra="vision"):
         import av

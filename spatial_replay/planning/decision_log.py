@@ -276,7 +276,7 @@ class BlackBox:
         """Observe the next sample.
 
         Raises:
-            TraceError: its time is not after the previous sample's time.
+            TraceError: the sample's time is not after the previous sample's time.
         """
         began = time.perf_counter()
         self.planner.observe(sample)

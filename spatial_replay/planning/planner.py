@@ -232,7 +232,7 @@ class Planner:
         """Observe the next sample.
 
         Raises:
-            TraceError: its time is not after the previous sample's time.
+            TraceError: the sample's time is not after the previous sample's time.
             UsageError: not a sample; at the first sample, settings that name unknown objects, or neither
                 settings nor objects.
         """

@@ -335,7 +335,7 @@ def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:
     """Check that a recomputed step equals the recorded decision.
 
     Raises:
-        LogError: it differs.
+        LogError: the step differs from the decision.
     """
     if (step.number, step.reason) != (decision.number, decision.reason):
         raise LogError(

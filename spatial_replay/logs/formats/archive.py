@@ -206,7 +206,7 @@ def row_count(array: Any) -> int:
     """Return the number of rows of an array after checking that reading it is safe.
 
     Raises:
-        LogError: its data are in another file, larger than the file can hold, or need a missing filter.
+        LogError: the array is in another file, larger than its own file, or needs a missing filter.
     """
     import h5py
 

@@ -58,7 +58,7 @@ def open_data_set(path: str | PathLike[str]) -> DataSet | None:
 
     Raises:
         UsageError: a library is not installed, or the format is of an unknown version.
-        LogError: its metadata cannot be read.
+        LogError: the metadata of the data set cannot be read.
     """
     folder = Path(path)
     try:

@@ -227,7 +227,7 @@ class DataSet:
         """Open an episode as a context; its value is the `group` of `read`.
 
         Raises:
-            LogError: it cannot be read.
+            LogError: the episode cannot be read.
         """
         raise NotImplementedError
 

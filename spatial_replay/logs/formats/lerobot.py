@@ -55,8 +55,8 @@ def open_lerobot(path: Path) -> DataSet | None:
     """Open a data set of LeRobot; None for another folder.
 
     Raises:
-        UsageError: its version is unknown, or pyarrow is not installed.
-        LogError: its metadata cannot be read.
+        UsageError: the version of the format is unknown, or pyarrow is not installed.
+        LogError: the metadata of the data set cannot be read.
     """
     return _LeRobot(path) if (path / "meta" / "info.json").is_file() else None
 

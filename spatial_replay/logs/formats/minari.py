@@ -40,8 +40,8 @@ def open_minari(path: Path) -> DataSet | None:
     """Open a data set of Minari, or its `data` folder; None for anything else.
 
     Raises:
-        UsageError: its storage is of an unknown kind, or a library is not installed.
-        LogError: it cannot be read.
+        UsageError: the storage of the data set is of an unknown kind, or a library is not installed.
+        LogError: the data set cannot be read.
     """
     folder = path / "data" if (path / "data" / "metadata.json").is_file() else path
     if b'"minari_version"' not in read_head(folder / "metadata.json"):

@@ -45,7 +45,7 @@ def arrow() -> Any:
     """Return the library for Arrow and Parquet.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: pyarrow is not installed.
     """
     with importing("data sets in Parquet need pyarrow", extra="datasets"):
         import pyarrow
