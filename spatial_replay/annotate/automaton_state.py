@@ -119,7 +119,7 @@ class AutomatonRun:
         return join_in_order(encoded)
 
     def pass_over(self, block: SeriesBlock) -> None:
-        """Add the next samples without messages."""
+        """Add the next samples, and write no messages for them."""
         if len(block.times_ns):
             self._steps(self._values(block))
 

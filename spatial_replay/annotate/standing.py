@@ -207,7 +207,7 @@ class StandingEncoder:
         return numbers
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
-        """Add the next samples without messages."""
+        """Add the next samples, and write no messages for them."""
         for index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue

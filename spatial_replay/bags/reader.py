@@ -113,7 +113,7 @@ def in_order(
     Args:
         starts_ns: sorted start times of the chunks; a message before the start of its chunk is yielded late.
         name: name of the log.
-        most_bytes: most bytes of messages in memory.
+        most_bytes: maximum number of bytes of messages in memory.
 
     Raises:
         LogError: the messages in memory exceed `most_bytes`.

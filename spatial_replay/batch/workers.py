@@ -134,7 +134,7 @@ def _results(
 
 @contextmanager
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
-    """Start processes, which end at once if the block ends early or leaves suspects."""
+    """Start processes, and end them at once if the block raises or adds suspects."""
     context = forking_context([_PRELOADED])
     others = set(multiprocessing.active_children())
     ours, theirs = multiprocessing.Pipe(duplex=False)

@@ -44,7 +44,7 @@ from spatial_replay.logs.remote import LogFile
     type=click.IntRange(1),
     default=200,
     show_default=True,
-    help="Most runs of the search; to make the failures found smaller takes more.",
+    help="Maximum number of runs of the search; reducing failures takes further runs.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
 @click.option("--planned", is_flag=True, help="Let the planner act for the scenario's task, not the script.")

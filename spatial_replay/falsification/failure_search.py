@@ -749,7 +749,7 @@ def falsify(
         vary: parameters to vary. For a scenario they are texts as on the command line,
             `["noise=0:0.01", "slip@T"]`, by default `["start"]`; for a function ranges by name,
             `{"wind": (-2, 2)}`.
-        budget: most runs, without those that reduce failures.
+        budget: maximum number of runs, without those that reduce failures.
         seed: seed of the search.
         planned: whether the planner acts in the scenario instead of the script.
         jobs: number of processes that simulate; the result does not depend on it.
@@ -794,7 +794,7 @@ def search_failures(
 
     Args:
         folder: folder for runs, logs and clips; it is created if it is missing.
-        budget: most runs, without those that reduce failures.
+        budget: maximum number of runs, without those that reduce failures.
         seed: seed of the search; equal arguments give equal files with any number of workers.
         progress: display of the number of runs.
 

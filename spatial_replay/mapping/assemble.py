@@ -53,7 +53,7 @@ _MOST_STEPS = 100_000
 """Limit of samples between two messages; more of them show a jump of the clock."""
 
 _ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
-"""Jump back that shows two clocks, such as simulated time from 0 and time since 1970, nanoseconds."""
+"""Least jump back, in nanoseconds, between two clocks, such as simulated time and time since 1970."""
 
 _MOST_AT_ONCE = 1_000_000
 """Limit of samples between messages of one step, which are in memory together."""
