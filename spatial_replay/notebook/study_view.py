@@ -20,6 +20,7 @@ from spatial_replay.html import Html, element, quiet, table, verdict_mark
 from spatial_replay.lazy import page_of
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision, PlanEdge, PlanTarget
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import INK, new_panel, new_panels, picture, plain, signed_colours
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE
@@ -328,6 +329,8 @@ def draw_map(
 ) -> Axes:
     """Draw a map: blue where the progress set would hold, vermillion elsewhere, blocked cells hatched.
 
+    Obstacles of the workspace are grey, and regions are dotted.
+
     Args:
         turn: index of the orientation; None for the orientation of the target, or of the best free cell.
         sample: sample whose objects are drawn over the map.
@@ -341,7 +344,7 @@ def draw_map(
     if turn is None:
         turn = _best_turn(gradient, None if target is None else target.turn)
     image = _draw_cells(gradient, ax, turn, _reach_of([gradient]), margin)
-    _draw_objects(ax, sample, gradient.name)
+    _draw_scene(ax, gradient, sample)
     if target is not None:
         _draw_target(ax, target_message(target), sample)
     ax.figure.colorbar(image, ax=ax, label="robustness of what is to hold")
@@ -395,15 +398,28 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin
     return image
 
 
-def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
-    """Draw the objects of a sample, with bold lines for the object to be moved."""
-    for object_name, tracked in (sample.objects if sample is not None else {}).items():
-        _draw_footprint(ax, tracked.footprint, 2.0 if object_name == name else 1.0)
-        x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
-        ax.annotate(
-            plain(object_name, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
-            annotation_clip=True,
-        )  # fmt: skip
+def _draw_scene(ax: Axes, gradient: GradientMap, sample: Sample | None) -> None:
+    """Draw obstacles in grey, regions dotted, and the objects of a sample; the moved object is bold."""
+    maps = gradient.made_of.now
+    for name, obstacle in maps.static.items():
+        _draw_footprint(ax, obstacle, 1.0, colour=_HATCH)
+        _name(ax, name, obstacle)
+    for name, outline in maps.about.regions.items():
+        region = footprint_from_outline(outline)
+        _draw_footprint(ax, region, 1.0, ":")
+        _name(ax, name, region)
+    for name, tracked in (sample.objects if sample is not None else {}).items():
+        _draw_footprint(ax, tracked.footprint, 2.0 if name == gradient.name else 1.0)
+        _name(ax, name, tracked.footprint)
+
+
+def _name(ax: Axes, name: str, footprint: Footprint) -> None:
+    """Write a name at the upper right corner of a footprint."""
+    x, y = np.concatenate(outlines_of(footprint)).max(axis=0).tolist()
+    ax.annotate(
+        plain(name, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
+        annotation_clip=True,
+    )  # fmt: skip
 
 
 def _draw_target(ax: Axes, target: PlanTarget, sample: Sample | None) -> None:
@@ -426,9 +442,11 @@ def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
     return [entry for (entry,) in filled]
 
 
-def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "-") -> None:
+def _draw_footprint(
+    ax: Axes, footprint: Footprint, width: float, style: str = "-", colour: str = "none"
+) -> None:
     for ring in outlines_of(footprint):
-        ax.fill(*ring.T, facecolor="none", edgecolor=INK, linewidth=width, linestyle=style)
+        ax.fill(*ring.T, facecolor=colour, edgecolor=INK, linewidth=width, linestyle=style)
 
 
 @html.register(Step)
@@ -509,7 +527,7 @@ def _draw_candidate(
     ax.set_axis_on()
     turn = _best_turn(gradient, None if target is None else target.turn)
     image = _draw_cells(gradient, ax, turn, reach, margin)
-    _draw_objects(ax, sample, candidate.object)
+    _draw_scene(ax, gradient, sample)
     if target is not None:
         _draw_target(ax, target, sample)
     question = plain(f"{edge.source} → {edge.target}: move {candidate.object}?")

@@ -312,7 +312,9 @@ class BlackBox:
         path = path_message(step.target, self._tracked, step.time_ns)
         if turned_maps:
             gradient, turn = turned_maps[-1].candidate.map, turned_maps[-1].turn
-            self._frame = map_frame(gradient, turn, self.planner.settings.margin)
+            settings = self.planner.settings
+            obstacles = settings.workspace.named_obstacles
+            self._frame = map_frame(gradient, turn, settings.margin, obstacles)
         drawing = map_drawing(self._frame, step.target, self._tracked, step.time_ns)
         timings = [[_timing(step, took_s)]] if self._times else []
         messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], [drawing], *timings)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,13 +16,15 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from spatial_replay.annotate.scene.scene_frames import cell_colours
 from spatial_replay.annotate.scene.scene_template import FRAME, outlines_of
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import TrackedObject, moved_object
+from spatial_replay.geometry.footprint import Footprint, TrackedObject, moved_object
 from spatial_replay.palette import LABEL, NEUTRAL, POSITIVE
 from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.maps import GradientMap
 from spatial_replay.text import number_text
 
 _MAP, _PATH, _TRAVELLED = "plan/map", "plan/way", "plan/travelled"
+OBSTACLE: Final = "plan/obstacle/"
+"""Start of the ids of the workspace's obstacles; their names follow."""
 
 DEPTH: Final = 0.1
 """Depth of a map below the plane, cells; at depth 0 the map would hide regions in the plane."""
@@ -32,6 +35,9 @@ _PIXELS: Final = 3.0
 _CASING_PIXELS: Final = 6.0
 _THIN_PIXELS: Final = 1.5
 """Line widths on the screen, pixels: path, white line below the path, axes and contour."""
+
+_OBSTACLE_OPACITY: Final = 0.5
+_NO_OBSTACLES: Final[Mapping[str, Footprint]] = MappingProxyType({})
 
 _INK: Final = (0.1, 0.1, 0.1)
 _WHITE: Final = (1.0, 1.0, 1.0)
@@ -50,14 +56,18 @@ class MapFrame(NamedTuple):
 
     entity: SceneEntity
     height: float
+    obstacles: tuple[SceneEntity, ...] = ()
 
 
-def map_frame(gradient: GradientMap, turn: int, margin: float) -> MapFrame:
-    """Return the contour of a map at the margin, axes, and a colour bar with numbers.
+def map_frame(
+    gradient: GradientMap, turn: int, margin: float, obstacles: Mapping[str, Footprint] = _NO_OBSTACLES
+) -> MapFrame:
+    """Return the contour of a map at the margin, axes, a colour bar with numbers, and obstacles.
 
     Args:
         turn: index of the map's orientation.
         margin: required robustness of a target.
+        obstacles: obstacles of the workspace by name.
     """
     grid, values = gradient.grid, gradient.values[turn]
     low = grid.xmin, grid.ymin
@@ -72,7 +82,28 @@ def map_frame(gradient: GradientMap, turn: int, margin: float) -> MapFrame:
     scale = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
     if scale:
         _add_scale(entity, low, high, height, scale, margin)
-    return MapFrame(entity, height)
+    font_size = _FONT * max(high[0] - low[0], high[1] - low[1])
+    entities = (_obstacle(name, part, height, font_size) for name, part in obstacles.items())
+    return MapFrame(entity, height, tuple(entities))
+
+
+def _obstacle(name: str, obstacle: Footprint, height: float, font_size: float) -> SceneEntity:
+    """Return the outline, the grey area and the name of an obstacle."""
+    entity = SceneEntity(id=f"{OBSTACLE}{name}", frame_id=FRAME)
+    rings = [ring.tolist() for ring in outlines_of(obstacle)]
+    for ring in rings:
+        entity.lines.append(_line(ring, height, NEUTRAL, LinePrimitive.LINE_LOOP))
+        area = entity.triangles.add()
+        area.pose.position.z, area.pose.orientation.w = height, 1.0
+        for x, y in ring:
+            area.points.add(x=x, y=y)
+        area.color.r, area.color.g, area.color.b, area.color.a = *NEUTRAL, _OBSTACLE_OPACITY
+        # parts of footprints are convex
+        for corner in range(1, len(ring) - 1):
+            area.indices.extend((0, corner, corner + 1))
+    xs, ys = zip(*(point for ring in rings for point in ring), strict=True)
+    _add_text(entity, name, ((min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0), height, font_size)
+    return entity
 
 
 def map_drawing(
@@ -86,7 +117,9 @@ def map_drawing(
     if frame is not None:
         entity = message.entities.add()
         entity.CopyFrom(frame.entity)
-        entity.timestamp.FromNanoseconds(time_ns)
+        message.entities.extend(frame.obstacles)
+        for part in message.entities:
+            part.timestamp.FromNanoseconds(time_ns)
         if target is not None and tracked is not None:
             entity.lines.extend(_path_lines(target, tracked, frame.height, _WHITE, _CASING_PIXELS))
     return message

@@ -195,6 +195,7 @@ class PropositionMaps:
         turns: (A,), angles by which the object is turned, radians.
         obstacles: names of objects; the last name, "", is for the obstacles of the workspace.
         about: subject of the maps.
+        static: obstacles of the workspace by name.
     """
 
     name: str
@@ -206,11 +207,21 @@ class PropositionMaps:
     turns: Floats
     obstacles: tuple[str, ...]
     about: MapSubject = field(repr=False)
+    static: Mapping[str, Footprint] = field(repr=False)
 
     def room(self, others: Collection[str] | None) -> Floats:
         """Return the distance to the nearest of some objects, (A, rows, columns); None for all objects."""
         mask = [others is None or name in others for name in self.obstacles]
         return np.asarray(self.distances[mask].min(axis=0, initial=np.inf))
+
+    def nearest(self) -> NDArray[np.int64]:
+        """Return the index in `obstacles` of what is nearest in each cell, (A, rows, columns).
+
+        An object that overlaps the moved one comes before the workspace's obstacles, because it has a name.
+        """
+        distances = self.distances.copy()
+        distances[-1, self.distances[:-1].min(axis=0, initial=np.inf) <= 0.0] = np.inf
+        return np.asarray(distances.argmin(axis=0))
 
 
 class MapSubject(NamedTuple):
@@ -286,7 +297,7 @@ def proposition_maps(
     to_obstacles = to_obstacles.reshape(-1, len(turns), *cells.shape)
     about = MapSubject(tuple(propositions), regions, sample)
     ways = to_obstacles.min(axis=0), to_obstacles, turns, (*obstacles, "")
-    return PropositionMaps(name, cells, bounds[0], bounds[-1], *ways, about)
+    return PropositionMaps(name, cells, bounds[0], bounds[-1], *ways, about, workspace.named_obstacles)
 
 
 def _slices(count: int, values: int) -> Iterator[slice]:
@@ -575,7 +586,7 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
     for reason, family in _KIND_OF.items():
         codes[blocked == reason] = family * _NUMBERS
     stands = blocked == OCCUPIED
-    codes[stands] += maps.distances.argmin(axis=0)[stands]
+    codes[stands] += maps.nearest()[stands]
     held = blocked == CONSTRAINED
     texts: tuple[str, ...] = ()
     if held.any():

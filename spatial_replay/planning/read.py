@@ -15,6 +15,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.geometry.arrays import select
+from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Messages, merge
@@ -154,6 +155,18 @@ def planner_of(source: Source) -> Planner:
         name=about.get("specification"),
         rate_hz=_rate_of(about),
     )
+
+
+def obstacles_of(source: Source) -> Mapping[str, Footprint]:
+    """Return the named obstacles of the workspace that a log was planned for.
+
+    They are empty without a plan, or with settings that cannot be read.
+    """
+    about = dict(source.metadata()).get(PLAN_METADATA, {})
+    try:
+        return settings_from_text(about.get("settings", "")).workspace.named_obstacles
+    except LogError:
+        return {}
 
 
 def _rate_of(about: Mapping[str, str]) -> float | None:
@@ -319,8 +332,8 @@ def _blocking_texts(
     maps = gradient.made_of.now
     apart = maps.distances[(slice(None), *cell)]
     if apart.size and apart.min() <= settings.workspace.clearance:
-        nearest = float(apart.min())
-        name = maps.obstacles[int(apart.argmin())] or "an obstacle of the workspace"
+        number = int(maps.nearest()[cell])
+        nearest, name = float(apart[number]), maps.obstacles[number] or "an obstacle of the workspace"
         yield f"{name} is in the way: " + (
             f"they overlap by {-nearest:.4g}" if nearest < 0.0 else f"{nearest:.4g} is left between them"
         )

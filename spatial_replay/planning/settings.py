@@ -162,6 +162,13 @@ class Workspace:
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
 
+    @property
+    def named_obstacles(self) -> dict[str, Footprint]:
+        """The obstacles by the names that drawings show; settings have no names for obstacles."""
+        if len(self.obstacles) == 1:
+            return {"obstacle": self.obstacles[0]}
+        return {f"obstacle {number}": obstacle for number, obstacle in enumerate(self.obstacles)}
+
     def _faults(self) -> Iterator[str]:
         yield from kind_faults("grid", self.grid, Grid, "a Grid")
         yield from kind_faults("yaws", self.yaws, tuple, "a tuple of angles in radians") or number_faults(

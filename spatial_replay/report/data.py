@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.deciding_leaf import pair_of
 from spatial_replay.annotate.scene.scene_frames import entity_ids
+from spatial_replay.annotate.scene.scene_template import outlines_of
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
 from spatial_replay.monitor.sentences import divisor_of, open_text
 from spatial_replay.monitor.verdict import Verdict
@@ -134,6 +136,7 @@ class RunReport:
         pictures: pictures of the camera, see `pictures_of`.
         planned_for: specification file of the decisions, if the report evaluates another one; else "".
         ticks: messages of the robot's behaviour tree.
+        obstacles: obstacles of the planner's workspace by name.
     """
 
     replayed: Replayed
@@ -148,6 +151,7 @@ class RunReport:
     planned_for: str
     ticks: tuple[bytes, ...] = ()
     pictures: Mapping[str, Any] = field(default_factory=lambda: NO_PICTURES)
+    obstacles: Mapping[str, Footprint] = field(default_factory=dict)
 
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
@@ -302,6 +306,10 @@ def page_data(report: RunReport) -> PageData:
         "scene": scene_value(report.scene, page_ns, first_ns, _places(report), packing),
         "events": event_values(report.events, first_ns),
         "decisions": decisions["decisions"],
+        "obstacles": [
+            {"name": name, "rings": [ring.ravel().tolist() for ring in outlines_of(obstacle)]}
+            for name, obstacle in report.obstacles.items()
+        ],
         "ticks": ticks_value(report.ticks, first_ns),
         "camera": dict(report.pictures),
     }

@@ -27,6 +27,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.planning.read import obstacles_of
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.data import ReportedResult, RunReport, page_data, worst_results
@@ -156,6 +157,7 @@ def report_of(
         collector.redone,
         planned_for(source, replay.files),
         tuple(collector.ticks),
+        obstacles=obstacles_of(source) if collector.decisions.decisions else {},
     )
     # the scene has one of many messages; samples in sentences are drawn in a second pass over the log
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))

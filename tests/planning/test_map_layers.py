@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from shapely import affinity
 from shapely.geometry import Point, box
 
+import spatial_replay as sr
 from planning.kinematics import block
 from planning.plans import record_plan_of
 from spatial_replay import Settings
-from spatial_replay.logs.topics import GRADIENT_MAP
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCause
+from spatial_replay.logs.topics import GRADIENT_MAP, MAP_DRAWING
 from spatial_replay.planning import Grid, Workspace, read_decisions, recompute_decisions
 from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.sources import open_source
@@ -166,3 +170,23 @@ def test_a_lost_specification_is_named_with_its_time(tmp_path):
 def test_while_a_specification_can_be_satisfied_nothing_is_lost(logged):
     _, decisions, _ = logged
     assert not any(each.HasField("lost") for each in decisions)
+
+
+def test_obstacles_are_drawn_and_an_object_within_one_is_named_first(tmp_path):
+    around_jug, far = box(1.9, 0.2, 3.8, 3.8), box(0.2, 1.8, 1.0, 2.4)
+    rings = [shape.exterior.coords[:-1] for shape in (around_jug, far)]
+    workspace = Workspace(
+        Grid.over(0, 0, 4, 4, 0.2), obstacles=tuple(sr.Footprint.polygon(list(ring)) for ring in rings)
+    )
+    record_plan_of(tmp_path / "run.mcap", SPEC, OBJECTS, replace(TIDYING, workspace=workspace))
+    source = open_source(tmp_path / "run.mcap")
+    drawing = next(payload for batch, _ in source.iter_payloads(MAP_DRAWING) for payload in batch)
+    entities = {entity.id: entity for entity in SceneUpdate.FromString(drawing).entities}
+    assert set(entities) == {"plan/map", "plan/obstacle/obstacle 0", "plan/obstacle/obstacle 1"}
+    (outline,) = entities["plan/obstacle/obstacle 1"].lines
+    assert {(point.x, point.y) for point in outline.points} == set(rings[1])
+    (candidate,) = read_decisions(tmp_path / "run.mcap").decisions[0].considered[-1].candidates
+    (message,) = (messages(tmp_path / "run.mcap")[named.number] for named in candidate.maps)
+    row, column = (int(place / 0.2 - 0.5) for place in reversed(PLACES["jug"]))
+    cause = candidate.causes[map_fields(message)["blocked_by"][row, column] - 1]
+    assert (cause.kind, cause.text) == (PlanCause.KIND_OBJECT, "jug")
