@@ -28,8 +28,10 @@ function makeTree(clock) {
       row.parts[0].parentElement.append(lane.made);
       return lane;
     });
+    fit(list);
     lightPath(list, rows, result);
   });
+  window.addEventListener("resize", () => fit(list));
   clock.on("time", () => {
     const result = clock.run.results[clock.result];
     if (!result) return;
@@ -49,6 +51,13 @@ function declaredUnit({unit, divisor}) {
 function commonUnit(nodes) {
   const [unit, ...others] = new Set(nodes.map(declaredUnit));
   return unit && !others.length && unit.length <= 4 ? ` [${unit}]` : "";
+}
+
+// A list that would scroll by little is shown whole, so that a wheel over it moves the page.
+function fit(list) {
+  list.classList.remove("whole");
+  const rest = list.scrollHeight - list.clientHeight;
+  list.classList.toggle("whole", rest > 0 && rest < list.clientHeight / 4);
 }
 
 // Marks the way to the node that decided the verdict, and scrolls to it.
