@@ -1,22 +1,26 @@
 // The panel of a planner's decisions: candidates, the chosen map, and the edges given up.
 
 import {
-  element, inShort, makeDecision, nodeRow, numberText, printable, secondsText, withCode,
+  element, inShort, makeDecision, mapKey, nodeRow, numberText, printable, secondsText, withCode,
   type DrawnBar, type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnOutline, type DrawnTarget,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
 
 import { TimedList } from "./event-list";
-import { wide, type DecisionMessage, type GridMessage, type SceneMessage, type TargetMessage, type TreeMessage } from "./messages";
+import {
+  wide, type DecisionMessage, type GridMessage, type SceneMessage, type SpecificationMessage, type TargetMessage, type TreeMessage,
+} from "./messages";
 import type { Cursor, View, Viewer } from "./viewer";
 
 const DECISION = "/plan/decision";
 const MAP = "/plan/gradient_map";
 const SCENE = "/spatial/scene";
+const DRAWING = "/plan/map_drawing";
 const TREE = "/plan/behaviour_tree";
 /** Cells of all maps that are kept: 16 MiB. */
 const MOST_CELLS = 1 << 22;
-const OBJECT = "object/";
+/** Starts of the ids of entities that are drawn on a map; their names follow. */
+const DRAWN = { "object/": "object", "region/": "region", "plan/obstacle/": "obstacle" } as const;
 /** A type of a field of cells. */
 const UINT16 = 3;
 /** Conjuncts and causes that are listed of a map. */
@@ -36,7 +40,7 @@ interface Owner {
 
 export class DecisionsView implements View {
   readonly topics = [DECISION, MAP];
-  readonly currentTopics = [SCENE, TREE];
+  readonly currentTopics = [SCENE, TREE, DRAWING];
   readonly body = element("div", { class: "panel-body decisions" });
   private readonly card = element("ol", { class: "cards" });
   private readonly pruned = element("div", { class: "tasks" });
@@ -52,6 +56,10 @@ export class DecisionsView implements View {
   private readonly mapsByTime = new Map<number, GridMessage[]>();
   /** The objects of the newest scene. */
   private outlines: DrawnOutline[] = [];
+  /** The obstacles of the planner's workspace. */
+  private obstacles: DrawnOutline[] = [];
+  /** Whether the reader has unfolded the candidates; it stays so for other decisions. */
+  private isUnfolded = false;
   private cells = 0;
   private mapsRead = 0;
   private shown = "";
@@ -60,7 +68,7 @@ export class DecisionsView implements View {
   constructor(viewer: Viewer) {
     this.clock = {
       run: {
-        settles: true, results: [], lengths: "", numbers: (values) => values, outlinesAt: () => this.outlines,
+        settles: true, results: [], lengths: "", numbers: (values) => values, outlinesAt: () => [...this.outlines, ...this.obstacles],
         palette: { positive: "#0072b2", negative: "#d55e00", neutral: "#8c8c8c", curves: [] },
       },
       view: [0, 0], time: 0, seek: (time) => viewer.seek(time), pause: () => undefined,
@@ -69,8 +77,11 @@ export class DecisionsView implements View {
       element("details", { open: true }, element("summary", {}, "All decisions"), this.list.made));
   }
 
-  specify(): void {
-    // decisions name what they are about
+  specify({ results }: SpecificationMessage): void {
+    // decisions name what they are about; lengths have the unit that all relations have
+    const units = new Set(results.flatMap(({ nodes }) => nodes.map(({ unit }) => unit)).filter((unit) => unit && unit !== "1"));
+    const [unit = ""] = units;
+    this.clock.run.lengths = units.size === 1 && !unit.startsWith("units of") && unit !== "mixed" ? printable(unit) : "";
   }
 
   reset(topic: string): void {
@@ -82,6 +93,12 @@ export class DecisionsView implements View {
   take(topic: string, time: number, message: unknown, isOfRange: boolean): void {
     if (topic === SCENE) {
       this.outlines = outlinesOf(message as SceneMessage);
+      return;
+    }
+    if (topic === DRAWING) {
+      const obstacles = outlinesOf(message as SceneMessage);
+      if (obstacles.length !== this.obstacles.length) this.shown = "";
+      this.obstacles = obstacles;
       return;
     }
     if (topic === TREE) {
@@ -117,8 +134,11 @@ export class DecisionsView implements View {
       this.pruned.replaceChildren();
       return;
     }
-    const made = makeDecision(this.clock, drawnOf(here, maps));
-    for (const each of made.querySelectorAll("details")) each.open = true;
+    const decision = drawnOf(here, maps);
+    const made = makeDecision(this.clock, decision);
+    this.isUnfolded = this.card.querySelector("details")?.open ?? this.isUnfolded;
+    for (const details of made.querySelectorAll("details")) details.open = this.isUnfolded;
+    if (maps.length) made.append(mapKey(this.clock.run, decision));
     this.card.replaceChildren(made);
     this.pruned.replaceChildren(...givenUp(here.message));
   }
@@ -141,7 +161,7 @@ export class DecisionsView implements View {
     this.list.fill(ordered.map((each) => each.time), ordered.map((each) => element("button", {
       type: "button", class: "event", onclick: () => this.clock.seek(each.time),
     }, element("span", {}), element("time", {}, secondsText(each.time)),
-    element("span", { class: "sentence" }, inShort(drawnOf(each, []))))));
+    element("span", { class: "sentence" }, `${each.message.number ?? 0}: ${inShort(drawnOf(each, []))}`))));
   }
 
   private forgetMaps(): void {
@@ -245,17 +265,18 @@ function fieldOf(grid: GridMessage, name: string): Float32Array | null {
   });
 }
 
-/** Returns the objects of a scene with their outlines. */
+/** Returns what of a scene is drawn on maps, with its outlines; the dashes of a region follow its outline. */
 function outlinesOf({ entities }: SceneMessage): DrawnOutline[] {
-  return entities.filter(({ id }) => id.startsWith(OBJECT)).map(({ id, lines }) => ({
-    name: printable(id.slice(OBJECT.length)),
+  return entities.flatMap(({ id, lines }) => Object.entries(DRAWN).filter(([start]) => id.startsWith(start)).map(([start, kind]) => ({
+    kind,
+    name: printable(id.slice(start.length)),
     rings: lines.map(({ pose, points }) => {
       const { x = 0, y = 0 } = pose?.position ?? {};
       const { z = 0, w = 1 } = pose?.orientation ?? {};
       const [sin, cos] = [2 * z * w, 1 - 2 * z * z];
       return points.flatMap((point) => [x + cos * point.x - sin * point.y, y + sin * point.x + cos * point.y]);
     }),
-  }));
+  })));
 }
 
 function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {

@@ -69,8 +69,8 @@ declare module "report-drawing" {
       cells: number; bars: DrawnBar[]; room: string;
     }[];
   }
-  /** An object with its outlines: points x and y in turn. */
-  export interface DrawnOutline { name: string; rings: number[][] }
+  /** What is drawn on a map, with its outlines: points x and y in turn. */
+  export interface DrawnOutline { kind: "object" | "region" | "obstacle"; name: string; rings: number[][] }
   export interface DrawnDecision {
     number: number; time: number; specification: string; kind: string; states: number[]; reason: string;
     edges: DrawnEdge[]; maps: DrawnMap[]; target: DrawnTarget | null; margin: number | null;
@@ -133,6 +133,7 @@ declare module "report-drawing" {
   export function keepInView(drawing: HTMLElement, state: SVGElement | undefined): void;
   export function describe(automaton: DrawnAutomaton, states: number[]): Node[];
   export function makeDecision(clock: DrawnClock, decision: DrawnDecision): HTMLElement;
+  export function mapKey(run: DrawnRun, decision: DrawnDecision): HTMLElement;
   export function inShort(decision: DrawnDecision): string;
   export function nodeRow(node: { name: string; type: string; depth: number }, status: number): HTMLElement;
 }

@@ -51,7 +51,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
         title,
-        element("p", text(" · ".join(_about(report))), **{"class": "about"}),
+        element("p", text(" · ".join(_about(report))), *_decisions_link(report), **{"class": "about"}),
         *_notices(report, omissions),
         element("noscript", element("p", _WITHOUT_SCRIPTS, **{"class": "notice"})),
         **{"class": "top"},
@@ -114,6 +114,13 @@ def _about(report: RunReport) -> Iterator[str]:
     yield plural(replayed.samples, "sample")
     yield f"semantics {replayed.semantics}"
     yield f"spatial-replay {__version__}"
+
+
+def _decisions_link(report: RunReport) -> Iterator[Html]:
+    """Yield a link to the panel of decisions for a planned run."""
+    if count := len(report.decisions.decisions):
+        yield text(" · ")
+        yield element("a", text(plural(count, "decision")), href="#decisions")
 
 
 def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -50,8 +51,12 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_recording(folder / "violated.html", "table.jsonl", "table_edited.spatial")
     report_of_recording(folder / "satisfied.html", "table.jsonl", "table.spatial")
     report_of_recording(folder / "planned.html", "push.mcap")
-    record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, TIDYING)
-    files = [sr.parse_specification(f"spec first = G (cup dist pan >= 0)\n{SPEC}")]
+    corner = sr.Footprint.polygon([(3.7, 3.7), (3.9, 3.7), (3.9, 3.9), (3.7, 3.9)])
+    settings = replace(TIDYING, workspace=replace(TIDYING.workspace, obstacles=(corner,)))
+    record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, settings)
+    files = [
+        sr.parse_specification(f"region mat = box(0, 0, 1, 1)\nspec first = G (cup dist pan >= 0)\n{SPEC}")
+    ]
     write_report(open_source(folder / "layers.mcap"), files, folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
     write_ticked_log(folder / "ticks.mcap")
@@ -410,8 +415,19 @@ def test_looking_closer_keeps_the_cursor_in_sight(open_page: Open) -> None:
 
 
 def test_states_and_decisions_have_lanes_of_their_own(open_page: Open) -> None:
-    lanes = open_page("planned").locator(".lane-name")
-    expect(lanes).to_have_text(["✓push", "✓beside", "✓order", "✓gaps", "state", "decision"])
+    page = open_page("planned", at="#t=1")
+    lanes = page.locator(".lane-name")
+    expect(lanes).to_have_text(
+        [f"{MINUS}push", f"{MINUS}beside", f"{MINUS}order", "+gaps", "state", "decision 0 ↓"]
+    )
+    # the lane and the header lead to the cards
+    page.get_by_role("button", name="decision 0 ↓").click()
+    card = page.locator(".card").nth(0)
+    expect(card).to_be_in_viewport()
+    page.evaluate("window.scrollTo(0, 0)")
+    expect(card).not_to_be_in_viewport()
+    page.locator(".top").get_by_role("link", name=" decisions").click()
+    expect(card).to_be_in_viewport()
     # a result without an automaton has no states
     expect(open_page("violated").locator("span.lane-name")).to_have_count(0)
 
@@ -501,7 +517,9 @@ def test_a_violation_without_an_arrow_is_reported_too(open_page: Open) -> None:
     caption = open_page("unseen", at="#t=1.2&r=1").locator(".caption")
     expect(caption).to_have_text("no violation is known now; a dist b >= 1 of apart is unknown")
     caption = open_page("reached", at="#t=9").locator(".caption")
-    expect(caption).to_have_text("no more requirements on the objects: they are grey")
+    expect(caption).to_have_text(
+        "no more requirements on the objects: blue ones have fulfilled theirs, grey ones had none"
+    )
 
 
 def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:
@@ -591,6 +609,16 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     page = open_page("layers")
     # of satisfied results, the one that was planned for is shown
     expect(page.locator("#tree .which")).to_contain_text("tidy at 0.100 s")
+    words = [
+        "fails, 0, holds",
+        "at least 0.05, as a target needs",
+        "blocked",
+        "obstacle",
+        "region",
+        "way and target",
+    ]
+    expect(page.locator("#decisions-body > .key span")).to_have_text(words)
+    expect(page.locator("#scene .key").first).to_contain_text("obstacle")
     # that of the target, beside the decision
     figure = page.locator(".card").nth(0).locator("> figure")
     made, choice, answer = (

@@ -270,6 +270,12 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
 ) -> None:
     page = open_panel("push", "decisions")
     decisions = read_decisions(logs["push"]).decisions
+    seek(page, decisions[-1].time_ns)
+    expect(page.locator(".event .sentence").first).to_contain_text("0: move red to")
+    seek(page, decisions[0].time_ns)
+    # candidates are folded until the reader unfolds them
+    expect(page.locator(".candidate").first).to_be_hidden()
+    page.locator(".card summary").click()
     for number, decision in reversed(list(enumerate(decisions))):
         seek(page, decision.time_ns)
         expect(page.locator(".decision-title")).to_contain_text(f"Decision {number}")
@@ -280,6 +286,7 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
                 assert (candidate.rejected or candidate.object) in text
         for each in decision.pruned:
             expect(page.locator(".tasks")).to_contain_text(f"{each.source} → {each.target}")
+    expect(page.locator(".card .key")).to_contain_text("at least 0.012 m, as a target needs")
     expect(page.locator(".card")).to_contain_text("Done at 10.467 s")
     expect(page.locator(".card")).to_contain_text("Planned next: green to (")
     maps = sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)

@@ -4,7 +4,8 @@ function makeDecisions(clock) {
   const place = body("decisions");
   if (!place) return;
   const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
-  if (clock.run.decisions.some((decision) => decision.maps.length)) place.append(mapKey());
+  const mapped = clock.run.decisions.find((decision) => decision.maps.length);
+  if (mapped) place.append(mapKey(clock.run, mapped));
   place.append(element("p", {class: "quiet"},
     "Edges are tried in the order of their paths' lengths, those that one motion takes first."));
   place.append(element("ol", {class: "cards"}, ...cards));
@@ -18,9 +19,14 @@ function makeDecisions(clock) {
   });
 }
 
-function mapKey() {
-  const made = key([{ground: "map", words: "fails, 0, holds; the line is at the robustness that a target needs"},
-    {ground: "hatched", words: "blocked"}]);
+function mapKey(run, {time, margin}) {
+  const kinds = run.outlinesAt(time).map(({kind}) => kind);
+  const made = key([{ground: "map", words: "fails, 0, holds"},
+    ...(margin === null ? [] : [{ground: "contour", words: `at least ${numberText(margin)}${spaced(run.lengths)}, as a target needs`}]),
+    {ground: "hatched", words: "blocked"},
+    ...(kinds.includes("obstacle") ? [{ground: "obstacle", words: "obstacle"}] : []),
+    ...(kinds.includes("region") ? [{ground: "region", words: "region"}] : []),
+    {ground: "moved", words: "way and target"}]);
   const [block] = made.querySelectorAll("i");
   block.style.background = `linear-gradient(to right, ${MAP.join(", ")})`;
   block.style.width = "5rem";
@@ -33,15 +39,16 @@ function makeDecision(clock, decision) {
     clock.seek(decision.time);
   }}, element("b", {}, `Decision ${decision.number}`), ` at ${secondsText(decision.time)}, `,
   `state ${decision.states.join(", ")}: ${inShort(decision)}`);
-  const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
+  // the edge that is aimed at comes first
+  const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number)).reverse();
   const unnamed = decision.maps.filter((map) => map.edge === null);
   const meant = chosenMap(decision);
   const later = decision.edges.flatMap((edge) => (edge.aim ? edge.later : []));
-  const heading = element("div", {}, title, element("p", {}, minusWords(sentence(decision.reason))),
+  const heading = element("div", {}, title, element("p", {}, reasonWords(decision)),
     ...decision.edges.filter(({aim}) => aim).map(demandsOf),
     later.length ? element("p", {}, `Planned next: ${minusWords(later.join(", then "))}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
-  return element("li", {class: "card"},
+  return element("li", {class: "card", "data-decision": decision.number},
     heading, meant ? makeMap(clock, meant, decision, false) : null, makeRedone(clock, decision.redone),
     tried.length ? element("details", {}, element("summary", {}, summaryOf(decision)), ...tried,
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, decision, false)))) : null);
@@ -52,7 +59,12 @@ function makeRedone(clock, decision) {
   if (!decision) return null;
   const meant = chosenMap(decision);
   return element("section", {class: "redone"}, element("p", {}, element("b", {}, "Redone"), `: ${inShort(decision)}`),
-    element("p", {}, minusWords(sentence(decision.reason))), meant ? makeMap(clock, meant, decision, false) : null);
+    element("p", {}, reasonWords(decision)), meant ? makeMap(clock, meant, decision, false) : null);
+}
+
+// The reason of a decision, with the states that an edge of the automaton joins.
+function reasonWords({reason}) {
+  return minusWords(sentence(reason)).replace(/for the edge (\d+) -> (\d+)/, "to bring the automaton from state $1 to state $2");
 }
 
 // The map that a decision's target was found on, if the page has it.
@@ -63,7 +75,7 @@ function chosenMap({maps: drawn}) {
 function summaryOf({edges, maps: drawn}) {
   const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
   const candidates = edges.reduce((sum, edge) => sum + edge.candidates.length, 0);
-  const parts = [count(edges.length, "edge"), count(candidates, "candidate"), count(drawn.length, "map")];
+  const parts = [count(edges.length, "edge") + " of the automaton", count(candidates, "candidate"), count(drawn.length, "map")];
   return `Looked into ${parts.join(", ")}`;
 }
 
@@ -91,13 +103,18 @@ function demandsOf({wanted, rules}) {
 function makeEdge(clock, decision, edge, number) {
   const mapsOf = (place) => decision.maps.filter((map) => map.edge === number && map.candidate === place);
   return element("section", {class: "edge"},
-    element("h3", {}, `${edge.aim ? "Aimed at" : "Looked into"} ${edge.path.slice(0, 2).join(" → ")}`,
-      element("span", {class: "quiet"}, ` on the path ${edge.path.join(" → ")}`)),
+    element("h3", {title: "An edge joins two states of the automaton."},
+      `${edge.aim ? "Aimed at" : "Looked into"} the edge ${edge.path.slice(0, 2).join(" → ")}`,
+      element("span", {class: "quiet"}, ` on the path of states ${edge.path.join(" → ")}`)),
     demandsOf(edge),
     element("div", {class: "candidates"},
-      ...edge.candidates.map((candidate, place) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
+      ...edge.candidates.map((candidate, place) => [candidate, place])
+        .sort(([one], [other]) => RANKS[one.status] - RANKS[other.status])
+        .map(([candidate, place]) => makeCandidate(clock, decision, candidate, mapsOf(place), edge.once))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${minusWords(sentence(edge.pruned))}`) : null);
 }
+
+const RANKS = {chosen: 0, possible: 1, rejected: 2};
 
 function makeCandidate(clock, decision, candidate, maps, once) {
   const {object, target, rejected, best} = candidate;

@@ -6,6 +6,7 @@ const MAP = ["#d55e00", "#f5f5f5", "#0072b2"], OPACITY = 0.6;
 const MAP_COLOURS = MAP.map(rgb);
 // Cells are as light in dark pages, and so are their ground and what is drawn on them.
 const MAP_INK = "#24292f", MAP_GROUND = "#e4e4e4", MAP_HATCH = "#9a9a9a";
+const OBSTACLE_GREY = "rgb(110 110 110 / 0.6)", REGION_DASH = [6, 4];
 // Room in pixels for the axes, and for the scale and its numbers.
 const FRAME = {left: 42, right: 66, top: 8, bottom: 22};
 const SCALE_WIDTH = 10;
@@ -120,9 +121,16 @@ function answerOf(run, map, decision, cell) {
   const heads = ["demand", `at (${centreOf(map, cell).map(numberText).join(", ")})${unit}`,
     ...(map.target ? [`at the target${unit}`] : [])];
   const words = element("p", {}, ...cellWords(run, map, decision, facts));
+  // what decides is in sight without scrolling
+  rows.sort((one, other) => rankOf(one) - rankOf(other));
   if (!rows.length) return [words];
   return [words, element("table", {}, element("thead", {}, element("tr", {},
     ...heads.map((head) => element("th", {scope: "col"}, head)))), element("tbody", {}, ...rows))];
+}
+
+// The row that limits, and that of all demands, come first.
+function rankOf(row) {
+  return row.classList.contains("limits") ? 0 : row.classList.contains("all") ? 1 : 2;
 }
 
 // A row for each demand whose number in a cell is known, and one for all of them where the cell is free.
@@ -139,7 +147,10 @@ function demandRows(run, map, {place, value, cause, limit, target}) {
     add(element("code", {}, text), isLimit,
       [layer ? run.numbers(layer.values)[place] : value, map.at_target?.[index] ?? null]);
   });
-  if (!cause) add("all that has to hold", false, [value, target]);
+  if (!cause) {
+    add("all that has to hold", false, [value, target]);
+    rows.at(-1).classList.add("all");
+  }
   const rest = (map.limits?.length ?? 0) - rows.filter((row) => row.querySelector("code")).length;
   if (rest > 0 && map.layers?.length) {
     rows.push(element("tr", {}, element("td", {class: "quiet", colspan: map.target ? 3 : 2},
@@ -206,21 +217,40 @@ function drawFigure(context, run, {map, layer, cell, decision}, width, height) {
   context.clip();
   if (decision.margin !== null) drawContour(context, run, layer, decision.margin, at);
   const outlines = run.outlinesAt(decision.time);
-  for (const outline of outlines) drawOutline(context, outline, at, outline.name === map.object ? 2 : 1);
+  const of = (wanted) => outlines.filter(({kind}) => kind === wanted);
+  for (const outline of of("obstacle")) drawObstacle(context, outline, at, MAP_INK);
+  for (const outline of of("region")) drawOutline(context, outline, at, 1, REGION_DASH);
+  for (const outline of of("object")) drawOutline(context, outline, at, outline.name === map.object ? 2 : 1);
   if (map.target) {
     drawWay(context, map.target.way, at, {colour: MAP_INK, width: 1.5, dash: [3, 4]});
-    const moved = outlines.find(({name}) => name === map.object);
+    const moved = of("object").find(({name}) => name === map.object);
     if (moved && map.target.at && map.target.way.length) drawOutline(context, movedOutline(moved, map.target), at, 1.5, [4, 3]);
     drawTarget(context, map.target.at, at, MAP_INK);
   }
   if (cell) drawCell(context, map, cell, at);
-  drawNames(context, outlines, at, [left, top, right, bottom]);
+  drawNames(context, [...of("object"), ...of("obstacle"), ...of("region")], at, [left, top, right, bottom]);
   context.restore();
   context.strokeStyle = colour("line");
   context.lineWidth = 1;
   context.strokeRect(left, top, right - left, bottom - top);
   drawAxes(context, map, run.lengths, at, [left, top, right, bottom]);
   drawScale(context, layer.scale, decision.margin, [right + 8, top, bottom]);
+}
+
+// An obstacle of the workspace is grey.
+function drawObstacle(context, {rings}, at, ink) {
+  context.save();
+  context.fillStyle = OBSTACLE_GREY;
+  context.strokeStyle = ink;
+  context.lineWidth = 1;
+  for (const ring of rings) {
+    context.beginPath();
+    for (let i = 0; i + 1 < ring.length; i += 2) context.lineTo(at.x(ring[i]), at.y(ring[i + 1]));
+    context.closePath();
+    context.fill();
+    context.stroke();
+  }
+  context.restore();
 }
 
 function drawOutline(context, {rings}, at, width, dash = []) {
@@ -246,19 +276,21 @@ function movedOutline({rings}, {at: [x, y], turn, way}) {
   }))};
 }
 
-// Names at the upper right of outlines; one that would cover another is left out.
+// Names at the upper right of outlines, in a region at its lower left; one that would cover another is left out.
 function drawNames(context, outlines, at, [left, top, right, bottom]) {
   context.font = FONT;
   context.textBaseline = "middle";
   context.textAlign = "left";
   const boxes = [];
-  for (const {name, rings} of outlines) {
+  for (const {kind, name, rings} of outlines) {
+    context.font = kind === "region" ? `italic ${FONT}` : FONT;
     const points = rings.flat();
     const xs = points.filter((_, i) => i % 2 === 0).map(at.x), ys = points.filter((_, i) => i % 2).map(at.y);
     if (Math.max(...xs) < left || Math.min(...xs) > right || Math.max(...ys) < top || Math.min(...ys) > bottom) continue;
     const text = shortened(name, 24), width = context.measureText(text).width;
-    const x = Math.max(Math.min(Math.max(...xs) + 3, right - width - 2), left + 2);
-    const y = Math.min(Math.max(Math.min(...ys) - 7, top + 8), bottom - 8);
+    const [column, line] = kind === "region" ? [Math.min(...xs) + 4, Math.max(...ys) - 8] : [Math.max(...xs) + 3, Math.min(...ys) - 7];
+    const x = Math.max(Math.min(column, right - width - 2), left + 2);
+    const y = Math.min(Math.max(line, top + 8), bottom - 8);
     const box = [x, y - 7, x + width, y + 7];
     if (boxes.some((placed) => overlapOf(placed, box) > 0)) continue;
     boxes.push(box);
@@ -358,7 +390,9 @@ function drawScale(context, scale, margin, [left, top, bottom]) {
   const rows = [];
   for (const number of [0, ...(scale > 0 ? [scale, -scale] : []), ...(margin ? [margin] : [])]) {
     if (Math.abs(number) > scale * (1 + 1e-9)) continue;
-    const height = y(number), row = Math.min(Math.max(height, top + 5), bottom - 5);
+    const height = y(number), nearest = Math.min(Math.max(height, top + 5), bottom - 5);
+    // a small margin is written above 0
+    const row = number === margin && Math.abs(nearest - rows[0]) < 12 ? rows[0] - 12 : nearest;
     context.fillStyle = number === margin ? colour("ink") : colour("quiet");
     context.fillRect(left, height - 0.5, SCALE_WIDTH + 3, 1);
     if (rows.some((other) => Math.abs(other - row) < 12)) continue;

@@ -24,7 +24,9 @@ function makeScene(clock, name = "scene") {
   key([{ground: "positive", words: scene.entities.some((each) => each.shades)
     ? "its requirements in the chosen result hold now" : "its requirements hold now"},
     {ground: "negative", words: "one is permanently violated"},
-    {ground: "neutral", words: "no requirement, still to come, or unknown"}]), trail);
+    {ground: "neutral", words: "no requirement, still to come, or unknown"},
+    ...(hasMaps ? [{ground: "hatched", words: "blocked in the map"}] : []),
+    ...(clock.run.obstacles.length ? [{ground: "obstacle", words: "obstacle"}] : [])]), trail);
   clock.on("result", () => trail.replaceChildren(...trailKey(clock, scene)));
   let before = null;
   const show = () => {
@@ -60,12 +62,17 @@ function sceneOf(run) {
   return run.drawnScene;
 }
 
-// The objects at a time, with their outlines: points x and y in turn.
+// The objects at a time, regions and obstacles, with their outlines: points x and y in turn.
 function outlinesAt(run, time) {
   const scene = sceneOf(run);
   const frame = indexAt(scene.times, time);
-  return scene.entities.filter((entity) => entity.kind === "object" && scene.times.length && isThere(entity, frame))
-    .map((entity) => ({name: entity.name, rings: ringsOf(entity, frame)}));
+  return scene.entities.filter((entity) => scene.times.length && isThere(entity, frame))
+    .map((entity) => ({kind: entity.kind, name: entity.name, rings: ringsOf(entity, frame)}))
+    .concat(obstaclesOf(run));
+}
+
+function obstaclesOf({obstacles}) {
+  return obstacles.map((obstacle) => ({kind: "obstacle", ...obstacle}));
 }
 
 function ringsOf(entity, frame) {
@@ -148,7 +155,7 @@ function drawScene(context, clock, scene, layers, width, height) {
     drawTrails(context, scene, frame, at);
     drawTightTrails(context, clock, scene, at, [width, height]);
   }
-  const labels = [];
+  const labels = obstaclesOf(clock.run).map((obstacle) => obstacleLabel(context, obstacle, at));
   const colourAt = coloursOf(clock, scene, frame);
   const marked = failedObjects(clock);
   for (const entity of scene.entities) {
@@ -165,6 +172,15 @@ function drawScene(context, clock, scene, layers, width, height) {
   const inks = clock.run.results[clock.result]?.left_open ? ["neutral", "quiet"] : ["negative-line", "negative-text"];
   const boxes = labels.filter((each) => !each.isRegion).map((each) => each.box);
   if (violation) drawViolation(context, violation, at, [names, boxes], [width, height], inks);
+}
+
+// Draws an obstacle; returns its label.
+function obstacleLabel(context, {name, rings}, at) {
+  drawObstacle(context, {rings}, at, colour("quiet"));
+  const points = rings.flat();
+  const xs = points.filter((_, index) => index % 2 === 0).map(at.x), ys = points.filter((_, index) => index % 2).map(at.y);
+  const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  return {id: `obstacle/${name}`, text: name, box, isRegion: true};
 }
 
 // The objects that the chosen result was violated by, from then on.
@@ -548,7 +564,18 @@ function wordsOf(clock, scene, frame) {
   }
   if (open.length) return [`nothing is violated now${lostBefore(clock)}`];
   const more = chosen.some((result) => result.requirements.length) ? "more " : "";
-  return [`no ${more}requirements on the objects: they are grey${lostBefore(clock)}`];
+  return [`no ${more}requirements on the objects: ${coloursNow(clock, scene, frame)}${lostBefore(clock)}`];
+}
+
+// The colours of objects that nothing is asked of any more: what they have fulfilled stays blue.
+function coloursNow(clock, scene, frame) {
+  const colourAt = coloursOf(clock, scene, frame);
+  const isBlue = scene.entities.some((entity) => {
+    if (entity.kind !== "object" || !isThere(entity, frame)) return false;
+    const [red, , blue] = colourAt(entity);
+    return blue > red;
+  });
+  return isBlue ? "blue ones have fulfilled theirs, grey ones had none" : "they are grey";
 }
 
 // What decided the chosen result, in the sample that did, where no arrow shows it.

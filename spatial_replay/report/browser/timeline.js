@@ -151,7 +151,18 @@ function decisionLane(clock) {
   const blocks = decisions.map(({time, kind, target}, index) => ({
     from: time, to: decisions[index + 1]?.time ?? clock.end, text: target ? `move ${target.object}` : kind,
   }));
-  return blockLane(clock, "decision", "Decisions of the planner", blocks);
+  const lane = blockLane(clock, "decision", "Decisions of the planner", blocks);
+  const link = element("button", {type: "button", class: "lane-name part", onclick: () => {
+    document.querySelector("#decisions .card[aria-current]")?.scrollIntoView({block: "start"});
+  }});
+  lane.made.replaceChild(link, lane.made.firstChild);
+  lane.update = () => {
+    const decision = decisionAt(clock.run, clock.time);
+    link.textContent = decision ? `decision ${decision.number} ↓` : "decision";
+    link.disabled = !decision;
+    link.title = decision ? `Show decision ${decision.number}, with its map` : "Before the first decision";
+  };
+  return lane;
 }
 
 function blockLane(clock, name, title, blocks) {
