@@ -235,8 +235,9 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
   const target = candidate.target && (candidate.target.turn ?? 0) === owner.turn ? drawnTarget(candidate.target) : null;
   const isLast = owner.edge === decision.considered.length - 1;
   const object = printable(candidate.object);
-  const layers = conjuncts.map(({ text }, index) => ({ name: `${index + 1}: ${text}`, number: index + 1 }))
-    .map(({ name, number }) => ({ number, title: printable(name), values: fieldOf(grid, name) }))
+  const layers = conjuncts.map((conjunct, index) => ({
+    number: index + 1, title: demandOf(conjunct).join(""), values: fieldOf(grid, `${index + 1}: ${conjunct.text}`),
+  }))
     .filter((layer): layer is { number: number; title: string; values: Float32Array } => layer.values !== null);
   const [limited, blocked, around] = ["limited_by", "blocked_by", "room"].map((name) => fieldOf(grid, name));
   return {
@@ -244,7 +245,7 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
     scale: values.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0),
     title: object + turned, rule: printable(candidate.rule ?? ""),
     chosen: Boolean(decision.target && isLast && candidate.chosen && target),
-    limits: conjuncts.map(({ text }) => printable(text)), blocks: causes.map(({ words }) => partsOf(words ?? "")),
+    limits: conjuncts.map(demandOf), blocks: causes.map(({ words }) => partsOf(words ?? "")),
     ...(limited && blocked ? { limited, blocked } : {}),
     ...(target ? { at_target: conjuncts.map((conjunct) => conjunct.at_target ?? null) } : {}),
     ...(room && around ? { room: around, wanted_room: room.wanted ?? 0 } : {}),
@@ -310,7 +311,7 @@ type Candidate = DecisionMessage["considered"][number]["candidates"][number];
 /** How many cells each demand limits and each cause blocks; logs of earlier planners do not say. */
 function barsOf({ conjuncts = [], causes = [], room, target }: Candidate): { cells: number; bars: DrawnBar[]; room: string } {
   const limits = conjuncts.filter((each) => each.limits).sort((a, b) => (b.limits ?? 0) - (a.limits ?? 0))
-    .map((each) => ({ kind: "limited by", words: ["", printable(each.text)], cells: each.limits ?? 0 }));
+    .map((each) => ({ kind: "limited by", words: demandOf(each), cells: each.limits ?? 0 }));
   const blocks = causes.map((each) => ({ kind: "blocked", words: partsOf(each.words ?? ""), cells: each.cells ?? 0 }));
   return {
     cells: [...limits, ...blocks].reduce((sum, { cells }) => sum + cells, 0),
@@ -318,6 +319,11 @@ function barsOf({ conjuncts = [], causes = [], room, target }: Candidate): { cel
     room: room && target ? `${numberText(target.robustness ?? NaN)} chosen, ${numberText(room.possible ?? NaN)} possible with `
       + `less room (${numberText(Math.max(room.clearance ?? NaN, 0))} of ${numberText(room.wanted ?? NaN)})` : "",
   };
+}
+
+/** Returns a conjunct as a demand; logs of earlier planners have its formula alone. */
+function demandOf({ text, words }: { readonly text: string; readonly words?: string }): string[] {
+  return partsOf(words || `\`${text}\``);
 }
 
 /** Returns a sentence as text and code, in turn. */

@@ -123,7 +123,7 @@ export interface DecisionMessage {
       readonly rejected: string;
       readonly chosen: boolean;
       readonly maps: readonly { readonly number?: number; readonly turn?: number }[];
-      readonly conjuncts?: readonly { readonly text: string; readonly limits?: number; readonly at_target?: number }[];
+      readonly conjuncts?: readonly { readonly text: string; readonly words?: string; readonly limits?: number; readonly at_target?: number }[];
       readonly causes?: readonly { readonly words?: string; readonly cells?: number }[];
       readonly rule?: string;
       readonly room?: { readonly wanted?: number; readonly possible?: number; readonly clearance?: number } | null;

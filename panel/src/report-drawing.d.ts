@@ -57,7 +57,7 @@ declare module "report-drawing" {
     columns: number; low: [number, number]; high: [number, number]; scale: number; values: Float32Array;
     chosen: boolean; edge: number | null; candidate: number | null; object: string; title: string;
     target: DrawnTarget | null;
-    limited?: Float32Array; blocked?: Float32Array; limits: string[]; blocks: string[][];
+    limited?: Float32Array; blocked?: Float32Array; limits: string[][]; blocks: string[][];
     layers: { number: number; title: string; values: Float32Array }[]; at_target?: (number | null)[];
     room?: Float32Array; wanted_room?: number; rule: string;
   }

@@ -57,7 +57,7 @@ from spatial_replay.planning.decisions import (
     either,
     wait_outcome,
 )
-from spatial_replay.planning.demands import Ban, ban_of, rules_of, wanted_of
+from spatial_replay.planning.demands import Ban, ban_of, demand_of, rules_of, wanted_of
 from spatial_replay.planning.map_drawing import DEPTH, MapFrame, map_drawing, map_frame, path_message
 from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
@@ -196,7 +196,10 @@ def explain(
     place = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
     for number, text in enumerate(layers.conjuncts):
         at_target = None if place is None else float(layers.robustness[number][place])
-        message.conjuncts.append(PlanConjunct(text=text, limits=counts[number], at_target=at_target))
+        words = demand_of(text, bans)
+        message.conjuncts.append(
+            PlanConjunct(text=text, limits=counts[number], at_target=at_target, words=words)
+        )
     for cause in layers.causes:
         kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")
         words = cause_sentence(kind, cause.name, bans, settings.constraint_margin)
@@ -620,7 +623,7 @@ def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
     for candidate in candidates:
         if candidate.rejected:
             limits = limiting_conjuncts(candidate)[:1]
-            because = "".join(f", mostly because of {conjunct.text}" for conjunct in limits)
+            because = "".join(f", mostly limited by {plain(demand_words(conjunct))}" for conjunct in limits)
             names.setdefault(f"{candidate.rejected}{because}", []).append(candidate.object)
         else:
             yield f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
@@ -735,11 +738,18 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
         at_target = (
             f", {conjunct.at_target:.4g} in the target's cell" if conjunct.HasField("at_target") else ""
         )
-        yield "limited by", f"{conjunct.text} in {plural(conjunct.limits, 'cell')}{at_target}"
+        demand = plain(demand_words(conjunct))
+        yield "limited by", f"{demand} in {plural(conjunct.limits, 'cell')}{at_target}"
     for cause in candidate.causes[:MOST_LISTED]:
         yield "blocked", f"{plural(cause.cells, 'cell')}: {plain(cause.words)}"
     if candidate.HasField("room"):
         yield "room", room_sentence(candidate)
+
+
+def demand_words(conjunct: PlanConjunct) -> str:
+    """Return a conjunct as a demand, with its formula between backquotes."""
+    # logs of earlier versions have no words
+    return conjunct.words or f"`{conjunct.text}`"
 
 
 def room_sentence(candidate: PlanCandidate) -> str:
@@ -762,8 +772,8 @@ def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban
         margin: by which constraints have to be false.
     """
     if kind == PlanCause.KIND_CONSTRAINT:
-        nearly = f", or nearly (margin {margin:.4g})" if margin else ""
-        return f"{ban_of(text, bans).breach}{nearly}"
+        distance = f" with a margin of {margin:.4g}" if margin else ""
+        return f"on the way, {ban_of(text, bans).rule}{distance}"
     texts = {
         PlanCause.KIND_OBJECT: f"{text} stands there",
         PlanCause.KIND_OBSTACLE: "an obstacle of the workspace stands there",

@@ -43,14 +43,6 @@ class Ban(NamedTuple):
             return f"avoid {_listing(self.holding, 'together with')}"
         return f"{_listing(self.holding, 'and')} not before {_listing(self.failing, 'or')}"
 
-    @property
-    def breach(self) -> str:
-        """The sentence that the ban would be violated."""
-        if not self.holding:
-            return f"{_listing(self.failing, 'and')} would fail"
-        before = f" before {_listing(self.failing, 'or')}" if self.failing else ""
-        return f"{_listing(self.holding, 'and')} would hold{before}"
-
 
 def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, ...]:
     """Return the shortest bans that together forbid exactly the guards, in the order of the guards.
@@ -90,6 +82,20 @@ def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
         *others[:_MOST_RULES],
         *more,
     )
+
+
+def demand_of(literal: str, bans: Iterable[Ban]) -> str:
+    """Return a literal of a goal as a demand: a relation to reach, to keep or to avoid.
+
+    Args:
+        bans: bans on the way; a relation that they require is one to keep.
+    """
+    text = _without_brackets(literal.removeprefix("not "))
+    if literal.startswith("not "):
+        return f"avoid {_listing([text], '')}"
+    required = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
+    is_kept = any(text in map(_without_brackets, _operands_of_and(formula)) for formula in required)
+    return f"{'keep ' if is_kept else ''}{_listing([text], '')}"
 
 
 def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:

@@ -52,7 +52,7 @@ from spatial_replay.planning.decision_log import (
     plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
-from spatial_replay.planning.demands import Ban, ban_of
+from spatial_replay.planning.demands import Ban, ban_of, demand_of
 from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, changed_settings, changes_text, settings_from_text
@@ -300,12 +300,12 @@ def why_not_there(
         f"({effort_text(steps[number].message)})"
     )
     layers = map_layers(gradient, settings, candidate.failed)
+    bans = planner.bans(edge, step.pruned)
     for layer in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
         value = float(layers.robustness[(layer, *cell)])
-        judgement = f"fails by {-value:.4g}" if value < 0.0 else f"holds by {value:.4g}"
-        note = ", less than the margin" if 0.0 <= value < settings.margin else ""
-        yield f"  {layers.conjuncts[layer]} {judgement}{note}"
-    bans = planner.bans(edge, step.pruned)
+        judgement = "not met" if value < 0.0 else "met"
+        note = f", but {settings.margin:.4g} needed" if 0.0 <= value < settings.margin else ""
+        yield f"  {value:>9.4g}  {plain(demand_of(layers.conjuncts[layer], bans))}: {judgement}{note}"
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, bans, settings))
     if target is not None:
@@ -324,24 +324,25 @@ def _blocking_texts(
     kind = "" if cause is None else cause.kind
     if cause is not None and kind == "constraint":
         danger = danger_of(gradient.made_of.now, gradient.made_of.constraints)[cell]
-        breach = plain(ban_of(cause.name, bans).breach)
+        rule = plain(ban_of(cause.name, bans).rule)
         if danger >= 0.0:
-            yield f"not allowed on the way: {breach}, by {danger:.4g}"
+            yield f"blocked: on the way, {rule}: short by {danger:.4g}"
         else:
-            yield f"too near on the way: {breach} after {-danger:.4g} more"
+            needed = settings.constraint_margin
+            yield f"blocked: on the way, {rule}: met by {-danger:.4g}, {needed:.4g} needed"
     maps = gradient.made_of.now
     apart = maps.distances[(slice(None), *cell)]
     if apart.size and apart.min() <= settings.workspace.clearance:
         number = int(maps.nearest()[cell])
         nearest, name = float(apart[number]), maps.obstacles[number] or "an obstacle of the workspace"
-        yield f"{name} is in the way: " + (
+        yield f"blocked: {name} stands there: " + (
             f"they overlap by {-nearest:.4g}" if nearest < 0.0 else f"{nearest:.4g} is left between them"
         )
     others = {"reach": "the robot does not reach it", "failed": "a motion failed near it"}
     if kind in others:
-        yield others[kind]
+        yield f"blocked: {others[kind]}"
     elif kind == "unknown":
-        yield "a relation there is unknown"
+        yield "blocked: a relation there is unknown"
 
 
 def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:

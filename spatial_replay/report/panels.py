@@ -60,11 +60,13 @@ from spatial_replay.planning.decision_log import (
     aim_of,
     best_robustness,
     decision_from_payload,
+    demand_words,
     joint_suffix,
     kind_text,
     latest_decisions,
     limiting_conjuncts,
     map_fields,
+    plain,
     room_sentence,
 )
 from spatial_replay.planning.decisions import Reason
@@ -863,16 +865,19 @@ def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, A
     if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
         return {}
     candidate = owner.candidate
-    named = [(number, f"{number}: {conjunct.text}") for number, conjunct in enumerate(candidate.conjuncts, 1)]
+    named = [
+        (number, f"{number}: {conjunct.text}", plain(demand_words(conjunct)))
+        for number, conjunct in enumerate(candidate.conjuncts, 1)
+    ]
     layers = [
-        {"number": number, "title": name, "values": packing.add(drawn.fields[name], "f4")}
-        for number, name in named
+        {"number": number, "title": title, "values": packing.add(drawn.fields[name], "f4")}
+        for number, name, title in named
         if drawn.is_chosen and name in drawn.fields and np.ptp(drawn.fields[name]) != 0.0
     ]
     value: dict[str, Any] = {
         "limited": packing.add(drawn.fields["limited_by"], "u2"),
         "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
-        "limits": [conjunct.text for conjunct in candidate.conjuncts],
+        "limits": [sentence_parts(demand_words(conjunct)) for conjunct in candidate.conjuncts],
         "blocks": [sentence_parts(cause.words) for cause in candidate.causes],
         "layers": layers,
     }
@@ -930,7 +935,10 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
 
 def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
     best = best_robustness(candidate)
-    limits = [(conjunct.limits, ["", conjunct.text]) for conjunct in limiting_conjuncts(candidate)]
+    limits = [
+        (conjunct.limits, sentence_parts(demand_words(conjunct)))
+        for conjunct in limiting_conjuncts(candidate)
+    ]
     blocks = [(cause.cells, sentence_parts(cause.words)) for cause in candidate.causes]
     return {
         **json_fields(candidate, "object", "rejected"),

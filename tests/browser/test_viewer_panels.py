@@ -301,7 +301,7 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     edge, answer = decisions[0].considered[-1], page.locator(".card > figure .answer")
     conjuncts = next(each for each in edge.candidates if each.chosen).conjuncts
     expect(answer.locator("tbody tr")).to_have_count(len(conjuncts) + 1)
-    expect(answer).to_contain_text("red above blue holds by")
+    expect(answer).to_contain_text("red above blue: met by")
     # a live source has neither numbers of maps nor, before it is played, the outcome
     live = open_panel("push", "decisions", "live")
     live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")

@@ -18,7 +18,7 @@ from spatial_replay.planning import (
     read_decisions,
     read_steps,
 )
-from spatial_replay.planning.demands import ban_of, bans_of, rules_of, wanted_of
+from spatial_replay.planning.demands import ban_of, bans_of, demand_of, rules_of, wanted_of
 
 AREA = Workspace(Grid.over(0, 0, 1, 1, 0.02))
 
@@ -147,7 +147,7 @@ def test_one_decision_is_shown_in_five_lines(tmp_path):
     assert first == "  instead  path 0 -> 3: no object can do it"
     assert second.startswith("blue to (")
     assert third.startswith("green: no place is good enough: ")
-    assert third.endswith(" needed, mostly because of red above blue")
+    assert third.endswith(" needed, mostly limited by red above blue")
     assert lines[4].startswith("  done at ")
     whole = call("info", log, "--decisions")
     assert whole[0] == "run.mcap: 3 decisions for 'push', 2 motions"
@@ -162,8 +162,15 @@ def test_a_place_that_was_not_chosen_is_explained_by_the_demands_that_fail_there
     log = tmp_path / "run.mcap"
     write_usual_run(log)
     lines = call("plan", "--why", log, "--step", 0, "--object", "red", "--at", "0.6,0.15")
-    assert "  red dist blue >= 0.03 fails by " in lines[1]
-    assert any(line.startswith("  blue is in the way: they overlap by ") for line in lines)
+    number, demand = lines[1].split(maxsplit=1)
+    assert float(number) < 0.0
+    assert demand == "keep red dist blue >= 0.03: not met"
+    assert any(line.endswith("  avoid green rightof red: met") for line in lines)
+    assert any(
+        line.startswith("  blocked: on the way, keep red dist blue >= 0.03: short by ") for line in lines
+    )
+    assert any(line.startswith("  blocked: blue stands there: they overlap by ") for line in lines)
+    assert not [line for line in lines if "not (" in line]
     assert lines[-1].startswith("  chosen instead: (")
     *_, last = call("plan", "--why", log, "--step", 0, "--object", "blue", "--at", "0.5,-0.05")
     assert last.startswith("  possible instead: (")
@@ -206,8 +213,11 @@ def test_constraints_are_said_as_what_to_keep_and_what_to_avoid():
         "avoid `f` together with `g`",
         "keep `h` or `i`",
     )
-    breaches = [ban_of(guard, bans).breach for guard in ("d and not z", "f and g", "(x and y) and not c")]
-    assert breaches == ["`d` would hold", "`f` and `g` would hold", "`x and y` would hold before `c`"]
+    rules = [ban_of(guard, bans).rule for guard in ("d and not z", "(x and y) and not c")]
+    assert rules == ["avoid `d`", "`x and y` not before `c`"]
+    way = bans_of(["not ((a dist b >= 1) and e)", "not h and not i"])
+    demands = [demand_of(literal, way) for literal in ("k", "h", "e", "a dist b >= 1", "not (f and g)")]
+    assert demands == ["`k`", "`h`", "keep `e`", "keep `a dist b >= 1`", "avoid `f and g`"]
     wanted = wanted_of(["k and e and not c and not d", "not k and e and not m"], bans)
     assert wanted == ("`k` and `c` no longer", "`k` no longer and `m` no longer")
 

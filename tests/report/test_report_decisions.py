@@ -66,18 +66,20 @@ def test_the_best_robustness_is_never_below_that_of_the_target() -> None:
     candidate.rejected, candidate.best = "", 0.03
     # refined between the centres of cells
     candidate.target.CopyFrom(PlanTarget(object="cup", robustness=0.031))
-    candidate.causes.add(kind=PlanCause.KIND_CONSTRAINT, words="`cup dist (jug) >= 1` would fail", cells=3)
-    candidate.causes.add(kind=PlanCause.KIND_CONSTRAINT, words="`b` would hold before `a`", cells=2)
-    candidate.conjuncts.add(text="cup leftof jug", limits=5)
+    candidate.causes.add(
+        kind=PlanCause.KIND_CONSTRAINT, words="on the way, keep `cup dist (jug) >= 1`", cells=3
+    )
+    candidate.causes.add(kind=PlanCause.KIND_CONSTRAINT, words="on the way, `b` not before `a`", cells=2)
+    candidate.conjuncts.add(text="not (cup leftof jug)", words="avoid `cup leftof jug`", limits=5)
     (edge,) = value_of(planned)["decisions"][0]["edges"]
     (value,) = edge["candidates"]
     assert value["best"] == value["target"]["robustness"] == 0.031
     assert (value["cells"], value["bars"]) == (
         10,
         [
-            {"kind": "limited by", "words": ["", "cup leftof jug"], "cells": 5},
-            {"kind": "blocked", "words": ["", "cup dist (jug) >= 1", " would fail"], "cells": 3},
-            {"kind": "blocked", "words": ["", "b", " would hold before ", "a", ""], "cells": 2},
+            {"kind": "limited by", "words": ["avoid ", "cup leftof jug", ""], "cells": 5},
+            {"kind": "blocked", "words": ["on the way, keep ", "cup dist (jug) >= 1", ""], "cells": 3},
+            {"kind": "blocked", "words": ["on the way, ", "b", " not before ", "a", ""], "cells": 2},
         ],
     )
 

@@ -388,21 +388,25 @@ class PlanConjunct(google.protobuf.message.Message):
     TEXT_FIELD_NUMBER: builtins.int
     LIMITS_FIELD_NUMBER: builtins.int
     AT_TARGET_FIELD_NUMBER: builtins.int
+    WORDS_FIELD_NUMBER: builtins.int
     text: builtins.str
     """In words; the field of the map with its robustness is named like this, behind its number."""
     limits: builtins.int
     """How many free cells, over all turns, it limits: the progress set has just its robustness there."""
     at_target: builtins.float
     """Its robustness in the target's cell; absent without a target."""
+    words: builtins.str
+    """The demand: what to reach, to keep or to avoid; formulas stand between backquotes."""
     def __init__(
         self,
         *,
         text: builtins.str = ...,
         limits: builtins.int | None = ...,
         at_target: builtins.float | None = ...,
+        words: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_at_target", b"_at_target", "_limits", b"_limits", "at_target", b"at_target", "limits", b"limits"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_at_target", b"_at_target", "_limits", b"_limits", "at_target", b"at_target", "limits", b"limits", "text", b"text"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_at_target", b"_at_target", "_limits", b"_limits", "at_target", b"at_target", "limits", b"limits", "text", b"text", "words", b"words"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_at_target", b"_at_target"]) -> typing.Literal["at_target"] | None: ...
     @typing.overload

@@ -137,18 +137,18 @@ function rankOf(row) {
 function demandRows(run, map, {place, value, cause, limit, target}) {
   const rows = [];
   const add = (title, isLimit, numbers) => rows.push(element("tr", {class: isLimit ? "limits" : null},
-    element("th", {scope: "row"}, title, isLimit ? " limits" : null),
+    element("th", {scope: "row"}, ...title, isLimit ? " limits" : null),
     ...numbers.slice(0, map.target ? 2 : 1).map((number) => element("td", {class: number < 0 ? "number fails" : "number"},
       number === null ? "–" : numberText(number)))));
-  (map.limits ?? []).forEach((text, index) => {
+  (map.limits ?? []).forEach((words, index) => {
     const layer = map.layers?.find(({number}) => number === index + 1);
     const isLimit = !cause && limit === index + 1;
     if (!layer && !isLimit) return;
-    add(element("code", {}, text), isLimit,
+    add(withCode(words), isLimit,
       [layer ? run.numbers(layer.values)[place] : value, map.at_target?.[index] ?? null]);
   });
   if (!cause) {
-    add("all that has to hold", false, [value, target]);
+    add(["all that has to hold"], false, [value, target]);
     rows.at(-1).classList.add("all");
   }
   const rest = (map.limits?.length ?? 0) - rows.filter((row) => row.querySelector("code")).length;
@@ -162,18 +162,18 @@ function demandRows(run, map, {place, value, cause, limit, target}) {
 function cellWords(run, map, decision, {place, value, cause, limit, target}) {
   if (cause) return ["Blocked: ", ...withCode(map.blocks[cause - 1] ?? ["something else"]), "."];
   if (Number.isNaN(value)) return ["Blocked, or not known."];
-  const demand = map.limits?.[limit - 1] ?? "what has to hold";
+  const demand = withCode(map.limits?.[limit - 1] ?? ["what has to hold"]);
   const {margin} = decision;
-  if (value < 0) return [element("code", {}, demand), ` fails by ${numberText(-value)}${spaced(run.lengths)}.`];
-  const by = ` holds by ${numberText(value)}${spaced(run.lengths)}`;
-  if (margin && value < margin) return [element("code", {}, demand), `${by}, less than the ${numberText(margin)} needed.`];
+  if (value < 0) return [...demand, `: short by ${numberText(-value)}${spaced(run.lengths)}.`];
+  const by = `: met by ${numberText(value)}${spaced(run.lengths)}`;
+  if (margin && value < margin) return [...demand, `${by}, less than the ${numberText(margin)} needed.`];
   const room = map.room && run.numbers(map.room)[place];
   const rest = room !== undefined && room < map.wanted_room
     ? ` The room around it is ${numberText(Math.max(room, 0))} of ${numberText(map.wanted_room)}.` : "";
-  if (target === null) return [element("code", {}, demand), `${by}.${rest}`];
+  if (target === null) return [...demand, `${by}.${rest}`];
   const more = Math.abs(value - target) <= 1e-6 * Math.abs(target) ? "as much as" : value > target ? "more than" : "less than";
   const rule = map.chosen && map.rule ? ` It would do, too; ${map.rule}.` : "";
-  return [element("code", {}, demand), `${by}, ${more} at the target.${rule}${rest}`];
+  return [...demand, `${by}, ${more} at the target.${rule}${rest}`];
 }
 
 function spaced(unit) {
