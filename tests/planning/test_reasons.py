@@ -18,6 +18,7 @@ from spatial_replay.planning import (
     read_decisions,
     read_steps,
 )
+from spatial_replay.planning.decision_log import explained_decision
 from spatial_replay.planning.demands import ban_of, bans_of, demand_of, rules_of, wanted_of
 
 AREA = Workspace(Grid.over(0, 0, 1, 1, 0.02))
@@ -63,6 +64,39 @@ def test_a_region_with_a_seam_is_named_where_an_object_would_have_to_cross_it():
     assert seam in step.reason
     assert seam in sr.doctor(sr.parse_specification(text), examples=False).notes
     assert seam not in planner_for(text, {"a": block(0.7, 0.7, size=0.05)}, "a").next_step().reason
+
+
+@pytest.mark.parametrize(
+    ("goal", "options", "rule"),
+    [
+        ("a leftof b", {"skill": "push"}, "a robot that pushes takes the nearest place that will do"),
+        ("a leftof b", {"skill": "place"}, "the most robust place is taken, of equal ones the nearest"),
+        (
+            "a enclosedin slot",
+            {"skill": "place", "room": 0.35, "room_from": "all"},
+            "places with enough room come first",
+        ),
+        ("a leftof c and b rightof d", {"skill": "place"}, "the places of 2 motions are chosen together"),
+    ],
+)
+def test_the_rule_that_chose_a_place_is_in_the_decision(goal, options, rule):
+    objects = {
+        "a": block(0.6, 0.5),
+        "b": block(0.4, 0.5),
+        "c": block(0.5, 0.2),
+        "d": block(0.5, 0.8),
+    }
+    area = Workspace(Grid.over(0, 0, 1, 1, 0.05))
+    text = f"region slot = box(0.55, 0.5, 0.95, 0.8)\nspec s = F ({goal})"
+    planner = Planner(sr.parse_specification(text), Settings(area, movable=("a", "b"), **options))
+    planner.observe(sr.Sample(0, objects))
+    step = planner.next_step()
+    (chosen,) = (
+        candidate
+        for candidate in explained_decision(step, planner).considered[-1].candidates
+        if candidate.chosen
+    )
+    assert chosen.rule == rule
 
 
 def test_equal_objects_are_taken_by_their_ways_then_by_their_order():
