@@ -232,7 +232,7 @@ def shortened_formula(text: str) -> str:
 
 
 def time_text(time_ns: int, first_ns: int = 0) -> str:
-    """Return a time since another one, or a duration, in the form of all texts: "5.533 s"."""
+    """Return the time since `first_ns`, or a duration, as every text writes it: "5.533 s"."""
     return str(Instant(time_ns, first_ns))
 
 

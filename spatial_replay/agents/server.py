@@ -78,7 +78,7 @@ _ROWS: Final = {
     "tune": "runs",
     "report": "",
 }
-"""Keys of the long list in each tool's document; "" without one."""
+"""For each tool, the key of the long list in its document; "" if it has none."""
 
 _LEFT_OUT: Final = frozenset({"nodes", "path", "measured", "certificate"})
 """Keys of long values that are left out of a document, because sentences contain the same facts."""

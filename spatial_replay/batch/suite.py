@@ -235,7 +235,7 @@ class Case:
     is_whole: bool = True
 
     def place(self, key: str) -> str:
-        """Return the place of a key as the beginning of an error; "" on a command line."""
+        """Return the beginning of an error, with the place of a key; "" for a case from a command line."""
         places = dict(self.places)
         return f"{places.get(key, places[''])}: case {self.name[:60]!r}: " if places else ""
 

@@ -508,7 +508,7 @@ class TreeDiff:
         return tuple(number for number, unit in enumerate(self.units) if unit[0].kind != "renamed")
 
     def formula(self, units: Collection[int]) -> Formula:
-        """Return the old formula with only some units of edits applied, by index."""
+        """Return the old formula with some units of edits applied: those with the given indices."""
         sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
         built = _build(self._merged, sites)
         return Truth(True) if built is None else built

@@ -374,7 +374,7 @@ class SpecificationDiff(Printed, Displayed):
         return not (self.removed or self.added or is_edited or any(spec.is_different for spec in self.specs))
 
     def spec(self, name: str) -> SpecDiff:
-        """Return the first difference of a spec, by its new name.
+        """Return the difference of the spec of this name in the new file; of several instances, the first.
 
         Raises:
             UsageError: an unknown spec.

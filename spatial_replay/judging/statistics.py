@@ -19,7 +19,7 @@ SIGNIFICANCE: Final = 0.05
 EVIDENCE: Final = 1.0 / SIGNIFICANCE
 """The least e-value that decides."""
 _POWER: Final = 0.8
-"""Probability with which the estimated number of pairs decides."""
+"""Probability that a test with the estimated number of pairs decides."""
 _MOST_PAIRS: Final = 100_000
 
 

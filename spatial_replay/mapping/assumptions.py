@@ -120,7 +120,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     first_ns, last_ns = arrivals.first_ns, arrivals.last_ns
     if evidence.planned.clock == "header" or arrivals.messages <= _FEW or first_ns is None or last_ns is None:
         return None
-    # the mean period, because messages within a burst are close in any unit
+    # the mean period, not the shortest: messages within a burst are close in any unit
     period_ns = arrivals.mean_period_s * 1e9
     for unit, ns in list(UNITS_NS.items())[1:]:
         year = _year(first_ns * ns)

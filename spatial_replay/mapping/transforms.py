@@ -266,8 +266,9 @@ class FrameTree:
     ) -> None:
         """Add one transform; a transform that tf2 would ignore is only counted.
 
-        A static transform holds from its stamp on. The first one of a frame also holds before. A static
-        transform without a stamp, or with an older stamp than its predecessor, holds from its clock time on.
+        A static transform holds from its stamp on. The first static transform of a frame also holds
+        before its stamp. A static transform without a stamp, or with an older stamp than its predecessor,
+        holds from its clock time on.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.

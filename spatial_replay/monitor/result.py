@@ -756,7 +756,7 @@ class Evaluation(Displayed):
         return nodes[0]
 
     def witness(self, node: str | None = None, object: str | None = None) -> Witness:
-        """Return the witness of a named node's verdict or, by default, of the worst result's.
+        """Return the witness of a node's verdict. The default is the witness of the worst result.
 
         Args:
             object: object of one instance of a template.

@@ -87,7 +87,7 @@ class UntestedPart:
     Attributes:
         node: its id; None for a template without instances.
         text: its canonical text.
-        reason: "empty window": an operator's window has no sample, at each sample where the operator counts.
+        reason: "empty window": wherever the operator counts, its window has no sample.
             "antecedent never held": the part is an implication, in any spelling. "no members": an open group
             is empty. "past the end": the result is infinite, because the deciding part looks beyond the log.
             "no rate": the result is infinite, because the deciding part leaves all samples or members out.

@@ -195,7 +195,7 @@ class Recording:
         self._sink.write_messages(self._count_messages(trace, beside))
 
     def evaluate(self, trace: Trace) -> None:
-        """Write the messages of the evaluation of samples from `add_samples`."""
+        """Evaluate samples that `add_samples` wrote, and write the messages of their results."""
         stretches = self._evaluation.extend(trace)
         self._sink.write_messages(merge(self._evaluation.annotator.messages(trace, stretches)))
         self._hashes.add_results(stretches)

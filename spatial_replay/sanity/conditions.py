@@ -215,7 +215,7 @@ def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outli
 
 
 def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
-    """Return the distances of regions that are apart, and the protrusions of regions from enclosing ones."""
+    """Return the distances between separate regions, and the protrusion of each region from one around it."""
     terms = (term for atom in atoms for term in terms_of(atom.expression))
     names = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
     pairs = list(permutations(names, 2))

@@ -50,8 +50,8 @@ def labelled_objects(
 ) -> NDArray[np.bool_]:
     """Return (S, objects), whether each object has a label.
 
-    In a crowded sample, objects that violate a specification have labels, the worst first. Objects that
-    specifications name follow, up to `_MOST_LABELS`.
+    In a crowded sample, at most `_MOST_LABELS` objects have labels: those that violate a specification, the
+    worst first, and then those that a specification names.
 
     Args:
         named: objects that specifications name.

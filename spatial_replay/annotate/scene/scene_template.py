@@ -337,7 +337,7 @@ REGION: Final = "region/"
 WITNESS: Final = "witness"
 
 LEVELS: Final = 8
-"""Number of heights from large to small flat objects."""
+"""Highest level of flat objects; small ones have higher levels than large ones."""
 
 _LABEL_LIFT: Final = 0.01
 """Height of a region's name above the region, fraction of the region's size."""

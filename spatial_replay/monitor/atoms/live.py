@@ -975,7 +975,7 @@ class SampleLeaves:
         self.room = SampleRoom(len(formulas))
 
     def look_at(self, sample: Sample) -> Sequence[Sample | None]:
-        """Add the next sample; return it with the earlier samples at the delays of terms."""
+        """Add the next sample; return the sample at each delay of terms, or None before the first sample."""
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)

@@ -614,7 +614,7 @@ class _Parts:
         self._number_of: dict[tuple[tuple[Row, ...], bool], int] = {}
 
     def add(self, node: Temporal, signals: SignalTable) -> int:
-        """Add the part of a node that looks ahead, and return its number."""
+        """Add the part for a node that looks ahead, and return the part's number."""
         part = part_of(signals, node)
         nodes = tuple(_with_signal_row(row, signals) for row in part.rows())
         has_now = node.operator not in FUTURE_OPERATORS
