@@ -36,7 +36,8 @@ _CASING_PIXELS: Final = 6.0
 _THIN_PIXELS: Final = 1.5
 """Line widths on the screen, pixels: path, white line below the path, axes and contour."""
 
-_OBSTACLE_OPACITY: Final = 0.5
+_OBSTACLE_OPACITY: Final = 0.6
+_BLOCKED_OPACITY: Final = 0.3
 _NO_OBSTACLES: Final[Mapping[str, Footprint]] = MappingProxyType({})
 
 _INK: Final = (0.1, 0.1, 0.1)
@@ -73,6 +74,7 @@ def map_frame(
     low = grid.xmin, grid.ymin
     high = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
     entity, height = SceneEntity(id=_MAP, frame_id=FRAME), -_FRAME_DEPTH * grid.cell_size
+    _add_blocked_cells(entity, np.isnan(values), low, grid.cell_size, height)
     contour = _contour(values, margin) * grid.cell_size + np.array(low)
     if len(contour):
         entity.lines.append(
@@ -102,7 +104,8 @@ def _obstacle(name: str, obstacle: Footprint, height: float, font_size: float) -
         for corner in range(1, len(ring) - 1):
             area.indices.extend((0, corner, corner + 1))
     xs, ys = zip(*(point for ring in rings for point in ring), strict=True)
-    _add_text(entity, name, ((min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0), height, font_size)
+    # above the area, which would cover the name
+    _add_text(entity, name, ((min(xs) + max(xs)) / 2.0, max(ys) + 0.75 * font_size), height, font_size)
     return entity
 
 
@@ -123,6 +126,24 @@ def map_drawing(
         if target is not None and tracked is not None:
             entity.lines.extend(_path_lines(target, tracked, frame.height, _WHITE, _CASING_PIXELS))
     return message
+
+
+def _add_blocked_cells(
+    entity: SceneEntity, blocked: Booleans, low: tuple[float, float], cell_size: float, height: float
+) -> None:
+    """Add a grey area for the blocked cells, which the map leaves transparent; free cells at 0 are white."""
+    changes = np.diff(np.pad(blocked, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    rows, starts = np.nonzero(changes == 1)
+    ends = np.nonzero(changes == -1)[1]
+    area = entity.triangles.add()
+    area.pose.position.z, area.pose.orientation.w = height, 1.0
+    area.color.r, area.color.g, area.color.b, area.color.a = *NEUTRAL, _BLOCKED_OPACITY
+    for number, (row, start, end) in enumerate(
+        zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
+    ):
+        for column, line in ((start, row), (end, row), (end, row + 1), (start, row + 1)):
+            area.points.add(x=low[0] + column * cell_size, y=low[1] + line * cell_size)
+        area.indices.extend(4 * number + corner for corner in (0, 1, 2, 0, 2, 3))
 
 
 def _contour(values: Floats, margin: float) -> Floats:

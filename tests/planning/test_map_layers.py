@@ -188,5 +188,9 @@ def test_obstacles_are_drawn_and_an_object_within_one_is_named_first(tmp_path):
     (candidate,) = read_decisions(tmp_path / "run.mcap").decisions[0].considered[-1].candidates
     (message,) = (messages(tmp_path / "run.mcap")[named.number] for named in candidate.maps)
     row, column = (int(place / 0.2 - 0.5) for place in reversed(PLACES["jug"]))
-    cause = candidate.causes[map_fields(message)["blocked_by"][row, column] - 1]
+    blocked_by = map_fields(message)["blocked_by"]
+    (area, *_) = entities["plan/map"].triangles
+    corners = np.array([(point.x, point.y) for point in area.points]).reshape(-1, 4, 2)
+    assert np.ptp(corners, axis=1).prod(axis=1).sum() == pytest.approx((blocked_by > 0).sum() * 0.2**2)
+    cause = candidate.causes[blocked_by[row, column] - 1]
     assert (cause.kind, cause.text) == (PlanCause.KIND_OBJECT, "jug")
