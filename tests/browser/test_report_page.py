@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -641,7 +641,7 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     number = next(turned.number for turned in candidate.maps if turned.turn == candidate.target.turn)
     grid = messages(log)[number]
     fields = map_fields(grid)
-    texts = [conjunct.text for conjunct in candidate.conjuncts]
+    demands = {conjunct.words.replace("`", ""): conjunct.text for conjunct in candidate.conjuncts}
     robustness, margin = fields["robustness"], read_decisions(log).decisions[0].margin
     enough, higher = (robustness >= margin).sum(), (robustness > candidate.target.robustness).sum()
     expect(figure.locator(".why")).to_contain_text(
@@ -652,24 +652,28 @@ def test_a_map_shows_each_relation_and_answers_for_every_cell(
     assert box is not None
     # by keys, the first cell is that of the target
     made.press("ArrowUp")
-    answers = {_checked_answer(answer, grid, fields, texts)}
+    answers = {_checked_answer(answer, grid, fields, demands)}
     for row in range(2, 8, 2):
         for column in range(2, 6):
             made.click(position={"x": box["width"] * column / 8, "y": box["height"] * row / 8})
-            answers.add(_checked_answer(answer, grid, fields, texts))
+            answers.add(_checked_answer(answer, grid, fields, demands))
     assert {"Blocked", "fails", "holds"} == answers
     # from where it is, keys go on by a cell, and the time stays
     time, heading = readout(page).text_content(), answer.locator("thead").text_content()
     made.press("ArrowLeft")
     assert answer.locator("thead").text_content() != heading
-    _checked_answer(answer, grid, fields, texts)
+    _checked_answer(answer, grid, fields, demands)
     assert readout(page).text_content() == time
 
 
 def _checked_answer(
-    answer: Locator, grid: GridMessage, fields: Mapping[str, np.ndarray], texts: Sequence[str]
+    answer: Locator, grid: GridMessage, fields: Mapping[str, np.ndarray], demands: Mapping[str, str]
 ) -> str:
-    """Compare the table of a cell with the log, and return what it says: blocked, fails or holds."""
+    """Compare the table of a cell with the log, and return what it says: blocked, fails or holds.
+
+    Args:
+        demands: conjunct of each demand.
+    """
     heads, words, *rows = answer.evaluate(
         """answer => [answer.querySelector("thead").textContent, answer.querySelector("p").textContent,
             ...Array.from(answer.querySelectorAll("tbody th"),
@@ -684,18 +688,19 @@ def _checked_answer(
         )
     )
     numbers = {name.removesuffix(" limits"): float(text.replace(MINUS, "-")) for name, text in rows}
-    layers = {text: fields[f"{place}: {text}"] for place, text in enumerate(texts, 1)}
-    varying = {text: layer[row, column] for text, layer in layers.items() if np.ptp(layer)}
-    for text, number in varying.items():
-        np.testing.assert_allclose(numbers[text], number, rtol=1e-3, atol=1e-3)
+    layers = {demand: fields[f"{place}: {text}"] for place, (demand, text) in enumerate(demands.items(), 1)}
+    varying = {demand: layer[row, column] for demand, layer in layers.items() if np.ptp(layer)}
+    for demand, number in varying.items():
+        np.testing.assert_allclose(numbers[demand], number, rtol=1e-3, atol=1e-3)
     # a demand that is the same everywhere is counted, and listed only where it limits
-    assert set(numbers) <= {*varying, "all that has to hold", texts[fields["limited_by"][row, column] - 1]}
+    limiting = list(demands)[fields["limited_by"][row, column] - 1]
+    assert set(numbers) <= {*varying, "all that has to hold", limiting}
     robustness = fields["robustness"][row, column]
     assert np.isnan(robustness) == words.startswith("Blocked: ")
     if np.isnan(robustness):
         return "Blocked"
     np.testing.assert_allclose(numbers["all that has to hold"], robustness, rtol=1e-3, atol=1e-3)
-    assert texts[fields["limited_by"][row, column] - 1] in words
+    assert limiting in words
     return "fails" if robustness < 0 else "holds"
 
 
