@@ -230,7 +230,7 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
   const high: [number, number] = [x + columns * (grid.cell_size?.x ?? 0), y + rows * (grid.cell_size?.y ?? 0)];
   if (![x, y, ...high].every(Number.isFinite) || high[0] <= x || high[1] <= y) return null;
   const candidate = decision.considered[owner.edge]!.candidates[owner.candidate]!;
-  const { conjuncts = [], causes = [], room } = candidate;
+  const { conjuncts = [], causes = [], least_way, least_room } = candidate;
   const turned = candidate.maps.length > 1 ? `, turned by ${degrees(owner.turn)}` : "";
   const target = candidate.target && (candidate.target.turn ?? 0) === owner.turn ? drawnTarget(candidate.target) : null;
   const isLast = owner.edge === decision.considered.length - 1;
@@ -239,16 +239,18 @@ function drawnMap(grid: GridMessage, owner: Owner, decision: DecisionMessage): D
     number: index + 1, title: demandOf(conjunct).join(""), values: fieldOf(grid, `${index + 1}: ${conjunct.text}`),
   }))
     .filter((layer): layer is { number: number; title: string; values: Float32Array } => layer.values !== null);
-  const [limited, blocked, around] = ["limited_by", "blocked_by", "room"].map((name) => fieldOf(grid, name));
+  const [limited, blocked, room, way] = ["limited_by", "blocked_by", "room", "way"].map((name) => fieldOf(grid, name));
   return {
     columns, low: [x, y], high, values, edge: owner.edge, candidate: owner.candidate, target, object, layers,
     scale: values.reduce((most, number) => (Number.isFinite(number) ? Math.max(most, Math.abs(number)) : most), 0),
     title: object + turned, rule: printable(candidate.rule ?? ""),
+    joint: Boolean(decision.considered[owner.edge]!.joint),
     chosen: Boolean(decision.target && isLast && candidate.chosen && target),
     limits: conjuncts.map(demandOf), blocks: causes.map(({ words }) => partsOf(words ?? "")),
     ...(limited && blocked ? { limited, blocked } : {}),
     ...(target ? { at_target: conjuncts.map((conjunct) => conjunct.at_target ?? null) } : {}),
-    ...(room && around ? { room: around, wanted_room: room.wanted ?? 0 } : {}),
+    ...(room && typeof least_room === "number" ? { room, least_room } : {}),
+    ...(way && typeof least_way === "number" ? { way, least_way } : {}),
   };
 }
 

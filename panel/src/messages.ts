@@ -125,7 +125,7 @@ export interface DecisionMessage {
       readonly maps: readonly { readonly number?: number; readonly turn?: number }[];
       readonly conjuncts?: readonly { readonly text: string; readonly words?: string; readonly limits?: number; readonly at_target?: number }[];
       readonly causes?: readonly { readonly words?: string; readonly cells?: number }[];
-      readonly rule?: string;
+      readonly rule?: string; readonly least_way?: number; readonly least_room?: number;
       readonly room?: { readonly wanted?: number; readonly possible?: number; readonly clearance?: number } | null;
     }[];
     readonly pruned: string;

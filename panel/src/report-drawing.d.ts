@@ -59,7 +59,7 @@ declare module "report-drawing" {
     target: DrawnTarget | null;
     limited?: Float32Array; blocked?: Float32Array; limits: string[][]; blocks: string[][];
     layers: { number: number; title: string; values: Float32Array }[]; at_target?: (number | null)[];
-    room?: Float32Array; wanted_room?: number; rule: string;
+    room?: Float32Array; least_room?: number; way?: Float32Array; least_way?: number; rule: string; joint: boolean;
   }
   export interface DrawnBar { kind: string; words: string[]; cells: number }
   export interface DrawnEdge {

@@ -62,7 +62,7 @@ from spatial_replay.planning.map_drawing import DEPTH, MapFrame, map_drawing, ma
 from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
-from spatial_replay.planning.targets import room_cost
+from spatial_replay.planning.targets import Ways, good_cells, least_room, room_cost, tried_cells, ways_of
 from spatial_replay.text import json_number, plural, time_text
 from spatial_replay.trace.trace import Sample
 
@@ -111,12 +111,18 @@ def map_digest(gradient: GradientMap) -> bytes:
     return hashlib.sha256(np.ascontiguousarray(gradient.values, "<f8").tobytes()).digest()
 
 
-def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessage:
-    """Return a map as a message that is drawn below the scene; blocked cells are NaN, and transparent."""
+def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers, ways: Ways | None = None) -> GridMessage:
+    """Return a map as a message that is drawn below the scene; blocked cells are NaN, and transparent.
+
+    Args:
+        ways: ways that a push to the map's target was chosen among.
+    """
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
     colours = dict(zip(_COLOURS, np.moveaxis(cell_colours(values), -1, 0), strict=True))
     fields = {"robustness": values.astype("<f4"), **colours, **dict(_fields(turned, layers))}
+    if ways is not None and _is_aim(turned.candidate, turned.turn):
+        fields["way"] = _singles(ways.lengths)
     # the schema foxglove.Grid packs all fields of a cell together
     cells = np.empty(values.shape, [(name, array.dtype.str) for name, array in fields.items()])
     for name, array in fields.items():
@@ -182,13 +188,13 @@ def explain(
     layers: MapLayers,
     settings: Settings,
     bans: Sequence[Ban],
-    motions: int,
+    ways: Ways | None,
 ) -> None:
-    """Add to a candidate the relations of its map, the causes of blocked cells, and the cost of room.
+    """Add to a candidate the relations of its map, the causes of blocked cells, and the rule of its target.
 
     Args:
         bans: the constraint set of its edge.
-        motions: the number of motions that are planned together for its edge.
+        ways: ways that its target was chosen among.
     """
     target = candidate.target
     free = layers.limiting[layers.blocked_by < 0]
@@ -207,19 +213,44 @@ def explain(
     if target is not None and (cost := room_cost(candidate, target, settings)) is not None:
         room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.room)
         message.room.CopyFrom(room)
-    if target is not None:
-        message.rule = _rule(settings, motions, has_room_cost=message.HasField("room"))
+    if target is None:
+        return
+    if candidate.rule:
+        message.rule = candidate.rule
+    elif ways is not None:
+        message.least_way = ways.shortest
+        message.rule = _push_rule(ways, target, candidate.map.grid.cell_size)
+    elif settings.skill == "place":
+        least = _least_room(candidate, settings)
+        if least > 0.0:
+            message.least_room = least
+        message.rule = _place_rule(least, settings.room)
 
 
-def _rule(settings: Settings, motions: int, *, has_room_cost: bool) -> str:
-    """Return how a target is chosen among places that will do."""
-    if motions > 1:
-        return f"the places of {motions} motions are chosen together"
-    if settings.skill == "push":
-        return "a robot that pushes takes the nearest place that will do"
-    if has_room_cost:
-        return "places with enough room come first"
-    return "the most robust place is taken, of equal ones the nearest"
+def _push_rule(ways: Ways, target: Target, size: float) -> str:
+    """Return how the target of a push is chosen among places that will do, in cells of a size."""
+    x, y = ways.end
+    rule = f"of places that will do, ({x:.4g}, {y:.4g}) has the shortest way over cells, {ways.shortest:.4g}"
+    if math.dist(ways.end, (target.x, target.y)) < 1e-6 * size:
+        return rule
+    return f"{rule}; the target is a more robust place within 2 cells ({2.0 * size:.4g}) of it"
+
+
+def _place_rule(least: float, wanted: float) -> str:
+    """Return how the target of a placement is chosen among places that will do."""
+    if least > 0.0:
+        return (
+            f"of places with room {least:.4g} around them the most robust is taken, of equal ones the nearest"
+        )
+    lacks = f"no place has the preferred room of {wanted:.4g}; " if wanted > 0.0 else ""
+    return f"{lacks}the most robust place is taken, of equal ones the nearest"
+
+
+def _least_room(candidate: Candidate, settings: Settings) -> float:
+    """Return the room that the target of a placement keeps; -inf if no place has the preferred room."""
+    good = good_cells(candidate.map, settings, candidate.failed, candidate.failures)
+    room = candidate.map.made_of.now.room(candidate.room_from)
+    return least_room(good, room, settings, candidate.failures)
 
 
 # -------------------------------------------------------------------------------------------------- decisions
@@ -306,11 +337,14 @@ class BlackBox:
         self._step = step
         self._tracked = self._moving_object()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        layers = _layers_of(step, self.planner)
-        self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers)
+        layers, ways = _layers_of(step, self.planner), _ways_of(step, self.planner)
+        self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers, ways)
         turned_maps = maps_of(step)
         maps = [
-            map_message(turned_map, step.time_ns, layers[turned_map.candidate]) for turned_map in turned_maps
+            map_message(
+                turned_map, step.time_ns, layers[turned_map.candidate], ways.get(turned_map.candidate)
+            )
+            for turned_map in turned_maps
         ]
         path = path_message(step.target, self._tracked, step.time_ns)
         if turned_maps:
@@ -424,13 +458,33 @@ def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, .
 
 def _layers_of(step: Step, planner: Planner) -> dict[Candidate, MapLayers]:
     candidates = (candidate for edge in step.considered for candidate in edge.candidates)
+    return {candidate: layers_of(candidate, planner.settings) for candidate in candidates}
+
+
+def layers_of(candidate: Candidate, settings: Settings) -> MapLayers:
+    """Return the layers of a candidate's map."""
+    tried = tried_cells(candidate, settings) if candidate.failures else None
+    return map_layers(candidate.map, settings, candidate.failed, tried)
+
+
+def _ways_of(step: Step, planner: Planner) -> dict[Candidate, Ways]:
+    """Return the ways among which the target of a push was chosen, for the chosen candidate."""
+    if planner.settings.skill != "push":
+        return {}
     return {
-        candidate: map_layers(candidate.map, planner.settings, candidate.failed) for candidate in candidates
+        candidate: ways
+        for candidate in step.candidates
+        if candidate.is_chosen and candidate.target is not None and not candidate.rule
+        if (ways := ways_of(candidate, candidate.target, planner.settings)) is not None
     }
 
 
 def explained_decision(
-    step: Step, planner: Planner, first_map: int = 0, layers: Mapping[Candidate, MapLayers] | None = None
+    step: Step,
+    planner: Planner,
+    first_map: int = 0,
+    layers: Mapping[Candidate, MapLayers] | None = None,
+    ways: Mapping[Candidate, Ways] | None = None,
 ) -> PlanDecision:
     """Return a decision as a message without an outcome, with the layers of its maps.
 
@@ -438,17 +492,18 @@ def explained_decision(
         planner: planner that made the decision.
         first_map: number of the step's first map in the log.
         layers: layers of the maps, if they are already computed.
+        ways: ways of the chosen candidate, if they are already computed.
     """
     layers = layers or _layers_of(step, planner)
+    ways = _ways_of(step, planner) if ways is None else ways
     message = decision_message(step, planner.automaton.name, first_map)
     message.margin = planner.settings.margin
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
         bans = planner.bans(edge, step.pruned)
-        motions = len(edge.motions) if edge.is_joint else 1
         of_edge.wanted[:] = wanted_of(edge.progress.texts, bans)
         of_edge.rules[:] = rules_of(bans)
         for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, candidate, layers[candidate], planner.settings, bans, motions)
+            explain(of_candidate, candidate, layers[candidate], planner.settings, bans, ways.get(candidate))
     return message
 
 
@@ -614,7 +669,8 @@ def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str
     if tight:
         second = "".join(f", then {conjunct.text} ({conjunct.at_target:.4g})" for conjunct in tight[1:2])
         facts.append(f"tightest: {tight[0].text}{second}")
-    return "; ".join(filter(None, [*facts, f"path length {_length(target):.4g}", room_sentence(candidate)]))
+    facts += [f"path length {_length(target):.4g}", room_sentence(candidate), candidate.rule]
+    return "; ".join(filter(None, facts))
 
 
 def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
@@ -744,6 +800,8 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
         yield "blocked", f"{plural(cause.cells, 'cell')}: {plain(cause.words)}"
     if candidate.HasField("room"):
         yield "room", room_sentence(candidate)
+    if candidate.rule:
+        yield "rule", candidate.rule
 
 
 def demand_words(conjunct: PlanConjunct) -> str:

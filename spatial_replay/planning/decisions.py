@@ -123,6 +123,8 @@ class Candidate:
         is_chosen: whether this is the object to move.
         failed: places (x, y) of earlier failed motions, which a target avoids.
         room_from: names of the objects from which the target keeps room; None for all objects.
+        failures: targets of failed motions in the current scene.
+        rule: rule by which the target was chosen together with other motions; empty if it was chosen alone.
     """
 
     name: str
@@ -132,6 +134,8 @@ class Candidate:
     is_chosen: bool = False
     failed: tuple[tuple[float, float], ...] = ()
     room_from: tuple[str, ...] | None = ()
+    failures: tuple[Target, ...] = ()
+    rule: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, islice, product
+from itertools import combinations, count, islice, product
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -722,7 +722,7 @@ class Lookahead:
         self._why.clear()
         for sequence in islice(self._joint(self._first, path, consideration), 4) if together else ():
             if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
-                return self._with_first_motion(consideration, sequence.motions, rest)
+                return self._with_first_motion(consideration, sequence, rest)
         order = by_cost(consideration.candidates, self._settings)
         for number, target in order.items():
             if (rest := self._after(target, path[0])) is None:
@@ -810,6 +810,7 @@ class Lookahead:
         """Yield motions of several objects that take a whole path, or its first edge."""
         if self._settings.motions < 2:
             return
+        numbers = count(1)
         # the whole path first, then only its first edge
         for length in dict.fromkeys((len(path), 1)):
             aims = path[:length]
@@ -829,8 +830,9 @@ class Lookahead:
                 if self._expected.attempts.are_any:
                     # a motion may fail by chance, so places of failed motions are tried after all others
                     arrangements = sorted(arrangements, key=self._is_near_failure)
-                for poses in arrangements:
-                    yield from self._ordered_from(scene, aims, consideration, about, poses, least)
+                for number, poses in zip(numbers, arrangements, strict=False):
+                    for sequence in self._ordered_from(scene, aims, consideration, about, poses, least):
+                        yield sequence._replace(arrangement=number)
 
     def _resume(self, aims: Sequence[Transition], consideration: Consideration) -> Iterator[Ordered]:
         """Yield the motions to the places of the last decision, if they still take the edges.
@@ -917,10 +919,11 @@ class Lookahead:
     def _with_first_motion(
         self,
         consideration: Consideration,
-        motions: tuple[Target, ...],
+        sequence: Ordered,
         rest: tuple[Target, ...],
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
+        motions = sequence.motions
         first, sample = motions[0], self._first.sample
         # a parked object goes to its own place later, so the pose of its first motion is not final
         poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first.name}
@@ -941,7 +944,7 @@ class Lookahead:
         )
         if all(motion.name != first.name for motion in motions[1:]):
             target = self._refine(target, consideration, poses, (*motions[1:], *rest))
-        candidate = Candidate(first.name, gradient, target, is_chosen=True)
+        candidate = Candidate(first.name, gradient, target, is_chosen=True, rule=sequence.rule)
         rivals = (rival for rival in consideration.candidates if rival.name != first.name)
         others = tuple(replace(rival, is_chosen=False) for rival in rivals)
         planned = (target, *motions[1:], *rest)

@@ -467,13 +467,17 @@ class MapLayers:
 
 
 def map_layers(
-    gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]] = ()
+    gradient: GradientMap,
+    settings: Settings,
+    failed: Collection[tuple[float, float]] = (),
+    tried: Booleans | None = None,
 ) -> MapLayers:
     """Split a gradient map into the layers of its conjuncts and causes.
 
     Args:
         settings: settings of the planner.
         failed: places (x, y) where motions of the object failed, which the object avoids.
+        tried: (A, rows, columns), further cells near failed targets.
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = parts.then.about.propositions
@@ -488,7 +492,8 @@ def map_layers(
         _limit_of([part.limit(layers, places) for part in cube], shape, is_every=True) for cube in cubes
     )
     _, limiting = _limit_of(limits, shape, is_every=False)
-    causes, blocked_by = _causes(gradient, avoided_cells(gradient, settings, failed))
+    avoided = avoided_cells(gradient, settings, failed)
+    causes, blocked_by = _causes(gradient, avoided if tried is None else avoided | tried)
     texts = tuple(leaf.text for leaf in leaves)
     return MapLayers(texts, layers, limiting, causes, blocked_by)
 

@@ -132,7 +132,15 @@ class Movables:
         if isinstance(target, Target) and self.is_repeated(target):
             target = "it was tried wherever it would hold, and nothing has changed since"
         possible_target, why = (None, target) if isinstance(target, str) else (target, "")
-        return Candidate(name, gradient, possible_target, why, failed=failed, room_from=_tuple(room_from))
+        return Candidate(
+            name,
+            gradient,
+            possible_target,
+            why,
+            failed=failed,
+            room_from=_tuple(room_from),
+            failures=self.failed_here(name),
+        )
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
         """Return the targets of failed motions of an object in the current scene."""
@@ -455,11 +463,34 @@ _ASTRAY: Final = -2
 
 
 class Ordered(NamedTuple):
-    """Motions in a possible order, with the resulting scene and state."""
+    """Motions in a possible order, with the resulting scene and state.
+
+    Attributes:
+        is_aside: whether the first motion parks an object.
+        arrangement: number of the arrangement in the order of the search, from 1; 0 for places of the last
+            decision, and for a single motion.
+    """
 
     motions: tuple[Target, ...]
     scene: PredictedState
     state: int
+    is_aside: bool = False
+    arrangement: int = 0
+
+    @property
+    def rule(self) -> str:
+        """The rule by which the place of the first motion was chosen."""
+        if self.is_aside:
+            return (
+                "it goes aside: parking places are tried from the nearest on, and the first one from which "
+                "all motions work is taken"
+            )
+        if not self.arrangement:
+            return "the places that an earlier decision planned are kept, because they still work"
+        return (
+            f"the first arrangement of objects that works is taken, here number {self.arrangement}; few "
+            "objects and robust places are tried first, and better arrangements are not sought"
+        )
 
 
 @dataclass(eq=False)
@@ -533,7 +564,7 @@ class MotionOrder:
                     if blocker not in parked and (
                         sequence := self._on(scene, state, target, left, more, is_first)
                     ):
-                        return sequence
+                        return sequence._replace(is_aside=True)
         self._dead.add((left, scene.moved))
         return None
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 import heapq
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.compiled import kernel, piece
-from spatial_replay.geometry.arrays import Booleans, Flags, Integers, read_only_integers
+from spatial_replay.geometry.arrays import Booleans, Flags, Floats, Integers, read_only_integers
 
 ROOT_2 = math.sqrt(2.0)
 
@@ -58,6 +59,33 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
     diagonal = int(steps.min(axis=1).sum())
     straight = int(steps.max(axis=1).sum()) - diagonal
     return Path(read_only_integers(cells), straight + ROOT_2 * diagonal)
+
+
+def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
+    """Return the length of the shortest path from a cell to each cell, (rows, columns); inf without a path.
+
+    Args:
+        free: (R, C), whether a path may cross each cell; the start need not be free.
+        start: row and column.
+    """
+    is_free = np.pad(free, 1)
+    is_free[start[0] + 1, start[1] + 1] = True
+    lengths = np.full(is_free.shape, np.inf)
+    lengths[start[0] + 1, start[1] + 1] = 0.0
+    inner = (slice(1, -1), slice(1, -1))
+    steps = []
+    for down, right in product((-1, 0, 1), repeat=2):
+        if down or right:
+            before = slice(1 - down, len(is_free) - 1 - down), slice(1 - right, is_free.shape[1] - 1 - right)
+            # a diagonal step needs both adjacent cells free
+            is_open = is_free[inner] & is_free[before[0], inner[1]] & is_free[inner[0], before[1]]
+            steps.append((before, is_open, ROOT_2 if down and right else 1.0))
+    while True:
+        previous = lengths.copy()
+        for before, is_open, length in steps:
+            np.minimum(lengths[inner], lengths[before] + length, where=is_open, out=lengths[inner])
+        if np.array_equal(lengths, previous):
+            return np.asarray(lengths[inner])
 
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:

@@ -47,13 +47,14 @@ from spatial_replay.planning.decision_log import (
     effort_text,
     explained_decision,
     latest_decisions,
+    layers_of,
     maps_of,
     plain,
     plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
 from spatial_replay.planning.demands import Ban, ban_of, demand_of
-from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of, map_layers
+from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, changed_settings, changes_text, settings_from_text
 from spatial_replay.sources.open_log import open_source
@@ -299,7 +300,7 @@ def why_not_there(
         f"{gradient.robustness[cell]:.4g}, {settings.margin:.4g} needed "
         f"({effort_text(steps[number].message)})"
     )
-    layers = map_layers(gradient, settings, candidate.failed)
+    layers = layers_of(candidate, settings)
     bans = planner.bans(edge, step.pruned)
     for layer in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
         value = float(layers.robustness[(layer, *cell)])

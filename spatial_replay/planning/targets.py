@@ -29,7 +29,7 @@ from spatial_replay.planning.maps import (
     distance_to,
     proposition_maps,
 )
-from spatial_replay.planning.paths import Path, shortest_path
+from spatial_replay.planning.paths import Path, lengths_from, shortest_path
 from spatial_replay.planning.settings import Grid, Settings
 from spatial_replay.spec.format import format_term
 from spatial_replay.spec.formula import Atom, Term, TrackedName
@@ -81,26 +81,55 @@ def find_target(
         failed: places (x, y) where earlier motions failed.
         failures: targets of failed motions in the current scene.
     """
-    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    good = holds & ~avoided_cells(gradient, settings, failed)
+    good = good_cells(gradient, settings, failed, failures)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
-        # cells at least a finger's width from failed targets; without any, cells with other poses than these
-        for apart in (_spread(settings), _SAME * _cell(settings)):
-            untried = good & ~tried_poses(gradient, failures, apart)
-            if untried.any():
-                good = untried
-                break
-        # after failures, the cells with the most room count if no cell has the preferred room
-        least_room = min(settings.room, float(room[good].max())) if failures else settings.room
-        roomy = good & (room >= least_room)
-        values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
+        roomy = good & (room >= least_room(good, room, settings, failures))
+        values = np.where(roomy, gradient.robustness, -np.inf)
         # the nearest of equally robust cells
         away = distance_to([centre_of(tracked.footprint)], gradient.grid)
         values = np.where(values >= values.max() - _EQUAL, -away, -np.inf)
         return _best_target(gradient, values, tracked)
     return _nearest_cell(gradient, good, tracked, settings, failures)
+
+
+def good_cells(
+    gradient: GradientMap,
+    settings: Settings,
+    failed: Collection[tuple[float, float]] = (),
+    failures: Sequence[Target] = (),
+) -> Booleans:
+    """Return the cells that will do as a target, (A, rows, columns); arguments as in `find_target`."""
+    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    good: Booleans = holds & ~avoided_cells(gradient, settings, failed)
+    if settings.skill == "place" and failures:
+        # cells at least a finger's width from failed targets; without any, cells with other poses than these
+        for apart in (_spread(settings), _SAME * _cell(settings)):
+            untried = good & ~tried_poses(gradient, failures, apart)
+            if untried.any():
+                return untried
+    return good
+
+
+def tried_cells(candidate: Candidate, settings: Settings) -> Booleans:
+    """Return the cells that would do but for failed motions of a candidate, (A, rows, columns)."""
+    gradient = candidate.map
+    good = good_cells(gradient, settings, candidate.failed, candidate.failures)
+    return np.asarray((gradient.blocked == FREE) & (gradient.robustness >= settings.margin) & ~good)
+
+
+def least_room(good: Booleans, room: Floats, settings: Settings, failures: Sequence[Target] = ()) -> float:
+    """Return the room that a placed object keeps; -inf if no cell has the preferred room.
+
+    Args:
+        good: cells that will do.
+        room, failures: as in `find_target`.
+    """
+    # after failures, the cells with the most room count if no cell has the preferred room
+    most = float(room[good].max(initial=-math.inf))
+    preferred = min(settings.room, most) if failures else settings.room
+    return preferred if most >= preferred else -math.inf
 
 
 def target_in(
@@ -181,6 +210,47 @@ def _nearest_cell(
     if not failures:
         way = _without_corners(way, gradient, free, settings)
     return _target(gradient, tracked, (turned, *cells[-1]), way)
+
+
+class Ways(NamedTuple):
+    """Ways of a pushed object over cells.
+
+    Attributes:
+        lengths: (rows, columns), length of the shortest way to each cell; inf without a way.
+        shortest: length of the shortest way to a cell that will do.
+        end: middle of the nearest of these cells to the target.
+    """
+
+    lengths: Floats
+    shortest: float
+    end: tuple[float, float]
+
+
+def ways_of(candidate: Candidate, target: Target, settings: Settings) -> Ways | None:
+    """Return the ways that `find_target` compares for a push; None if it finds no way."""
+    gradient, failures = candidate.map, candidate.failures
+    grid = gradient.grid
+    tracked = gradient.made_of.now.about.sample.objects[candidate.name]
+    towards = _failed_directions(grid, tracked, failures)
+    entry = _path_into_reach(gradient, grid.cell(*centre_of(tracked.footprint)), settings, towards)
+    if entry is None:
+        return None
+    free = (gradient.blocked[0] == FREE) & ~towards
+    row, column = entry.cells[-1].tolist()
+    lengths = (entry.length + lengths_from(free, (row, column))) * grid.cell_size
+    layer, *_ = gradient.cell_of(*target.pose)
+    good = good_cells(gradient, settings, candidate.failed, failures)[layer]
+    if layer:
+        able = _turnable(gradient, layer, good & free, settings)
+        lengths = np.where(good & ~able, np.inf, lengths)
+    of_good = np.where(good, lengths, np.inf)
+    shortest = float(of_good.min())
+    if not math.isfinite(shortest):
+        return None
+    away = distance_to([(target.x, target.y)], grid)
+    end = np.where(of_good <= shortest * (1.0 + _EQUAL), away, np.inf)
+    row, column = (int(index) for index in np.unravel_index(int(np.argmin(end)), end.shape))
+    return Ways(lengths, shortest, grid.centre(row, column))
 
 
 def _without_corners(

@@ -697,12 +697,14 @@ class _Owner(NamedTuple):
         edge: index of the edge in the decision.
         place: index of the candidate in the edge.
         turn: turn of the object in radians.
+        is_joint: whether the edge takes several motions.
     """
 
     edge: int
     place: int
     candidate: PlanCandidate
     turn: float
+    is_joint: bool
 
     @property
     def target(self) -> PlanTarget | None:
@@ -784,7 +786,7 @@ def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
     """Yield the maps of a decision, or the maps of its time if the log does not record the owners of maps."""
     owners = {
-        named.number: _Owner(edge, place, candidate, named.turn)
+        named.number: _Owner(edge, place, candidate, named.turn, considered.joint)
         for edge, considered in enumerate(decision.considered)
         for place, candidate in enumerate(considered.candidates)
         for named in candidate.maps
@@ -843,6 +845,7 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "title": "",
         "target": None,
         "rule": "",
+        "joint": False,
     }
     owner = drawn.owner
     if owner is None:
@@ -857,6 +860,7 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "title": f"{candidate.object}{turn_text}",
         "target": None if owner.target is None else _target_value(owner.target),
         "rule": candidate.rule,
+        "joint": owner.is_joint,
     }
 
 
@@ -883,8 +887,10 @@ def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, A
     }
     if owner.target is not None:
         value["at_target"] = [_finite(conjunct, "at_target") for conjunct in candidate.conjuncts]
-    if drawn.is_chosen and candidate.HasField("room") and "room" in drawn.fields:
-        value |= {"room": packing.add(drawn.fields["room"], "f4"), "wanted_room": candidate.room.wanted}
+    if drawn.is_chosen and candidate.HasField("least_way") and "way" in drawn.fields:
+        value |= {"way": packing.add(drawn.fields["way"], "f4"), "least_way": candidate.least_way}
+    if drawn.is_chosen and candidate.HasField("least_room") and "room" in drawn.fields:
+        value |= {"room": packing.add(drawn.fields["room"], "f4"), "least_room": candidate.least_room}
     return value
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from itertools import count, pairwise, product
 
 import numpy as np
+import pytest
+from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +17,10 @@ import spatial_replay as sr
 from examples import examples
 from spatial_replay import Planner, Settings
 from spatial_replay.geometry.footprint import centre_of
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION
 from spatial_replay.planning import Grid, Outcome, Workspace, moved_object
+from spatial_replay.planning.decision_log import BlackBox, map_fields
 from spatial_replay.planning.demands import bans_of
 from spatial_replay.planning.edges import MOST_MOTIONS
 from spatial_replay.planning.maps import proposition_maps
@@ -205,6 +211,52 @@ def test_a_planner_terminates_with_a_reason_for_each_pruned_edge(specification, 
     if step.kind == "no path":
         assert step.reason.startswith("no path left")
         assert all(reason.kind for _, reason in step.pruned)
+
+
+@given(st.data(), settings_of_planners(), st.integers(0, 2**32 - 1))
+@examples(15)
+def test_no_cell_that_would_do_is_better_than_the_target_by_the_rule_in_the_log(data, options, seed):
+    options = replace(options, room=data.draw(st.sampled_from([0.0, 1.5])))
+    random = np.random.default_rng(seed)
+    written = []
+    box = BlackBox(Planner(data.draw(st.one_of(easy_tasks(), tasks())), options), written.append)
+    shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
+    scene = {name: moved_object(shape, *random.uniform(-5, 5, 2)) for name in THINGS}
+    for time_ns in range(4):
+        box.observe(sr.Sample(time_ns, scene))
+        if time_ns:
+            box.conclude(Outcome(succeeded=False, reason="it slipped"))
+        step = box.next_step()
+        if step.kind != "execute":
+            return
+        rows = [(topic, row.payload) for m in written for topic, row in zip(m.topics, m.rows(), strict=True)]
+        decision = [PlanDecision.FromString(payload) for topic, payload in rows if topic == PLAN_DECISION][-1]
+        grids = [GridMessage.FromString(payload) for topic, payload in rows if topic == GRADIENT_MAP]
+        (chosen,) = [each for each in decision.considered[-1].candidates if each.chosen]
+        check_rule(chosen, [map_fields(grids[each.number]) for each in chosen.maps], decision, options)
+
+
+def check_rule(chosen, maps, decision, options):
+    """Check that no cell of the maps of the chosen object is better than its target."""
+    fields, target = maps[0], chosen.target
+    would_do = (fields["blocked_by"] == 0) & (fields["robustness"] >= options.margin)
+    if decision.considered[-1].joint:
+        assert re.match("it goes aside|the places that an earlier|the first arrangement", chosen.rule)
+    elif options.skill == "push":
+        # the shortest way leads to the target, or to a cell near it
+        least = chosen.least_way
+        assert np.nanmin(fields["way"][would_do]) == pytest.approx(least)
+        ends = would_do & (fields["way"] <= least * (1.0 + 1e-6))
+        x, y = np.meshgrid(np.arange(-5.5, 6.0), np.arange(-5.5, 6.0))
+        assert (ends & (abs(x - target.x) <= 2.0) & (abs(y - target.y) <= 2.0)).any()
+        assert f"{least:.4g}" in chosen.rule
+    else:
+        roomy = (
+            would_do & (fields["room"] >= chosen.least_room) if chosen.HasField("least_room") else would_do
+        )
+        better = roomy & (fields["robustness"] > target.robustness + 1e-6)
+        assert not better.any()
+        assert chosen.HasField("least_room") == ("of places with room" in chosen.rule)
 
 
 @st.composite

@@ -69,14 +69,18 @@ def test_a_region_with_a_seam_is_named_where_an_object_would_have_to_cross_it():
 @pytest.mark.parametrize(
     ("goal", "options", "rule"),
     [
-        ("a leftof b", {"skill": "push"}, "a robot that pushes takes the nearest place that will do"),
+        ("a leftof b", {"skill": "push"}, "of places that will do, (0.325, 0.575) has the shortest way"),
         ("a leftof b", {"skill": "place"}, "the most robust place is taken, of equal ones the nearest"),
         (
             "a enclosedin slot",
             {"skill": "place", "room": 0.35, "room_from": "all"},
-            "places with enough room come first",
+            "of places with room 0.35 around them the most robust is taken",
         ),
-        ("a leftof c and b rightof d", {"skill": "place"}, "the places of 2 motions are chosen together"),
+        (
+            "a leftof c and b rightof d",
+            {"skill": "place"},
+            "the first arrangement of objects that works is taken, here number 1",
+        ),
     ],
 )
 def test_the_rule_that_chose_a_place_is_in_the_decision(goal, options, rule):
@@ -96,7 +100,7 @@ def test_the_rule_that_chose_a_place_is_in_the_decision(goal, options, rule):
         for candidate in explained_decision(step, planner).considered[-1].candidates
         if candidate.chosen
     )
-    assert chosen.rule == rule
+    assert chosen.rule.startswith(rule)
 
 
 def test_equal_objects_are_taken_by_their_ways_then_by_their_order():

@@ -327,6 +327,8 @@ class PlanCandidate(google.protobuf.message.Message):
     CAUSES_FIELD_NUMBER: builtins.int
     ROOM_FIELD_NUMBER: builtins.int
     RULE_FIELD_NUMBER: builtins.int
+    LEAST_WAY_FIELD_NUMBER: builtins.int
+    LEAST_ROOM_FIELD_NUMBER: builtins.int
     object: builtins.str
     best: builtins.float
     """Greatest robustness of the progress set at a cell that is not blocked; -infinity if all are."""
@@ -338,6 +340,12 @@ class PlanCandidate(google.protobuf.message.Message):
     """Whether it is the one to be moved."""
     rule: builtins.str
     """How its target is chosen among places that will do; empty without a target."""
+    least_way: builtins.float
+    """Of a push: the length of the shortest way over cells to a place that will do. The field `way` of the map has
+    the length of the way to each cell.
+    """
+    least_room: builtins.float
+    """Of a placement: the least room around a place that is taken; absent if no place has the preferred room."""
     @property
     def target(self) -> global___PlanTarget:
         """Where it would go; absent if it was rejected."""
@@ -372,10 +380,17 @@ class PlanCandidate(google.protobuf.message.Message):
         causes: collections.abc.Iterable[global___PlanCause] | None = ...,
         room: global___PlanRoom | None = ...,
         rule: builtins.str = ...,
+        least_way: builtins.float | None = ...,
+        least_room: builtins.float | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "room", b"room", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "causes", b"causes", "chosen", b"chosen", "conjuncts", b"conjuncts", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "room", b"room", "rule", b"rule", "target", b"target"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_best", b"_best", "_least_room", b"_least_room", "_least_way", b"_least_way", "best", b"best", "least_room", b"least_room", "least_way", b"least_way", "room", b"room", "target", b"target"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_best", b"_best", "_least_room", b"_least_room", "_least_way", b"_least_way", "best", b"best", "causes", b"causes", "chosen", b"chosen", "conjuncts", b"conjuncts", "least_room", b"least_room", "least_way", b"least_way", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "room", b"room", "rule", b"rule", "target", b"target"]) -> None: ...
+    @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_best", b"_best"]) -> typing.Literal["best"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_least_room", b"_least_room"]) -> typing.Literal["least_room"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_least_way", b"_least_way"]) -> typing.Literal["least_way"] | None: ...
 
 global___PlanCandidate = PlanCandidate
 

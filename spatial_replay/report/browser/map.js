@@ -57,11 +57,14 @@ function whyThere(run, map, {margin}) {
   const [inCell, target] = [values[row * map.columns + column], map.target.robustness];
   // a refined target may be better than the middle of its cell
   const best = Math.max(inCell, target);
+  // cells near failed motions have a value, too
+  const blocked = map.blocked && run.numbers(map.blocked);
   let enough = 0, higher = 0;
-  for (const value of values) {
+  values.forEach((value, place) => {
+    if (blocked?.[place]) return;
     enough += value >= margin;
     higher += value > best;
-  }
+  });
   const between = numberText(inCell) === numberText(target) ? ""
     : ` The target lies between cells and has ${numberText(target)}; demands are those in the middle of its cell, which has ${numberText(inCell)}.`;
   return element("p", {class: "why"},
@@ -114,7 +117,10 @@ function centreOf(map, [row, column]) {
 function answerOf(run, map, decision, cell) {
   const place = cell[0] * map.columns + cell[1];
   const number = (values) => (values ? run.numbers(values)[place] : 0);
-  const facts = {place, value: number(map.values), cause: number(map.blocked), limit: number(map.limited),
+  const aim = map.target?.at ? cellAt(map, map.target.at) : null;
+  const limits = (at) => (map.limited && at ? run.numbers(map.limited)[at[0] * map.columns + at[1]] : 0);
+  const facts = {place, value: number(map.values), cause: number(map.blocked), limit: limits(cell),
+    limitAtTarget: limits(aim), isAim: Boolean(aim) && aim.every((part, axis) => part === cell[axis]), centre: centreOf(map, cell),
     target: map.target ? map.target.robustness : null};
   const rows = demandRows(run, map, facts);
   const unit = run.lengths ? ` [${run.lengths}]` : "";
@@ -136,22 +142,25 @@ function rankOf(row) {
   return row.classList.contains("limits") ? 0 : row.classList.contains("all") ? 1 : 2;
 }
 
-// A row for each demand whose number in a cell is known, and one for all of them where the cell is free.
-function demandRows(run, map, {place, value, cause, limit, target}) {
+// A row for each demand that depends on the cell or limits it or the target, and one for all where the cell is free.
+function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target}) {
   const rows = [];
-  const add = (title, isLimit, numbers) => rows.push(element("tr", {class: isLimit ? "limits" : null},
-    element("th", {scope: "row"}, ...title, isLimit ? " limits" : null),
+  const add = (title, limits, numbers) => rows.push(element("tr", {class: limits ? "limits" : null},
+    element("th", {scope: "row"}, title, limits ? ` ${limits}` : null),
     ...numbers.slice(0, map.target ? 2 : 1).map((number) => element("td", {class: number < 0 ? "number fails" : "number"},
       number === null ? "–" : numberText(number)))));
   (map.limits ?? []).forEach((words, index) => {
     const layer = map.layers?.find(({number}) => number === index + 1);
-    const isLimit = !cause && limit === index + 1;
-    if (!layer && !isLimit) return;
-    add(withCode(words), isLimit,
-      [layer ? run.numbers(layer.values)[place] : value, map.at_target?.[index] ?? null]);
+    const [isLimit, isLimitAtTarget] = [!cause && limit === index + 1, limitAtTarget === index + 1];
+    if (!layer && !isLimit && !isLimitAtTarget) return;
+    const atTarget = map.at_target?.[index] ?? null;
+    const limits = isLimit && isLimitAtTarget ? "limits here and at the target" : isLimit ? "limits"
+      : isLimitAtTarget ? "limits at the target" : null;
+    // without a layer, it is the same in all cells
+    add(withCode(words), limits, [layer ? run.numbers(layer.values)[place] : isLimit ? value : atTarget, atTarget]);
   });
   if (!cause) {
-    add(["all that has to hold"], false, [value, target]);
+    add(["all that has to hold"], null, [value, target]);
     rows.at(-1).classList.add("all");
   }
   const rest = (map.limits?.length ?? 0) - rows.filter((row) => row.querySelector("code")).length;
@@ -162,7 +171,8 @@ function demandRows(run, map, {place, value, cause, limit, target}) {
   return rows;
 }
 
-function cellWords(run, map, decision, {place, value, cause, limit, target}) {
+function cellWords(run, map, decision, facts) {
+  const {place, value, cause, limit, target, isAim} = facts;
   if (cause) return ["Blocked: ", ...withCode(map.blocks[cause - 1] ?? ["something else"]), "."];
   if (Number.isNaN(value)) return ["Blocked, or not known."];
   const demand = withCode(map.limits?.[limit - 1] ?? ["what has to hold"]);
@@ -170,13 +180,32 @@ function cellWords(run, map, decision, {place, value, cause, limit, target}) {
   if (value < 0) return [...demand, `: short by ${numberText(-value)}${spaced(run.lengths)}.`];
   const by = `: met by ${numberText(value)}${spaced(run.lengths)}`;
   if (margin && value < margin) return [...demand, `${by}, less than the ${numberText(margin)} needed.`];
+  if (target === null) return [...demand, `${by}.`];
+  const [here, there] = [value, target].map((number) => `${numberText(number)}${spaced(run.lengths)}`);
+  const would = isAim ? "The target is in this cell." : map.chosen ? `It would do, too. ${whyNotHere(run, map, facts)}` : "";
+  return [...demand, `${by}, and limits this cell. All that has to hold: ${here} in this cell, ${there} at the target. ${would}`];
+}
+
+// Why the target is not in a cell that would do, by the rule that chose the target.
+function whyNotHere(run, map, {place, value, target, centre}) {
+  const length = (number) => `${numberText(number)}${spaced(run.lengths)}`;
+  if (map.joint) return `That counts the other objects at their planned places; ${map.rule}.`;
+  if (map.way) {
+    const way = run.numbers(map.way)[place];
+    if (Number.isNaN(way)) return "No free way over cells leads there.";
+    if (way > map.least_way * (1 + 1e-6)) {
+      return `The way there over cells is ${length(way)}, and the shortest to a place that will do is ${length(map.least_way)}.`;
+    }
+    return `No place that will do has a shorter way over cells, ${length(way)}. The target is a more robust place near the end of such a way.`;
+  }
   const room = map.room && run.numbers(map.room)[place];
-  const rest = room !== undefined && room < map.wanted_room
-    ? ` The room around it is ${numberText(Math.max(room, 0))} of ${numberText(map.wanted_room)}.` : "";
-  if (target === null) return [...demand, `${by}.${rest}`];
-  const more = Math.abs(value - target) <= 1e-6 * Math.abs(target) ? "as much as" : value > target ? "more than" : "less than";
-  const rule = map.chosen && map.rule ? ` It would do, too; ${map.rule}.` : "";
-  return [...demand, `${by}, ${more} at the target.${rule}${rest}`];
+  if (room !== undefined && room < map.least_room) {
+    return `The room around it is ${length(Math.max(room, 0))}, and the target has at least ${length(map.least_room)}.`;
+  }
+  const away = ([x, y]) => Math.hypot(x - map.target.way[0], y - map.target.way[1]);
+  const isEqual = Math.abs(value - target) <= 1e-6 * Math.abs(target) && map.target.way.length && away(centre) >= away(map.target.at);
+  return isEqual ? `It is as robust as the target, which is nearer: ${length(away(map.target.at))} instead of ${length(away(centre))}.`
+    : "The target is more robust.";
 }
 
 function spaced(unit) {
