@@ -127,15 +127,12 @@ function answerOf(run, map, decision, cell) {
   const heads = ["demand", `at (${centreOf(map, cell).map(numberText).join(", ")})${unit}`,
     ...(map.target ? [`at the target${unit}`] : [])];
   const words = element("p", {}, ...cellWords(run, map, decision, facts));
-  if (words.textContent.includes("(margin ")) words.title = MARGIN_TITLE;
   // what decides is in sight without scrolling
   rows.sort((one, other) => rankOf(one) - rankOf(other));
   if (!rows.length) return [words];
   return [words, element("table", {}, element("thead", {}, element("tr", {},
     ...heads.map((head) => element("th", {scope: "col"}, head)))), element("tbody", {}, ...rows))];
 }
-
-const MARGIN_TITLE = "This margin is the constraint margin of the planner's settings: constraints have to be false by it.";
 
 // The row that limits, and that of all demands, come first.
 function rankOf(row) {
