@@ -143,7 +143,7 @@ function rankOf(row) {
 function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target}) {
   const rows = [];
   const add = (title, limits, numbers) => rows.push(element("tr", {class: limits ? "limits" : null},
-    element("th", {scope: "row"}, title, limits ? ` ${limits}` : null),
+    element("th", {scope: "row"}, ...title, limits ? ` ${limits}` : null),
     ...numbers.slice(0, map.target ? 2 : 1).map((number) => element("td", {class: number < 0 ? "number fails" : "number"},
       number === null ? "–" : numberText(number)))));
   (map.limits ?? []).forEach((words, index) => {
