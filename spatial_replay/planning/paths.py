@@ -70,22 +70,22 @@ def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
     """
     is_free = np.pad(free, 1)
     is_free[start[0] + 1, start[1] + 1] = True
-    lengths = np.full(is_free.shape, np.inf)
-    lengths[start[0] + 1, start[1] + 1] = 0.0
-    inner = (slice(1, -1), slice(1, -1))
-    steps = []
-    for down, right in product((-1, 0, 1), repeat=2):
-        if down or right:
-            before = slice(1 - down, len(is_free) - 1 - down), slice(1 - right, is_free.shape[1] - 1 - right)
+    width, is_open = is_free.shape[1], is_free.ravel()
+    lengths = np.full(is_free.size, np.inf)
+    newest = np.array([(start[0] + 1) * width + start[1] + 1])
+    lengths[newest] = 0.0
+    # only cells that became nearer in the last round can bring others nearer
+    while newest.size:
+        nearer = []
+        for down, right in product((-1, 0, 1), repeat=2):
+            after, length = newest + down * width + right, ROOT_2 if down and right else 1.0
             # a diagonal step needs both adjacent cells free
-            is_open = is_free[inner] & is_free[before[0], inner[1]] & is_free[inner[0], before[1]]
-            steps.append((before, is_open, ROOT_2 if down and right else 1.0))
-    while True:
-        previous = lengths.copy()
-        for before, is_open, length in steps:
-            np.minimum(lengths[inner], lengths[before] + length, where=is_open, out=lengths[inner])
-        if np.array_equal(lengths, previous):
-            return np.asarray(lengths[inner])
+            is_step = is_open[after] & is_open[newest + down * width] & is_open[newest + right]
+            is_step &= lengths[newest] + length < lengths[after]
+            lengths[after[is_step]] = lengths[newest[is_step]] + length
+            nearer.append(after[is_step])
+        newest = np.unique(np.concatenate(nearer))
+    return np.asarray(lengths.reshape(is_free.shape)[1:-1, 1:-1])
 
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
