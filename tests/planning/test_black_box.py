@@ -310,7 +310,9 @@ def test_the_drawing_of_a_map_has_the_contour_axes_scale_and_way(tmp_path):
         assert sides[across] == ((one != two) & free[0] & free[1]).sum() > 0
     assert [(point.x, point.y) for point in way.points] == list(first.target.waypoints)
     assert len(outline.points) == 4
-    (bar,) = frame.triangles
+    blocked, bar = frame.triangles
+    widths = [end.x - start.x for start, end in zip(blocked.points[::4], blocked.points[1::4], strict=True)]
+    assert sum(widths) == pytest.approx(np.isnan(values).sum() * size)
     middle = bar.colors[len(bar.colors) // 2]
     assert middle.r == middle.b, "white at 0"
     texts = {text.text: (text.pose.position.x, text.pose.position.y) for text in frame.texts}
