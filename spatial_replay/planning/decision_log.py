@@ -202,7 +202,7 @@ def explain(
     place = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
     for number, text in enumerate(layers.conjuncts):
         at_target = None if place is None else float(layers.robustness[number][place])
-        words = demand_of(text, bans)
+        words = demand_of(text, bans, is_required=layers.required[number])
         message.conjuncts.append(
             PlanConjunct(text=text, limits=counts[number], at_target=at_target, words=words)
         )

@@ -84,12 +84,15 @@ def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
     )
 
 
-def demand_of(literal: str, bans: Iterable[Ban]) -> str:
+def demand_of(literal: str, bans: Iterable[Ban], *, is_required: bool = True) -> str:
     """Return a literal of a goal as a demand: a relation to reach, to keep or to avoid.
 
     Args:
         bans: bans on the way; a relation that they require is one to keep.
+        is_required: whether the literal must hold; otherwise it is one of several alternatives.
     """
+    if not is_required:
+        return f"one of several: {demand_of(literal, bans)}"
     text = _without_brackets(literal.removeprefix("not "))
     if literal.startswith("not "):
         return f"avoid {_listing([text], '')}"

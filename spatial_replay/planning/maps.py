@@ -452,6 +452,7 @@ class MapLayers:
 
     Attributes:
         conjuncts: texts of the L relations in the progress set, or of their negations.
+        required: whether each conjunct must hold; False for one of several alternatives.
         robustness: (L, A, rows, columns), robustness of each conjunct; -inf if it is unknown.
         limiting: (A, rows, columns), index of the conjunct whose robustness equals the progress set's; -1
             without one.
@@ -460,6 +461,7 @@ class MapLayers:
     """
 
     conjuncts: tuple[str, ...]
+    required: tuple[bool, ...]
     robustness: Floats
     limiting: NDArray[np.int64]
     causes: tuple[BlockedBy, ...]
@@ -495,7 +497,9 @@ def map_layers(
     avoided = avoided_cells(gradient, settings, failed)
     causes, blocked_by = _causes(gradient, avoided if tried is None else avoided | tried)
     texts = tuple(leaf.text for leaf in leaves)
-    return MapLayers(texts, layers, limiting, causes, blocked_by)
+    required_leaves = [{leaf for part in cube for leaf in part.required_leaves()} for cube in cubes]
+    required = tuple(all(leaf in of_cube for of_cube in required_leaves) for leaf in leaves)
+    return MapLayers(texts, required, layers, limiting, causes, blocked_by)
 
 
 _Limit: TypeAlias = tuple[Floats, NDArray[np.int64]]
@@ -541,6 +545,13 @@ class _Part(NamedTuple):
         """Iterate over all relations in the part."""
         members = self.members
         yield from chain.from_iterable(member.leaves() for member in members) if members else (self,)
+
+    def required_leaves(self) -> Iterator[_Part]:
+        """Iterate over the relations that must hold, without alternatives."""
+        if not self.members:
+            yield self
+        elif self.is_every:
+            yield from chain.from_iterable(member.required_leaves() for member in self.members)
 
     def options(self) -> Iterator[_Part]:
         """Iterate over alternatives: the part holds if any one of them holds."""

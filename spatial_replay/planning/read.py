@@ -306,12 +306,16 @@ def why_not_there(
         value = float(layers.robustness[(layer, *cell)])
         judgement = "not met" if value < 0.0 else "met"
         note = f", but {settings.margin:.4g} needed" if 0.0 <= value < settings.margin else ""
-        yield f"  {value:>9.4g}  {plain(demand_of(layers.conjuncts[layer], bans))}: {judgement}{note}"
+        demand = demand_of(layers.conjuncts[layer], bans, is_required=layers.required[layer])
+        yield f"  {value:>9.4g}  {plain(demand)}: {judgement}{note}"
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, bans, settings))
     if target is not None:
         judgement = "chosen" if candidate.is_chosen else "possible"
         yield f"  {judgement} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
+        of_edge = steps[number].message.considered[step.considered.index(edge)]
+        rules = [message.rule for message in of_edge.candidates if message.object == name and message.rule]
+        yield from (f"  rule: {rule}" for rule in rules)
 
 
 def _blocking_texts(

@@ -203,13 +203,14 @@ def test_a_place_that_was_not_chosen_is_explained_by_the_demands_that_fail_there
     number, demand = lines[1].split(maxsplit=1)
     assert float(number) < 0.0
     assert demand == "keep red dist blue >= 0.03: not met"
-    assert any(line.endswith("  avoid green rightof red: met") for line in lines)
+    assert any(line.endswith("  one of several: avoid green rightof red: met") for line in lines)
     assert any(
         line.startswith("  blocked: on the way, keep red dist blue >= 0.03: short by ") for line in lines
     )
     assert any(line.startswith("  blocked: blue stands there: they overlap by ") for line in lines)
     assert not [line for line in lines if "not (" in line]
-    assert lines[-1].startswith("  chosen instead: (")
+    assert lines[-2].startswith("  chosen instead: (")
+    assert lines[-1].startswith("  rule: of places that will do, (")
     *_, last = call("plan", "--why", log, "--step", 0, "--object", "blue", "--at", "0.5,-0.05")
     assert last.startswith("  possible instead: (")
     for arguments, error in {
@@ -256,6 +257,7 @@ def test_constraints_are_said_as_what_to_keep_and_what_to_avoid():
     way = bans_of(["not ((a dist b >= 1) and e)", "not h and not i"])
     demands = [demand_of(literal, way) for literal in ("k", "h", "e", "a dist b >= 1", "not (f and g)")]
     assert demands == ["`k`", "`h`", "keep `e`", "keep `a dist b >= 1`", "avoid `f and g`"]
+    assert demand_of("not f", way, is_required=False) == "one of several: avoid `f`"
     wanted = wanted_of(["k and e and not c and not d", "not k and e and not m"], bans)
     assert wanted == ("`k` and `c` no longer", "`k` no longer and `m` no longer")
 
