@@ -80,7 +80,7 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             F and G. Its U reaches to the ends of the formula on both sides.
     """
     levels = [_Level()]
-    for before, token in pairwise([None, *tokens]):
+    for previous, token in pairwise([None, *tokens]):
         level = levels[-1]
         if token is None:
             continue
@@ -97,8 +97,8 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             levels[-1] = _Level()
         elif token.type == "NOT":
             level.negation = level.negation or token
-            if before is not None and before.value in ("X", "WX") and _is_strong_sign(before, token):
-                yield _strong_next(before, token, source)
+            if previous is not None and previous.value in ("X", "WX") and _is_strong_sign(previous, token):
+                yield _strong_next(previous, token, source)
         elif token.type in BINARY_TYPES:
             if level.prefix is not None:
                 yield _reach(level.prefix, token, source)
@@ -109,9 +109,9 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
             level.binary = token
 
 
-def _is_strong_sign(before: Token, token: Token) -> bool:
+def _is_strong_sign(previous: Token, token: Token) -> bool:
     """Return whether a `!` directly follows a prefix operator, as in `X! a`."""
-    return token.value == "!" and before.type == "PREFIX" and before.end_pos == token.start_pos
+    return token.value == "!" and previous.type == "PREFIX" and previous.end_pos == token.start_pos
 
 
 def _strong_next(prefix: Token, sign: Token, source: SourceText) -> Diagnostic:
@@ -135,15 +135,15 @@ def _grouping_warnings(level: _Level, operator: Token, source: SourceText) -> It
         yield source.diagnostic("warning", span_of(level.negation), message, "write the brackets you mean")
         level.negation = None
     elif level.binary is not None and _differs(level.binary, operator):
-        pair = f"{level.binary.value!r} and {operator.value!r}"
-        message = f"the published grammar groups {pair} the other way round"
+        operators = f"{level.binary.value!r} and {operator.value!r}"
+        message = f"the published grammar groups {operators} the other way round"
         yield source.diagnostic("warning", span_of(operator), message, "write the brackets you mean")
 
 
-def _differs(first: Token, second: Token) -> bool:
-    if "INFIX" in (first.type, second.type):
-        return first.type != second.type
-    return _TIGHTNESS[first.type] > _TIGHTNESS[second.type]
+def _differs(first_operator: Token, second_operator: Token) -> bool:
+    if "INFIX" in (first_operator.type, second_operator.type):
+        return first_operator.type != second_operator.type
+    return _TIGHTNESS[first_operator.type] > _TIGHTNESS[second_operator.type]
 
 
 def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[Diagnostic]:
@@ -151,21 +151,21 @@ def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[D
 
     A bounded until has the same spelling in R2U2. It is warned about only if the text contains `&&` or `||`.
     """
-    signs = (token for token in tokens if token.type in ("AND", "OR"))
-    is_of_r2u2 = any(_source_text(token, source) in _R2U2_SIGNS for token in signs)
-    for place, token in enumerate(tokens):
+    connectives = (token for token in tokens if token.type in ("AND", "OR"))
+    has_r2u2_sign = any(_source_text(token, source) in _R2U2_SIGNS for token in connectives)
+    for position, token in enumerate(tokens):
         if token.type not in ("PREFIX", "INFIX"):
             continue
         if _source_text(token, source) == "next":
             message = "'next' is read as X, so there has to be a next sample"
             hint = "in rtamt it holds at the last sample, too: write WX for that, X for this"
             yield source.diagnostic("warning", span_of(token), message, hint)
-        window = tokens[place + 1 : place + 3]
-        is_window = [following.type for following in window] == ["LSQB", "NUMBER"]
-        begin = window[1].value if is_window else ""
-        if is_of_r2u2 and token.value in ("U", "R") and begin.strip("0").isdigit():
+        next_tokens = tokens[position + 1 : position + 3]
+        has_window = [next_token.type for next_token in next_tokens] == ["LSQB", "NUMBER"]
+        lower_end = next_tokens[1].value if has_window else ""
+        if has_r2u2_sign and token.value in ("U", "R") and lower_end.strip("0").isdigit():
             message = f"the left side of {token.value!r} counts from now, not from its window's beginning"
-            hint = f"in R2U2 it counts from there: F[{begin}, {begin}] (a {token.value}[0, ...] b)"
+            hint = f"in R2U2 it counts from there: F[{lower_end}, {lower_end}] (a {token.value}[0, ...] b)"
             yield source.diagnostic("warning", span_of(token), message, hint)
 
 
@@ -198,14 +198,14 @@ def last_sample_warnings(specification: Specification) -> Iterator[Diagnostic]:
     source = SourceText.of(specification.source, specification.filename)
     warned: set[Span] = set()
     for spec in specification.results:
-        for outer in iter_formulas(spec.formula):
-            inner = operands_of(outer)[0] if _is_unbounded(outer) else outer
-            pair = f"{operator_of(outer)} {operator_of(inner)}"
-            if pair not in ("F G", "G F") or not _is_unbounded(inner) or outer.span in warned:
+        for formula in iter_formulas(spec.formula):
+            operand = operands_of(formula)[0] if _is_unbounded(formula) else formula
+            operators = f"{operator_of(formula)} {operator_of(operand)}"
+            if operators not in ("F G", "G F") or not _is_unbounded(operand) or formula.span in warned:
                 continue
-            warned.add(outer.span)
-            message = f"`{pair} p` asks for the last sample of a log alone"
-            yield source.diagnostic("warning", outer.span, message, _LASTING[pair])
+            warned.add(formula.span)
+            message = f"`{operators} p` asks for the last sample of a log alone"
+            yield source.diagnostic("warning", formula.span, message, _LASTING[operators])
 
 
 _LASTING: Final = {
@@ -233,10 +233,10 @@ def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterato
             if isinstance(atom, Atom) and is_exact and atom.span not in warned:
                 warned.add(atom.span)
                 message = f"`{atom.text}` hardly ever holds: its robustness is at most 0"
-                *names, _, limit = atom.parameters
+                *rate_signals, _, limit = atom.parameters
                 # 12 digits, because 0.1 + 0.05 would be written as 0.15000000000000002
-                low, high = (float(f"{float(limit) + by:.12g}") for by in (-0.05, 0.05))
-                band = format_relation(atom.relation, atom.terms, (*names, low, "<=", "<=", high))
+                lower, upper = (float(f"{float(limit) + offset:.12g}") for offset in (-0.05, 0.05))
+                band = format_relation(atom.relation, atom.terms, (*rate_signals, lower, "<=", "<=", upper))
                 hint = f"write a band, such as {band}"
                 yield source.diagnostic("warning", atom.span, message, hint)
 
@@ -300,11 +300,11 @@ def signal_names(specification: Specification) -> tuple[str, ...]:
 
 def _atoms(specification: Specification) -> Iterable[Atom]:
     # a spec that names another shares its formula, so one atom can be in several specs
-    visited: set[int] = set()
+    visited_ids: set[int] = set()
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
-            if isinstance(formula, Atom) and id(formula) not in visited:
-                visited.add(id(formula))
+            if isinstance(formula, Atom) and id(formula) not in visited_ids:
+                visited_ids.add(id(formula))
                 yield formula
 
 
@@ -333,43 +333,43 @@ def check_names(
         error with the nearest name. The class of an open group is an error only if a class of the log has a
         similar name. Each object of the log that is hidden by a definition of the same name is a warning.
     """
-    objects, numeric = tuple(known), tuple(signals)
+    known_objects, known_signals = tuple(known), tuple(signals)
     known_classes = tuple(classes)
     source = SourceText.of(specification.source, specification.filename)
-    places, defined = _places(specification, source)
+    first_places, definition_places = _places(specification, source)
     diagnostics: list[Diagnostic] = []
 
     def report(
         kind: str, name: str, candidates: tuple[str, ...], span: Span, hint: str = "", during: str = ""
     ) -> None:
         # an unknown name in a sum is parsed as a signal, so it may be a misspelt constant
-        choices = (*candidates, *specification.constants) if kind == "signal" else candidates
-        hint = hint or " ".join(filter(None, (nearest_hint(name, choices), _listing(kind, candidates))))
+        similar_names = (*candidates, *specification.constants) if kind == "signal" else candidates
+        hint = hint or " ".join(filter(None, (nearest_hint(name, similar_names), _listing(kind, candidates))))
         message = f"the {where} never has the {kind} {name!r}" + (during and f" {during}")
         diagnostics.append(source.diagnostic("error", span, message, hint))
 
     for kind, names, candidates in (
-        ("object", object_names(specification), objects),
-        ("signal", signal_names(specification), numeric),
+        ("object", object_names(specification), known_objects),
+        ("signal", signal_names(specification), known_signals),
     ):
         for name in names:
             if name not in candidates:
                 hint = _class_hint(name, kind, known_classes)
-                report(kind, name, candidates, places.get(name, Span(0, 0)), hint, during)
+                report(kind, name, candidates, first_places.get(name, Span(0, 0)), hint, during)
     folded_classes = {name.casefold() for name in known_classes}
     for spec in specification.results:
         choice = each.get(spec.parameter or "", "all")
         kind, _, name = choice.partition(":")
         if kind == "class" and name.casefold() not in folded_classes:
             report("class", name, known_classes, spec.span)
-        elif kind != "class" and choice not in ("all", *objects):
-            report("object", choice, objects, spec.span)
+        elif kind != "class" and choice not in ("all", *known_objects):
+            report("object", choice, known_objects, spec.span)
     for name in group_classes(specification):
         # a log may lack a class, so only a name that is close to one of its classes is reported as misspelt
         if name != ANY_CLASS and name.casefold() not in folded_classes and nearest_hint(name, known_classes):
-            report("class", name, known_classes, places.get(name, Span(0, 0)))
-    for name, span in defined.items():
-        if name in objects:
+            report("class", name, known_classes, first_places.get(name, Span(0, 0)))
+    for name, span in definition_places.items():
+        if name in known_objects:
             message = f"the {where} has an object {name!r}, which this definition hides"
             hint = "give the definition another name"
             hint += f"; {title_hint(name)}" if any(spec.name == name for spec in specification.specs) else ""
@@ -387,31 +387,37 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
         SpecificationError: an unknown name of an enumerated signal, or a sum or comparison of numbers with
             different units.
     """
-    tables = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
+    names_by_signal = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
     faults = Faults(SourceText.of(specification.source, specification.filename))
 
     def named_equality(atom: Atom) -> Equality | None:
-        part = atom.expression.operand if isinstance(atom.expression, Negative) else atom.expression
-        if isinstance(part, Equality) and part.signal.name in tables and is_text_number(part.value):
-            return part
+        equality = atom.expression.operand if isinstance(atom.expression, Negative) else atom.expression
+        if (
+            isinstance(equality, Equality)
+            and equality.signal.name in names_by_signal
+            and is_text_number(equality.value)
+        ):
+            return equality
         return None
 
     def change(atom: Atom) -> Atom:
-        if (part := named_equality(atom)) is None:
+        if (equality := named_equality(atom)) is None:
             return atom
-        names = tables[part.signal.name]
-        numbers = {text_number(name): number for name, number in names.items()}
-        if part.value not in numbers:
-            what = f"no number of {part.signal.name} is called {atom.parameters[-1]}"
+        names = names_by_signal[equality.signal.name]
+        number_by_text = {text_number(name): number for name, number in names.items()}
+        if equality.value not in number_by_text:
+            what = f"no number of {equality.signal.name} is called {atom.parameters[-1]}"
             faults.add(atom.span, what, f"its names are {', '.join(map(quote_name, names))}")
             return atom
-        exact = replace(part, value=numbers[part.value])
-        return replace(atom, expression=exact if part is atom.expression else -exact)
+        numeric_equality = replace(equality, value=number_by_text[equality.value])
+        return replace(
+            atom, expression=numeric_equality if equality is atom.expression else -numeric_equality
+        )
 
     for atom in _atoms(specification):
-        summed = summed_units(atom.expression, units) if atom.relation == "sum" else []
-        if len(summed) > 1:
-            message = f"`{atom.text}` adds or compares numbers in {' and '.join(summed)}"
+        sum_units = summed_units(atom.expression, units) if atom.relation == "sum" else []
+        if len(sum_units) > 1:
+            message = f"`{atom.text}` adds or compares numbers in {' and '.join(sum_units)}"
             hint = (
                 "multiply one of them by a constant that converts it, or by 1 if its declared unit is wrong"
             )
@@ -426,31 +432,31 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
     """Return a hint that an unknown object name is a class; "" if it is not."""
-    meant = next((label for label in classes if label.casefold() == name.casefold()), None)
-    if kind != "object" or meant is None:
+    class_name = next((label for label in classes if label.casefold() == name.casefold()), None)
+    if kind != "object" or class_name is None:
         return ""
-    group = f"class {quote_name(meant)}"
-    return f"it is a class: write {group} for all of them, or forall one in {group}: ..."
+    group_text = f"class {quote_name(class_name)}"
+    return f"it is a class: write {group_text} for all of them, or forall one in {group_text}: ..."
 
 
 def _listing(kind: str, names: tuple[str, ...]) -> str:
     kinds = "classes" if kind == "class" else f"{kind}s"
     if not names:
         return f"it has no {kinds}"
-    first = ", ".join(names[:_LISTED])
-    return f"its {kinds} are {first}" + (", ..." if len(names) > _LISTED else "")
+    listed_names = ", ".join(names[:_LISTED])
+    return f"its {kinds} are {listed_names}" + (", ..." if len(names) > _LISTED else "")
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
     """Return two maps from names to places: the first occurrence, and the definition."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))
-    places: dict[str, Span] = {}
-    defined: dict[str, Span] = {}
+    first_places: dict[str, Span] = {}
+    definition_places: dict[str, Span] = {}
     for token in tokens:
         if token.type == "NAME":
-            places.setdefault(token.value, span_of(token))
-    for first, second in pairwise(tokens):
-        if first.type in ("CONST", "REGION", "GROUP", "DEF", "SPEC") and second.type == "NAME":
-            defined.setdefault(second.value, span_of(second))
-    return places, defined
+            first_places.setdefault(token.value, span_of(token))
+    for keyword, name in pairwise(tokens):
+        if keyword.type in ("CONST", "REGION", "GROUP", "DEF", "SPEC") and name.type == "NAME":
+            definition_places.setdefault(name.value, span_of(name))
+    return first_places, definition_places

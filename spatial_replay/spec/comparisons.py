@@ -130,23 +130,23 @@ class ComparisonBuilder:
         if isinstance(quantity, Name):
             ((sign, limit),) = limits
             return self._of_signal(quantity, sign, limit, limit, scope)
-        measured = self._number(quantity, scope)
+        measured_number = self._number(quantity, scope)
         relation = quantity.function if isinstance(quantity, RateSyntax) else "dist"
-        names: tuple[float | str, ...] = ()
-        if not isinstance(measured, Rate | SignedDistance):
+        signal_names: tuple[float | str, ...] = ()
+        if not isinstance(measured_number, Rate | SignedDistance):
             return _NOTHING
-        if isinstance(measured, Rate) and measured.signal:
-            names = (measured.signal.name,)
+        if isinstance(measured_number, Rate) and measured_number.signal:
+            signal_names = (measured_number.signal.name,)
         for token in written.operators:
             if token.value == "!=":
                 message = f"a {'distance' if relation == 'dist' else 'rate'} is hardly ever exactly a number"
                 self.resolver.fault(span_of(token), scope, message, _NOT_EQUAL[relation])
-        terms = _written_terms(measured)
-        margins = [compare(measured, sign, limit) for sign, limit in limits]
-        (sign, limit), *upper = limits
-        if not upper:
-            return Comparison(relation, margins[0], terms, (*names, sign, limit))
-        parameters = (*names, limit, _MIRRORED[sign], *upper[0])
+        terms = _written_terms(measured_number)
+        margins = [compare(measured_number, sign, limit) for sign, limit in limits]
+        (sign, limit), *upper_limits = limits
+        if not upper_limits:
+            return Comparison(relation, margins[0], terms, (*signal_names, sign, limit))
+        parameters = (*signal_names, limit, _MIRRORED[sign], *upper_limits[0])
         return Comparison(relation, minimum(*margins), terms, parameters)
 
     def _of_text(self, signal: Name, sign: str, text: Name, scope: Scope) -> Comparison:
@@ -157,24 +157,26 @@ class ComparisonBuilder:
     ) -> Comparison:
         """Return the comparison of a signal with a constant or a text; `==` and `!=` are exact."""
         signal = self._signal(name, scope)
-        is_equal = Equality(signal, limit)
-        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
-        expression = exact.get(sign) or compare(signal, sign, limit)
+        equality = Equality(signal, limit)
+        exact_expressions: Mapping[str, Expression] = {"==": equality, "!=": -equality}
+        expression = exact_expressions.get(sign) or compare(signal, sign, limit)
         return Comparison("signal", expression, (), (name.text, sign, limit_text))
 
     # ----------------------------------------------------------------------------------------------- sums
 
     def _range(self, written: ComparisonSyntax, scope: Scope) -> Comparison:
         """Return a chained comparison, `c1 <= a dist b <= c2`: the minimum of two comparisons."""
-        (lower, middle, upper), (below, above) = written.operands, written.operators
-        for token, side in ((below, "left"), (above, "right")):
+        (lower, middle, upper), (lower_sign, upper_sign) = written.operands, written.operators
+        for token, side in ((lower_sign, "left"), (upper_sign, "right")):
             if token.value not in ("<=", "<"):
                 message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
-                self.resolver.fault(span_of(token), scope, message, _range_hint(below.value, above.value))
+                self.resolver.fault(
+                    span_of(token), scope, message, _range_hint(lower_sign.value, upper_sign.value)
+                )
                 return _NOTHING
         is_between_constants = self._is_constant(lower, scope) and self._is_constant(upper, scope)
         if is_between_constants and isinstance(middle, DistanceSyntax | RateSyntax):
-            limits = ((_MIRRORED[below.value], lower), (above.value, upper))
+            limits = ((_MIRRORED[lower_sign.value], lower), (upper_sign.value, upper))
             return self._of_one(middle, limits, written, scope)
         return self._of_sums(written, scope)
 
@@ -187,16 +189,15 @@ class ComparisonBuilder:
             self._report_constants(written, scope)
             return _NOTHING
         numbers = [self._number(operand, scope) for operand in written.operands]
-        for first, second in pairwise(numbers):
-            self._check_units(first, second, written, scope)
+        for left, right in pairwise(numbers):
+            self._check_units(left, right, written, scope)
         margins = [
-            compare(first, sign, second)
-            for (first, second), sign in zip(pairwise(numbers), signs, strict=True)
+            compare(left, sign, right) for (left, right), sign in zip(pairwise(numbers), signs, strict=True)
         ]
         expression = margins[0] if len(margins) == 1 else minimum(*margins)
-        parts = list(iter_expressions(expression))
-        limits = dict.fromkeys(part.value for part in parts if isinstance(part, Number))
-        terms = dict.fromkeys(term for part in parts for term in _written_terms(part))
+        nodes = list(iter_expressions(expression))
+        limits = dict.fromkeys(node.value for node in nodes if isinstance(node, Number))
+        terms = dict.fromkeys(term for node in nodes for term in _written_terms(node))
         return Comparison("sum", expression, tuple(terms), (*signs, *limits))
 
     def _number(self, written: ArgumentSyntax, scope: Scope) -> Expression:
@@ -218,9 +219,9 @@ class ComparisonBuilder:
                 return -self._number(operand, scope)
             case Arithmetic(operator="+" | "-" as sign, operands=(left, right)):
                 self._check_hyphen(written, scope)
-                first, second = self._number(left, scope), self._number(right, scope)
-                self._check_units(first, second, written, scope)
-                return first + second if sign == "+" else first - second
+                left_number, right_number = self._number(left, scope), self._number(right, scope)
+                self._check_units(left_number, right_number, written, scope)
+                return left_number + right_number if sign == "+" else left_number - right_number
             case Arithmetic():
                 return self._multiple(written, scope)
         message, hint = "a formula, where a number is expected", "compare signals, distances or rates"
@@ -236,32 +237,32 @@ class ComparisonBuilder:
         if is_product and self._is_constant(operand, scope):
             operand, factor = factor, operand
         if not self._is_constant(factor, scope):
-            what = "a product of two signals" if is_product else "a quotient of two signals"
-            self.resolver.fault(written.span, scope, f"{what}, distances or rates", _PLUGIN)
+            quantities = "a product of two signals" if is_product else "a quotient of two signals"
+            self.resolver.fault(written.span, scope, f"{quantities}, distances or rates", _PLUGIN)
             return Number(0.0)
-        amount, number = self.resolver.number(factor, scope), self._number(operand, scope)
+        factor_value, number = self.resolver.number(factor, scope), self._number(operand, scope)
         if any(self.resolver.is_unknown(name, scope) for name in names_in(factor)):
             return number
-        if amount == 0.0:
+        if factor_value == 0.0:
             message = "a factor of 0" if is_product else "division by zero"
             self.resolver.fault(factor.span, scope, message, "leave the number out, or write another factor")
             return Number(0.0)
         # factors and divisors of expressions are positive, so a negative one becomes a negation
-        size = abs(amount)
-        if isinstance(amount, NamedNumber):
-            size = NamedNumber(size, amount.constants)
-        multiple = Product(size, number) if is_product else Scaled(number, size)
-        return multiple if amount > 0.0 else -multiple
+        magnitude = abs(factor_value)
+        if isinstance(factor_value, NamedNumber):
+            magnitude = NamedNumber(magnitude, factor_value.constants)
+        multiple = Product(magnitude, number) if is_product else Scaled(number, magnitude)
+        return multiple if factor_value > 0.0 else -multiple
 
     def _absolute(self, written: Call, scope: Scope) -> Expression:
         """Return `abs(x)` as the maximum of x and -x; report a fault for any other function."""
         name, arguments = written.name.text, written.arguments
-        macro = self.resolver.names.definitions.get(name)
-        if name == "abs" and len(arguments) == 1 and not isinstance(macro, DefStatement):
+        definition = self.resolver.names.definitions.get(name)
+        if name == "abs" and len(arguments) == 1 and not isinstance(definition, DefStatement):
             operand = self._number(arguments[0], scope)
             return maximum(operand, -operand)
         message, hint = f"{name!r} is not a function", self._function_hint(written)
-        if isinstance(macro, DefStatement):
+        if isinstance(definition, DefStatement):
             message, hint = f"{name!r} is a macro, so a formula, where a number is expected", ""
         elif name == "abs":
             message, hint = "'abs' takes one number", "write abs(x - y) <= c"
@@ -284,10 +285,10 @@ class ComparisonBuilder:
                 message, hint = "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"
             self.resolver.fault(written.span, scope, message, hint)
             return Number(0.0)
-        is_alone = len(arguments) == 1
-        return speed_of(*(self._moving(argument, scope, alone=is_alone) for argument in arguments))
+        has_one_argument = len(arguments) == 1
+        return speed_of(*(self._moving(argument, scope, is_alone=has_one_argument) for argument in arguments))
 
-    def _moving(self, written: ArgumentSyntax, scope: Scope, *, alone: bool) -> Term:
+    def _moving(self, written: ArgumentSyntax, scope: Scope, *, is_alone: bool) -> Term:
         """Return an argument of `speed`; report a fault if it cannot move."""
         if not isinstance(written, (Name, *DERIVED_TERMS)):
             self.resolver.fault(written.span, scope, "a number has no speed", "write speed(a) or speed(a, b)")
@@ -296,10 +297,10 @@ class ComparisonBuilder:
         if looks_back(term):
             hint = "leave out the [-n]"
             self.resolver.fault(written.span, scope, "a speed is from the report before to this one", hint)
-        elif alone and isinstance(base_of(term), Group):
+        elif is_alone and isinstance(base_of(term), Group):
             hint = "write forall p in GROUP: speed(p) <= c"
             self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)
-        elif alone and isinstance(base_of(term), RegionName):
+        elif is_alone and isinstance(base_of(term), RegionName):
             hint = "write speed(a) for an object a, or speed(a, REGION)"
             self.resolver.fault(written.span, scope, "a region never moves", hint)
         return term
@@ -307,12 +308,12 @@ class ComparisonBuilder:
     def _signal(self, name: Name, scope: Scope) -> Signal:
         """Return a signal of the log or of a plug-in; report a fault for a name with another meaning."""
         plugin = self.resolver.names.signals.get(name.text)
-        defined = self.resolver.names.definitions.get(name.text)
+        definition = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
             message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
             self.resolver.fault(name.span, scope, message)
-        elif defined is not None and not isinstance(defined, BrokenStatement):
-            message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
+        elif definition is not None and not isinstance(definition, BrokenStatement):
+            message = f"{name.text!r} is {kind_of(definition)}; a signal of the log is expected"
             self.resolver.fault(name.span, scope, message, "if the log has it, rename the definition")
         return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
 
@@ -322,10 +323,10 @@ class ComparisonBuilder:
             case NumberSyntax():
                 return True
             case Name():
-                local = scope.values.get(written.text)
-                defined = self.resolver.names.definitions.get(written.text)
-                is_broken = local is None and isinstance(defined, BrokenStatement)
-                return isinstance(local, Anything) or is_broken or self.resolver.is_number(written, scope)
+                value = scope.values.get(written.text)
+                definition = self.resolver.names.definitions.get(written.text)
+                is_broken = value is None and isinstance(definition, BrokenStatement)
+                return isinstance(value, Anything) or is_broken or self.resolver.is_number(written, scope)
             case Arithmetic():
                 return all(self._is_constant(operand, scope) for operand in written.operands)
         return False
@@ -333,11 +334,11 @@ class ComparisonBuilder:
     # --------------------------------------------------------------------------------------------- faults
 
     def _check_units(
-        self, first: Expression, second: Expression, written: Arithmetic | ComparisonSyntax, scope: Scope
+        self, left: Expression, right: Expression, written: Arithmetic | ComparisonSyntax, scope: Scope
     ) -> None:
         """Report a sum or a comparison of a distance and a speed."""
-        kinds = {kind for kind in (_kind(first), _kind(second)) if kind}
-        if len(kinds) > 1:
+        dimensions = {dimension for dimension in (_kind(left), _kind(right)) if dimension}
+        if len(dimensions) > 1:
             hint = "multiply one of them by a constant: a dist b >= 2 * speed(a)"
             self.resolver.fault(written.span, scope, "a distance and a speed have different units", hint)
 
@@ -346,40 +347,44 @@ class ComparisonBuilder:
         definitions = self.resolver.names.definitions
         if not isinstance(limit, Name) or limit.is_quoted or limit.text in {*definitions, *scope.values}:
             return
-        constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
+        constant_names = [name for name in definitions if isinstance(definitions[name], ConstStatement)]
         if isinstance(quantity, Name):
             # two signals of one comparison often have similar names, so only another case is a misspelling
-            constants = [key for key in constants if key.casefold() == limit.text.casefold()]
-        if nearest := self.resolver.faults.nearest(limit.text, constants):
-            hint = f"{nearest} A signal of that name is written in quotes: {quote_name(limit.text)}"
+            constant_names = [name for name in constant_names if name.casefold() == limit.text.casefold()]
+        if advice := self.resolver.faults.nearest(limit.text, constant_names):
+            hint = f"{advice} A signal of that name is written in quotes: {quote_name(limit.text)}"
             self.resolver.fault(limit.span, scope, f"unknown constant {limit.text!r}", hint)
 
     def _check_hyphen(self, written: Arithmetic, scope: Scope) -> None:
         """Report `cup dist base-link`: probably an unquoted name, because a difference has blanks."""
         left, right = written.operands
-        sign = Span(left.span.end, right.span.start)
-        if sign.end - sign.start > 1 or written.operator != "-":
+        sign_span = Span(left.span.end, right.span.start)
+        if sign_span.end - sign_span.start > 1 or written.operator != "-":
             return
         match left, right:
-            case DistanceSyntax(second=Name() as first), Name() as last:
-                name = f"{first.text}-{last.text}"
-            case Name() as first, DistanceSyntax(first=Name() as last):
-                name = f"{first.text}-{last.text}"
+            case DistanceSyntax(second=Name() as first_part), Name() as last_part:
+                name = f"{first_part.text}-{last_part.text}"
+            case Name() as first_part, DistanceSyntax(first=Name() as last_part):
+                name = f"{first_part.text}-{last_part.text}"
             case _:
                 return
         hint = f"a name with - is written in quotes: {quote_name(name)}; a difference has blanks around its -"
-        self.resolver.fault(sign, scope, "'-' within a name, or without blanks", hint)
+        self.resolver.fault(sign_span, scope, "'-' within a name, or without blanks", hint)
 
     def _report_equality(self, written: ComparisonSyntax, scope: Scope) -> None:
-        left, right = (self._source(operand) for operand in (written.operands[0], written.operands[-1]))
+        left_text, right_text = (
+            self._source(operand) for operand in (written.operands[0], written.operands[-1])
+        )
         is_sum = isinstance(written.operands[-1], Arithmetic)
-        hint = f"write abs({left} - {f'({right})' if is_sum else right}) <= 0.01"
+        hint = f"write abs({left_text} - {f'({right_text})' if is_sum else right_text}) <= 0.01"
         match written.operands:
             case (Name(), Name() as name):
                 definitions = self.resolver.names.definitions
-                constants = [key for key in definitions if isinstance(definitions[key], ConstStatement)]
-                nearest = self.resolver.faults.nearest(name.text, constants)
-                hint = nearest or f"{hint}; a text stands in quotes, {left} == {quote_name(name.text)}"
+                constant_names = [
+                    constant for constant in definitions if isinstance(definitions[constant], ConstStatement)
+                ]
+                advice = self.resolver.faults.nearest(name.text, constant_names)
+                hint = advice or f"{hint}; a text stands in quotes, {left_text} == {quote_name(name.text)}"
         (token, *_) = [token for token in written.operators if token.value in ("==", "!=")]
         self.resolver.fault(span_of(token), scope, "two measured numbers are hardly ever equal", hint)
 
@@ -421,9 +426,9 @@ def _kind(expression: Expression) -> str:
     return ""
 
 
-def _range_hint(below: str, above: str) -> str:
-    if {"==", "!="} & {below, above}:
+def _range_hint(lower_sign: str, upper_sign: str) -> str:
+    if {"==", "!="} & {lower_sign, upper_sign}:
         return "write a dist b == c, or c1 <= a dist b <= c2"
-    if below[0] == above[0]:
+    if lower_sign[0] == upper_sign[0]:
         return "write the lesser limit first: c1 <= a dist b <= c2"
     return "write it as c1 <= a dist b <= c2, or as two comparisons joined by and"

@@ -48,11 +48,11 @@ def value_of(
     except _ImpossibleError as fault:
         report(written.span, str(fault), "durations are added to durations, and multiplied by numbers")
     except (OverflowError, ZeroDivisionError) as fault:
-        what = "division by zero" if isinstance(fault, ZeroDivisionError) else "a result that is too large"
-        report(written.span, what, "numbers reach up to about 1.7e308, durations up to 9e9s")
+        message = "division by zero" if isinstance(fault, ZeroDivisionError) else "a result that is too large"
+        report(written.span, message, "numbers reach up to about 1.7e308, durations up to 9e9s")
     else:
-        names = [name for value in values if isinstance(value, NamedNumber) for name in value.constants]
-        return NamedNumber(result, tuple(names)) if names and isinstance(result, float) else result
+        constants = [name for value in values if isinstance(value, NamedNumber) for name in value.constants]
+        return NamedNumber(result, tuple(constants)) if constants and isinstance(result, float) else result
     return None
 
 
@@ -67,20 +67,20 @@ def names_in(written: Quantity) -> Iterator[Name]:
 
 def _compute(written: Arithmetic, values: list[Value]) -> Value:
     """Return the result of an operation in exact decimal arithmetic, rounded once: 0.1 * 30 is 3."""
-    first, *rest = values
-    if not rest:
+    first_value, *other_values = values
+    if not other_values:
         # 0.0 - x, because the negative of 0.0 is -0.0
-        return Duration(-first.ns) if isinstance(first, Duration) else 0.0 - first
-    durations = [isinstance(value, Duration) for value in values]
-    left, right = _exact(first), _exact(rest[0])
+        return Duration(-first_value.ns) if isinstance(first_value, Duration) else 0.0 - first_value
+    duration_flags = [isinstance(value, Duration) for value in values]
+    left, right = _exact(first_value), _exact(other_values[0])
     match written.operator:
-        case "+" | "-" if durations[0] == durations[1]:
-            return _round(left + right if written.operator == "+" else left - right, durations[0])
-        case "*" if not all(durations):
-            return _round(left * right, any(durations))
-        case "/" if durations[0] or not durations[1]:
-            return _round(left / right, durations[0] and not durations[1])
-    kinds = " and ".join("a duration" if is_duration else "a number" for is_duration in durations)
+        case "+" | "-" if duration_flags[0] == duration_flags[1]:
+            return _round(left + right if written.operator == "+" else left - right, duration_flags[0])
+        case "*" if not all(duration_flags):
+            return _round(left * right, any(duration_flags))
+        case "/" if duration_flags[0] or not duration_flags[1]:
+            return _round(left / right, duration_flags[0] and not duration_flags[1])
+    kinds = " and ".join("a duration" if is_duration else "a number" for is_duration in duration_flags)
     raise _ImpossibleError(f"{kinds} cannot be {_WORDS[written.operator]}")
 
 
@@ -150,27 +150,27 @@ def replace_constants(
     Raises:
         UsageError: an unknown constant, an invalid value, a number for a duration or the reverse.
     """
-    pieces: list[tuple[Span, str]] = []
+    replacements: list[tuple[Span, str]] = []
     for name, value in given.items():
         if name not in statements:
             hint = nearest_hint(name, statements) or f"its constants are: {', '.join(statements) or 'none'}"
             raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
-        pieces.append((statements[name].value.span, _new_text(name, value, values[name])))
+        replacements.append((statements[name].value.span, _new_text(name, value, values[name])))
     # backwards, so that the offsets of earlier lines stay valid
-    for span, piece in sorted(pieces, key=lambda each: each[0].start, reverse=True):
-        text = text[: span.start] + piece + text[span.end :]
+    for span, new_text in sorted(replacements, key=lambda replacement: replacement[0].start, reverse=True):
+        text = text[: span.start] + new_text + text[span.end :]
     return text
 
 
 def _new_text(name: str, value: object, written: Value | None) -> str:
-    new = value_from_outside(name, value)
-    if written is not None and isinstance(new, Duration) != isinstance(written, Duration):
-        was, example = (
+    new_value = value_from_outside(name, value)
+    if written is not None and isinstance(new_value, Duration) != isinstance(written, Duration):
+        kind, example = (
             ("a duration", "'2s' or '500ms'") if isinstance(written, Duration) else ("a number", "80")
         )
-        message = f"constants: {name!r} cannot be {value!r}: it is {was}, {text_of(written)} in the text"
+        message = f"constants: {name!r} cannot be {value!r}: it is {kind}, {text_of(written)} in the text"
         raise UsageError(f"{message}; give one, such as {example}")
-    return text_of(new)
+    return text_of(new_value)
 
 
 def value_from_outside(name: str, value: object) -> Value:

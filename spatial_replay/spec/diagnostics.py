@@ -50,12 +50,12 @@ class Diagnostic:
     hint: str = ""
 
     def __str__(self) -> str:
-        first = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
-        piece = self.source_line[first : first + _SHOWN]
+        piece_start = max(0, self.column - _SHOWN_BEFORE) if len(self.source_line) > _SHOWN else 0
+        piece = self.source_line[piece_start : piece_start + _SHOWN]
         # control characters of a text would act on the terminal
         printable_piece = "".join(character if character.isprintable() else " " for character in piece)
-        offset = self.column - 1 - first
-        caret = " " * offset + "^" * max(1, min(self.width, _SHOWN - offset))
+        caret_offset = self.column - 1 - piece_start
+        caret = " " * caret_offset + "^" * max(1, min(self.width, _SHOWN - caret_offset))
         place = f"{escape_text(self.filename)}:{self.line}:{self.column}"
         head = f"{place}: {self.severity}: {escape_text(self.message)}"
         tail = f"\n  {escape_text(self.hint)}" if self.hint else ""
@@ -90,10 +90,10 @@ class SourceText:
     ) -> Diagnostic:
         """Return an error or a warning about a span; the underline ends with the first line of the span."""
         line = self.line_of(span.start)
-        start = self.line_starts[line - 1]
-        end = self.line_starts[line] if line < len(self.line_starts) else len(self.text)
-        source_line = self.text[start:end].rstrip("\r\n")
-        column = min(span.start - start, len(source_line)) + 1
+        line_start = self.line_starts[line - 1]
+        line_end = self.line_starts[line] if line < len(self.line_starts) else len(self.text)
+        source_line = self.text[line_start:line_end].rstrip("\r\n")
+        column = min(span.start - line_start, len(source_line)) + 1
         width = max(1, min(span.end - span.start, len(source_line) - column + 1))
         return Diagnostic(severity, message, self.filename, line, column, source_line, width, hint)
 
@@ -142,12 +142,12 @@ class Faults:
         """
         if not self.found:
             return
-        diagnoses = sorted(self.found.values(), key=lambda fault: (fault.line, fault.column))
+        diagnostics = sorted(self.found.values(), key=lambda fault: (fault.line, fault.column))
         if self.unreported:
-            end = Span(len(self.source.text), len(self.source.text))
+            end_span = Span(len(self.source.text), len(self.source.text))
             remark = f"{self.unreported} further faults are not shown"
-            diagnoses.append(self.source.diagnostic("error", end, remark, "mend these first"))
-        raise SpecificationError(diagnoses)
+            diagnostics.append(self.source.diagnostic("error", end_span, remark, "mend these first"))
+        raise SpecificationError(diagnostics)
 
 
 _LONGEST_MESSAGE = 400
@@ -157,5 +157,5 @@ def _crop(message: str) -> str:
     """Cut the middle out of a long message, such as one that quotes a very long name."""
     if len(message) <= _LONGEST_MESSAGE:
         return message
-    half = _LONGEST_MESSAGE // 2
-    return f"{message[:half]} ... {message[-half:]}"
+    half_length = _LONGEST_MESSAGE // 2
+    return f"{message[:half_length]} ... {message[-half_length:]}"

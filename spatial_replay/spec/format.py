@@ -65,9 +65,9 @@ def format_bound(bound: Bound | None) -> str:
     """Return the text of a window, such as "[0, 10]"; "" without a window."""
     if bound is None:
         return ""
-    write = format_duration if bound.unit == "ns" else str
-    upper = "inf" if bound.upper is None else write(bound.upper)
-    return f"[{write(bound.lower)}, {upper}]"
+    format_end = format_duration if bound.unit == "ns" else str
+    upper = "inf" if bound.upper is None else format_end(bound.upper)
+    return f"[{format_end(bound.lower)}, {upper}]"
 
 
 # ---------------------------------------------------------------------------------------------- terms
@@ -108,27 +108,27 @@ def format_relation(
     relations: frozenset[str] = RELATION_NAMES,
 ) -> str:
     """Return the text of an atom from its relation, terms and parameters (see `Atom`)."""
-    names = [format_term(term, relations) for term in terms]
-    values = [format_number(value) if isinstance(value, float) else value for value in parameters]
+    texts = [format_term(term, relations) for term in terms]
+    arguments = [format_number(value) if isinstance(value, float) else value for value in parameters]
     if relation == "signal":
-        return f"{written_name(values[0], relations)} {values[1]} {values[2]}"
+        return f"{written_name(arguments[0], relations)} {arguments[1]} {arguments[2]}"
     if relation in ("dist", "speed", "rate"):
-        measured = f"{names[0]} dist {names[1]}" if relation == "dist" else f"speed({', '.join(names)})"
+        quantity = f"{texts[0]} dist {texts[1]}" if relation == "dist" else f"speed({', '.join(texts)})"
         if relation == "rate":
-            signal, *values = values
-            measured = f"rate({written_name(signal, relations)})"
-        if len(values) == 2:
-            return f"{measured} {values[0]} {values[1]}"
-        if not values:
-            return measured
-        return f"{values[0]} {values[1]} {measured} {values[2]} {values[3]}"
+            signal, *arguments = arguments
+            quantity = f"rate({written_name(signal, relations)})"
+        if len(arguments) == 2:
+            return f"{quantity} {arguments[0]} {arguments[1]}"
+        if not arguments:
+            return quantity
+        return f"{arguments[0]} {arguments[1]} {quantity} {arguments[2]} {arguments[3]}"
     if relation == "present":
-        return f"present({names[0]})"
+        return f"present({texts[0]})"
     if relation == "closer":
-        return f"{names[0]} closer {names[1]} than {names[2]}"
-    bracket = f"[{', '.join(values)}]" if values else ""
-    right = f"({names[1]}, {names[2]})" if relation == "between" else names[1]
-    return f"{names[0]} {relation}{bracket} {right}"
+        return f"{texts[0]} closer {texts[1]} than {texts[2]}"
+    bracket = f"[{', '.join(arguments)}]" if arguments else ""
+    right = f"({texts[1]}, {texts[2]})" if relation == "between" else texts[1]
+    return f"{texts[0]} {relation}{bracket} {right}"
 
 
 def format_atom(
@@ -141,8 +141,8 @@ def format_atom(
     """Return the text of an atom (see `Atom`); the text of a sum comes from its expression."""
     if relation != "sum":
         return format_relation(relation, terms, parameters, relations)
-    whole = expression.operand if isinstance(expression, Scaled) else expression
-    margins = whole.operands if isinstance(whole, Minimum) else (whole,)
+    unscaled = expression.operand if isinstance(expression, Scaled) else expression
+    margins = unscaled.operands if isinstance(unscaled, Minimum) else (unscaled,)
     signs = [sign for sign in parameters if isinstance(sign, str)]
     sides = [_sides(margin, sign) for margin, sign in zip(margins, signs, strict=True)]
     texts = [format_sum(side, relations) for side in (sides[0][0], *(right for _, right in sides))]
@@ -162,8 +162,8 @@ def format_sum(expression: Expression, relations: frozenset[str] = RELATION_NAME
 
     def operand(inner: Expression) -> str:
         text = format_sum(inner, relations)
-        is_alone = isinstance(inner, Number | Signal | Maximum)
-        return text if is_alone else f"({text})"
+        is_unbracketed = isinstance(inner, Number | Signal | Maximum)
+        return text if is_unbracketed else f"({text})"
 
     match expression:
         case Number(value):
@@ -222,10 +222,10 @@ def format_formula(
         case Atom():
             return formula.text
         case Boolean(operator="spec"):
-            that = formula.operands[0]
-            if references and that.name is not None:
-                return written_name(that.name, relations)
-            return format_formula(that, references=references, relations=relations)
+            spec_formula = formula.operands[0]
+            if references and spec_formula.name is not None:
+                return written_name(spec_formula.name, relations)
+            return format_formula(spec_formula, references=references, relations=relations)
         case Boolean(operator="given" | "with"):
             return format_formula(formula.operands[-1], references=references, relations=relations)
         case Boolean(operator="not"):
@@ -303,16 +303,16 @@ class Branch(NamedTuple):
 def iter_branches(formula: Formula) -> Iterator[Branch]:
     """Yield every node in text order, the root first."""
     stack = [("", "", formula)]
-    identifier = 0
+    node_id = 0
     while stack:
-        above, branch, node = stack.pop()
-        yield Branch(identifier, above + branch, node)
-        identifier += 1
-        below = above + {"": "", "├─ ": "│  ", "└─ ": "   "}[branch]
-        last = "└─ "
+        ancestor_stem, node_connector, node = stack.pop()
+        yield Branch(node_id, ancestor_stem + node_connector, node)
+        node_id += 1
+        child_stem = ancestor_stem + {"": "", "├─ ": "│  ", "└─ ": "   "}[node_connector]
+        connector = "└─ "
         for operand in reversed(operands_of(node)):
-            stack.append((below, last, operand))
-            last = "├─ "
+            stack.append((child_stem, connector, operand))
+            connector = "├─ "
 
 
 def title_of(node: Formula) -> str:

@@ -657,10 +657,12 @@ def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formu
     if not any(conditions):
         return operands
     return tuple(
-        Boolean(how, (_all(operand_conditions), operand), name=operand.name)
+        Boolean(internal_operator, (_all(operand_conditions), operand), name=operand.name)
         if operand_conditions
         else operand
-        for how, operand_conditions, operand in zip(_LEFT_OUT_AS[operator], conditions, operands, strict=True)
+        for internal_operator, operand_conditions, operand in zip(
+            _LEFT_OUT_AS[operator], conditions, operands, strict=True
+        )
     )
 
 
@@ -682,7 +684,9 @@ def rate_conditions(formula: Formula) -> list[Formula]:
             return [_has_value(rate) for rate in dict.fromkeys(_rates_of(formula.expression))]
         case Boolean() if formula.operator not in ("given", "with"):
             return list(
-                dict.fromkeys(condition for part in formula.operands for condition in rate_conditions(part))
+                dict.fromkeys(
+                    condition for operand in formula.operands for condition in rate_conditions(operand)
+                )
             )
         case Temporal(operator="X" | "WX"):
             return [Temporal("WX", (condition,)) for condition in rate_conditions(formula.operands[0])]
@@ -738,12 +742,12 @@ def operator_of(formula: Formula) -> str:
 def iter_nodes(formula: Formula) -> Iterator[tuple[int, int | None, Formula]]:
     """Yield the nodes of the tree as (id, id of the parent, node), in text order; the root is 0."""
     stack: list[tuple[int | None, Formula]] = [(None, formula)]
-    identifier = 0
+    node_id = 0
     while stack:
         parent, node = stack.pop()
-        yield identifier, parent, node
-        stack.extend((identifier, operand) for operand in reversed(operands_of(node)))
-        identifier += 1
+        yield node_id, parent, node
+        stack.extend((node_id, operand) for operand in reversed(operands_of(node)))
+        node_id += 1
 
 
 # -------------------------------------------------------------------------------------- specifications

@@ -123,12 +123,14 @@ def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...
         UsageError: the function has too few parameters, or some that are not positional.
     """
     parameters = tuple(inspect.signature(relation).parameters.values())
-    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    terms = 3 if name in THREE_TERM_RELATIONS else 2
-    if len(parameters) < terms or any(parameter.kind not in kinds for parameter in parameters):
+    positional_kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    term_count = 3 if name in THREE_TERM_RELATIONS else 2
+    if len(parameters) < term_count or any(
+        parameter.kind not in positional_kinds for parameter in parameters
+    ):
         hint = "give a function of two terms and, after them, numbers, all positional"
         raise UsageError(f"relations: {name!r} cannot be written between two objects; {hint}")
-    return parameters[terms:]
+    return parameters[term_count:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,39 +188,41 @@ class AtomBuilder:
     # ------------------------------------------------------------------------------------ parameters
 
     def _parameters(self, written: RelationSyntax, scope: Scope) -> tuple[float | str, ...] | None:
-        expected = parameters_of(written.relation, self.relations[written.relation])
+        expected_parameters = parameters_of(written.relation, self.relations[written.relation])
         quantities = written.parameters
-        missing = expected[len(quantities) :]
-        if len(quantities) > len(expected) or any(
-            parameter.default is parameter.empty for parameter in missing
+        missing_parameters = expected_parameters[len(quantities) :]
+        if len(quantities) > len(expected_parameters) or any(
+            parameter.default is parameter.empty for parameter in missing_parameters
         ):
-            self._report_parameters(written, expected, scope)
+            self._report_parameters(written, expected_parameters, scope)
             return None
-        values = [
+        arguments = [
             self._axis(quantity, scope) if parameter.name == "axis" else self.resolver.number(quantity, scope)
-            for parameter, quantity in zip(expected, quantities, strict=False)
+            for parameter, quantity in zip(expected_parameters, quantities, strict=False)
         ]
-        values += [
+        arguments += [
             parameter.default if parameter.name == "axis" else float(parameter.default)
-            for parameter in missing
+            for parameter in missing_parameters
         ]
-        return tuple(values)
+        return tuple(arguments)
 
     def _report_parameters(
-        self, written: RelationSyntax, expected: tuple[inspect.Parameter, ...], scope: Scope
+        self, written: RelationSyntax, parameters: tuple[inspect.Parameter, ...], scope: Scope
     ) -> None:
         name = written.relation
-        bracket = ", ".join("x" if parameter.name == "axis" else parameter.name for parameter in expected)
-        if not expected:
+        bracket = ", ".join("x" if parameter.name == "axis" else parameter.name for parameter in parameters)
+        if not parameters:
             self.resolver.fault(written.operator, scope, f"{name!r} takes no parameter", f"write a {name} b")
             return
-        right = "(b, c)" if name == "between" else "b"
-        what = "an axis, x, y or z" if expected[0].name == "axis" else "a number"
-        hint = f"write a {name}[{bracket}] {right}, where {expected[0].name} is {what}"
-        if len(expected) == 1 and len(written.parameters) == 2:
+        right_side = "(b, c)" if name == "between" else "b"
+        kind = "an axis, x, y or z" if parameters[0].name == "axis" else "a number"
+        hint = f"write a {name}[{bracket}] {right_side}, where {parameters[0].name} is {kind}"
+        if len(parameters) == 1 and len(written.parameters) == 2:
             hint += "; decimals have a point: 0.1"
-        count = f"{len(expected)} parameter{'s' if len(expected) > 1 else ''}, not {len(written.parameters)}"
-        self.resolver.fault(written.operator, scope, f"{name!r} takes {count}", hint)
+        mismatch = (
+            f"{len(parameters)} parameter{'s' if len(parameters) > 1 else ''}, not {len(written.parameters)}"
+        )
+        self.resolver.fault(written.operator, scope, f"{name!r} takes {mismatch}", hint)
 
     def _axis(self, quantity: Quantity, scope: Scope) -> str:
         if isinstance(quantity, Name) and quantity.text in _AXES:
@@ -230,9 +234,9 @@ class AtomBuilder:
 
     def _check(self, expression: Expression, written: RelationSyntax, scope: Scope) -> None:
         """Report relations of orientations with terms that have none, and negative radii."""
-        for part in iter_expressions(expression):
-            if isinstance(part, Measurement) and part.needs_orientation:
-                for term in part.terms:
+        for node in iter_expressions(expression):
+            if isinstance(node, Measurement) and node.needs_orientation:
+                for term in node.terms:
                     self._check_orientation(term, written, scope)
         for term in terms_of(expression):
             if isinstance(term, Enlarged) and term.radius < 0.0:
@@ -264,9 +268,9 @@ class QuantifierBuilder:
 
     def formula(self, written: QuantifierSyntax, scope: Scope, span: Span) -> Formula:
         """Return the formula of a quantifier; `true` if it has faults."""
-        doubled = first_repetition(written.variables)
-        if doubled is not None:
-            self.resolver.fault(doubled.span, scope, f"the variable {doubled.text!r} is given twice")
+        repetition = first_repetition(written.variables)
+        if repetition is not None:
+            self.resolver.fault(repetition.span, scope, f"the variable {repetition.text!r} is given twice")
         group = self.resolver.term(written.group, scope)
         base = base_of(group)
         if isinstance(base, Group) and base.is_open and isinstance(group, (Group, Earlier)):
@@ -296,15 +300,17 @@ class QuantifierBuilder:
             self.resolver.fault(written.group.span, scope, message, hint)
         members = [TrackedName(name) for name in named_members(group)]
         # permutations grow factorially; more than MAX_SIZE of them exceed the limit of a text anyway
-        choices = list(islice(permutations(members, len(written.variables)), MAX_SIZE))
-        if not choices:
+        member_tuples = list(islice(permutations(members, len(written.variables)), MAX_SIZE))
+        if not member_tuples:
             self._body_of_any(written, scope)
             return Truth(written.quantifier == "forall", span=span)
-        inner = scope.deeper()
+        body_scope = scope.deeper()
         instances: list[Formula] = []
-        for choice in choices:
-            bound = dict(zip((name.text for name in written.variables), choice, strict=True))
-            instances.append(self.elaborate(written.body, replace(inner, values={**scope.values, **bound})))
+        for member_tuple in member_tuples:
+            bindings = dict(zip((name.text for name in written.variables), member_tuple, strict=True))
+            instances.append(
+                self.elaborate(written.body, replace(body_scope, values={**scope.values, **bindings}))
+            )
         # `and` and `or` have at least two operands
         if len(instances) == 1:
             return instances[0]
@@ -317,11 +323,13 @@ class QuantifierBuilder:
         for name in written.variables:
             bound_names = scope.bound.union(variables)
             variables.append(self._fresh(name.text, bound_names) if name.text in bound_names else name.text)
-        bound: dict[str, Value] = {
+        bindings: dict[str, Value] = {
             name.text: Variable(variable) for name, variable in zip(written.variables, variables, strict=True)
         }
-        inner = replace(scope.deeper(), values={**scope.values, **bound}, bound=scope.bound.union(variables))
-        body = self.elaborate(written.body, inner)
+        body_scope = replace(
+            scope.deeper(), values={**scope.values, **bindings}, bound=scope.bound.union(variables)
+        )
+        body = self.elaborate(written.body, body_scope)
         temporal = next(
             (subformula for subformula in iter_formulas(body) if isinstance(subformula, Temporal)), None
         )
@@ -335,24 +343,24 @@ class QuantifierBuilder:
     def _without_clash(self, quantified: Quantified, scope: Scope) -> Quantified:
         """Rename variables that have the name of an object, region, group or definition."""
         # the canonical text does not distinguish a variable from an object of the same name
-        others = other_names(quantified.body)
-        renamed = {
-            variable: self._fresh(variable, scope.bound | others)
+        body_names = other_names(quantified.body)
+        new_names = {
+            variable: self._fresh(variable, scope.bound | body_names)
             for variable in quantified.variables
-            if variable in others or variable in self.names.definitions
+            if variable in body_names or variable in self.names.definitions
         }
-        if not renamed:
+        if not new_names:
             return quantified
-        names = {old: Variable(new) for old, new in renamed.items()}
-        body = substitute(quantified.body, names, frozenset(self.relations))
-        variables = tuple(renamed.get(variable, variable) for variable in quantified.variables)
+        new_variables = {old: Variable(new) for old, new in new_names.items()}
+        body = substitute(quantified.body, new_variables, frozenset(self.relations))
+        variables = tuple(new_names.get(variable, variable) for variable in quantified.variables)
         return replace(quantified, variables=variables, body=body)
 
-    def _fresh(self, name: str, taken: Collection[str]) -> str:
-        number = 2
-        while f"{name}_{number}" in taken or f"{name}_{number}" in self.words:
-            number += 1
-        return f"{name}_{number}"
+    def _fresh(self, name: str, used_names: Collection[str]) -> str:
+        suffix = 2
+        while f"{name}_{suffix}" in used_names or f"{name}_{suffix}" in self.words:
+            suffix += 1
+        return f"{name}_{suffix}"
 
 
 def first_repetition(names: Sequence[Name]) -> Name | None:
@@ -369,10 +377,10 @@ def _split_title(text: str | None) -> tuple[str | None, str | None]:
     """Return the requirement id and the title; the id is the text before ": " if that has no blanks."""
     if text is None:
         return None, None
-    identifier, _, rest = text.partition(": ")
-    if not rest or not identifier or any(character.isspace() for character in identifier):
+    identifier, _, title = text.partition(": ")
+    if not title or not identifier or any(character.isspace() for character in identifier):
         return None, text
-    return identifier, rest.strip()
+    return identifier, title.strip()
 
 
 _UNBOUNDED = frozenset({"X", "WX", "Y"})
@@ -429,27 +437,27 @@ class Elaborator:
         Raises:
             TooLargeError: the text expands to more than `MAX_SIZE` nodes.
         """
-        for order, statement in enumerate(statements):
+        for spec_index, statement in enumerate(statements):
             if self.names.definitions.get(statement.name.text) is statement:
-                self._spec(statement, order)
+                self._spec(statement, spec_index)
         for definition in self.names.definitions.values():
             if isinstance(definition, DefStatement):
                 self._check_macro(definition)
-        specs = [elaborated.spec for elaborated in self.known.values()]
+        specs = [entry.spec for entry in self.known.values()]
         # the size of a spec includes those of the specs that it names
-        total = sum(elaborated.size for name, elaborated in self.known.items() if name not in self.referred)
-        if total > MAX_SIZE:
+        total_size = sum(entry.size for name, entry in self.known.items() if name not in self.referred)
+        if total_size > MAX_SIZE:
             self._too_large(statements[-1].name.span)
         return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in specs)
 
-    def _spec(self, statement: SpecStatement, order: int) -> None:
+    def _spec(self, statement: SpecStatement, spec_index: int) -> None:
         name = statement.name.text
         parameter = self._template_parameter(statement)
-        scope = Scope(order=order)
+        scope = Scope(order=spec_index)
         if parameter is not None:
             values: dict[str, Value] = {parameter: Variable(parameter)}
-            scope = Scope(values, bound=frozenset(values), order=order)
-        before, self.deepest, self.shared = self.resolver.size, 0, 0
+            scope = Scope(values, bound=frozenset(values), order=spec_index)
+        size_before, self.deepest, self.shared = self.resolver.size, 0, 0
         formula = self.formula(statement.formula, scope)
         if parameter is not None:
             self._check_capture(statement, formula)
@@ -458,22 +466,24 @@ class Elaborator:
             formula = Boolean("spec", (formula,), span=statement.formula.span)
             self.deepest += 1
         formula = replace(formula, name=name)
-        requirement, title = _split_title(statement.title)
+        requirement_id, title = _split_title(statement.title)
         span = statement.name.span
-        spec = NamedSpec(name, formula, parameter, span=span, id=requirement, title=title)
-        size = self.resolver.size - before + self.shared
-        self.known[name] = _Known(spec, order, size, self.deepest)
+        spec = NamedSpec(name, formula, parameter, span=span, id=requirement_id, title=title)
+        size = self.resolver.size - size_before + self.shared
+        self.known[name] = _Known(spec, spec_index, size, self.deepest)
 
     def _template_parameter(self, statement: SpecStatement) -> str | None:
         if not statement.parameters:
             return None
-        parameter, *more = statement.parameters
-        if more:
+        parameter, *extra_parameters = statement.parameters
+        if extra_parameters:
             message = f"the template {statement.name.text!r} has more than one parameter"
-            self.faults.add(more[0].span, message, "a template is evaluated per object; use def for macros")
-        defined = self.names.definitions.get(parameter.text)
-        if defined is not None:
-            message = f"{parameter.text!r} is already the name of {kind_of(defined)}"
+            self.faults.add(
+                extra_parameters[0].span, message, "a template is evaluated per object; use def for macros"
+            )
+        definition = self.names.definitions.get(parameter.text)
+        if definition is not None:
+            message = f"{parameter.text!r} is already the name of {kind_of(definition)}"
             self.faults.add(parameter.span, message, "give the parameter another name")
         return parameter.text
 
@@ -485,9 +495,9 @@ class Elaborator:
 
     def _check_macro(self, definition: DefStatement) -> None:
         """Report repeated parameters of a macro, and the faults of its body if the macro is unused."""
-        doubled = first_repetition(definition.parameters)
-        if doubled is not None:
-            self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
+        repetition = first_repetition(definition.parameters)
+        if repetition is not None:
+            self.faults.add(repetition.span, f"the parameter {repetition.text!r} is given twice")
         if definition.name.text not in self.names.used:
             values: dict[str, Value] = {parameter.text: Anything() for parameter in definition.parameters}
             scope = Scope(values, macros=(definition.name.text,), order=len(self.known))
@@ -514,12 +524,12 @@ class Elaborator:
             case ComparisonSyntax():
                 return self.atoms.comparison(written, scope)
             case BooleanSyntax(operator="->", operands=[left, NumberSyntax() as right]):
-                between = Span(left.span.end, right.span.start)
-                self.resolver.fault(between, scope, "'=>' means implies", "at least is written >=")
+                operator_span = Span(left.span.end, right.span.start)
+                self.resolver.fault(operator_span, scope, "'=>' means implies", "at least is written >=")
                 return Truth(True)
             case BooleanSyntax():
-                inner = scope.deeper()
-                operands = tuple([self.formula(operand, inner) for operand in written.operands])
+                operand_scope = scope.deeper()
+                operands = tuple([self.formula(operand, operand_scope) for operand in written.operands])
                 return Boolean(written.operator, operands, span=span)
             case TemporalSyntax():
                 return self._temporal(written, scope, span)
@@ -554,8 +564,8 @@ class Elaborator:
             hint = f"F and G take windows; {written.operator} means one sample"
             self.resolver.fault(written.bound.span, scope, f"{written.operator!r} takes no window", hint)
         bound = self.resolver.bound(written, scope)
-        inner = scope.deeper()
-        operands = tuple([self.formula(operand, inner) for operand in written.operands])
+        operand_scope = scope.deeper()
+        operands = tuple([self.formula(operand, operand_scope) for operand in written.operands])
         return Temporal(written.operator, operands, bound, span=span)  # type: ignore[arg-type]
 
     # -------------------------------------------------------------------------------- names and calls
@@ -565,32 +575,32 @@ class Elaborator:
             message = f"{name.text!r} is an object or number; a formula is expected here"
             self.resolver.fault(name.span, scope, message, f"write a relation, such as {name.text} ovlp b")
             return Truth(True)
-        defined = self.names.definitions.get(name.text)
-        elaborated = self.known.get(name.text)
-        if elaborated is not None and elaborated.order < scope.order and elaborated.spec.parameter is None:
+        definition = self.names.definitions.get(name.text)
+        entry = self.known.get(name.text)
+        if entry is not None and entry.order < scope.order and entry.spec.parameter is None:
             self.names.used.add(name.text)
             self.referred.add(name.text)
-            self.shared += elaborated.size
-            self._reach(scope.depth + elaborated.depth, name.span)
-            return elaborated.spec.formula
-        if not isinstance(defined, BrokenStatement):
-            self._report_reference(name, elaborated, scope)
+            self.shared += entry.size
+            self._reach(scope.depth + entry.depth, name.span)
+            return entry.spec.formula
+        if not isinstance(definition, BrokenStatement):
+            self._report_reference(name, entry, scope)
         return Truth(True)
 
-    def _report_reference(self, name: Name, known: _Known | None, scope: Scope) -> None:
-        defined = self.names.definitions.get(name.text)
-        if known is not None and known.spec.parameter is not None:
+    def _report_reference(self, name: Name, entry: _Known | None, scope: Scope) -> None:
+        definition = self.names.definitions.get(name.text)
+        if entry is not None and entry.spec.parameter is not None:
             hint = "a template is evaluated for each object by itself; share formulas by def"
             self.resolver.fault(name.span, scope, f"{name.text!r} is a template, not a formula", hint)
-        elif isinstance(defined, SpecStatement):
+        elif isinstance(definition, SpecStatement):
             hint = "a spec may name those above it; move it down"
             self.resolver.fault(name.span, scope, f"{name.text!r} is not defined before this place", hint)
-        elif isinstance(defined, DefStatement):
-            arguments = ", ".join(parameter.text for parameter in defined.parameters)
+        elif isinstance(definition, DefStatement):
+            arguments = ", ".join(parameter.text for parameter in definition.parameters)
             hint = f"write {name.text}({arguments})"
             self.resolver.fault(name.span, scope, f"{name.text!r} is a macro, and needs its arguments", hint)
-        elif defined is not None:
-            message = f"{name.text!r} is {kind_of(defined)}; a formula is expected here"
+        elif definition is not None:
+            message = f"{name.text!r} is {kind_of(definition)}; a formula is expected here"
             self.resolver.fault(name.span, scope, message, f"write a relation, such as a ovlp {name.text}")
         else:
             hint = self.faults.nearest(name.text, self._formula_names())
@@ -598,10 +608,10 @@ class Elaborator:
                 hint = f"truth values are written {name.text.lower()}"
             elif name.text.lower() in SAMPLES:
                 hint = f"it is written {SAMPLES[name.text.lower()]}"
-            word = name.text if name.text.isidentifier() else quote_name(name.text)
+            name_text = name.text if name.text.isidentifier() else quote_name(name.text)
             hint = hint or (
-                f"a signal needs a comparison, such as {word} >= 1.0 or, for a flag, {word} == 1; "
-                f"an object needs a relation, such as {word} ovlp other"
+                f"a signal needs a comparison, such as {name_text} >= 1.0 or, for a flag, {name_text} == 1; "
+                f"an object needs a relation, such as {name_text} ovlp other"
             )
             self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
 
@@ -611,12 +621,12 @@ class Elaborator:
 
     def _call(self, written: Call, scope: Scope) -> Formula:
         name = written.name.text
-        macro = self.names.definitions.get(name)
-        if isinstance(macro, BrokenStatement):
+        definition = self.names.definitions.get(name)
+        if isinstance(definition, BrokenStatement):
             return Truth(True)
-        if name == "present" and not isinstance(macro, DefStatement | SpecStatement):
+        if name == "present" and not isinstance(definition, DefStatement | SpecStatement):
             return self.atoms.presence(written, scope)
-        if not isinstance(macro, DefStatement):
+        if not isinstance(definition, DefStatement):
             self._report_call(written, scope)
             return Truth(True)
         self.names.used.add(name)
@@ -624,35 +634,43 @@ class Elaborator:
             message = f"def {name!r} is defined in terms of itself"
             self.faults.add(written.span, message, "a macro is written out where it is used, so it must end")
             return Truth(True)
-        if len(written.arguments) != len(macro.parameters):
-            parameter_names = ", ".join(parameter.text for parameter in macro.parameters)
-            count = f"{len(macro.parameters)} arguments ({parameter_names}), not {len(written.arguments)}"
-            self.resolver.fault(written.span, scope, f"{name!r} takes {count}")
+        if len(written.arguments) != len(definition.parameters):
+            parameter_names = ", ".join(parameter.text for parameter in definition.parameters)
+            mismatch = (
+                f"{len(definition.parameters)} arguments ({parameter_names}), not {len(written.arguments)}"
+            )
+            self.resolver.fault(written.span, scope, f"{name!r} takes {mismatch}")
             return Truth(True)
         values = {
             parameter.text: self._argument(argument, scope)
-            for parameter, argument in zip(macro.parameters, written.arguments, strict=True)
+            for parameter, argument in zip(definition.parameters, written.arguments, strict=True)
         }
-        call = scope.call or written.span
-        inner = replace(scope, values=values, call=call, macros=(*scope.macros, name), depth=scope.depth + 1)
-        return self.formula(macro.body, inner)
+        call_span = scope.call or written.span
+        body_scope = replace(
+            scope, values=values, call=call_span, macros=(*scope.macros, name), depth=scope.depth + 1
+        )
+        return self.formula(definition.body, body_scope)
 
     def _report_call(self, written: Call, scope: Scope) -> None:
         name = written.name.text
-        defined = self.names.definitions.get(name)
-        if isinstance(defined, SpecStatement) and defined.parameters:
+        definition = self.names.definitions.get(name)
+        if isinstance(definition, SpecStatement) and definition.parameters:
             hint = "a template is evaluated for each object by itself; share formulas by def"
             self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
             return
-        macros = (
+        macro_names = (
             macro_name
-            for macro_name, what in self.names.definitions.items()
-            if isinstance(what, DefStatement)
+            for macro_name, statement in self.names.definitions.items()
+            if isinstance(statement, DefStatement)
         )
         arguments = written.arguments
         text = self.faults.source.text
-        inner = f"({text[arguments[0].span.start : arguments[-1].span.end] if arguments else 'p'})"
-        hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
+        argument_text = f"({text[arguments[0].span.start : arguments[-1].span.end] if arguments else 'p'})"
+        hint = (
+            self.faults.nearest(name, macro_names)
+            or function_hint(name, argument_text)
+            or "define it with def"
+        )
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
     def _argument(self, written: ArgumentSyntax, scope: Scope) -> Value:
@@ -663,9 +681,9 @@ class Elaborator:
             self.resolver.fault(written.span, scope, "a formula in the place of an object", hint)
             return Anything()
         if isinstance(written, Name):
-            local = scope.values.get(written.text)
-            if local is not None:
-                return local
+            value = scope.values.get(written.text)
+            if value is not None:
+                return value
             constant = self.names.with_constant_name(written.text, self.names.constant(written.text))
             if constant is not None:
                 self.names.used.add(written.text)
@@ -715,11 +733,11 @@ def parse_specification(
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
     # some editors write a byte order mark, which is not a part of the text
     text = text.removeprefix("\ufeff")
-    names = RELATION_NAMES.union(custom_relations)
+    relation_names = RELATION_NAMES.union(custom_relations)
     if constants:
-        text = _constant_writer(text, filename, names)(constants)
+        text = _constant_writer(text, filename, relation_names)(constants)
     faults = Faults(SourceText.of(text, filename))
-    for name, place in used_modules(text).items():
+    for name, offsets in used_modules(text).items():
         # a name that is similar to a profile is reported as a misspelt profile later
         if name not in plugins and not nearest_hint(name, PROFILES):
             message = f"{name!r} is neither a profile ({', '.join(PROFILES)}) nor an allowed plug-in"
@@ -727,10 +745,10 @@ def parse_specification(
                 f'if you trust the module: plugins = ["{name}"] in pyproject.toml, under'
                 f" [tool.spatial-replay]; or --plugin {name} of check, replay and batch"
             )
-            faults.add(Span(*place), message, hint)
+            faults.add(Span(*offsets), message, hint)
     faults.raise_if_any()
-    tokens = _tokens(text, names, faults)
-    statements = parse_statements(tokens, names, faults)
+    tokens = _tokens(text, relation_names, faults)
+    statements = parse_statements(tokens, relation_names, faults)
     used_profile = _profile(statements, plugins, faults) or profile or DEFAULT_PROFILE
     words = frozenset(token.value for token in tokens)
     namespace = Namespace(
@@ -739,16 +757,16 @@ def parse_specification(
     namespace.declare(statements)
     constants_with_ranges = namespace.constant_ranges()
     elaborator = Elaborator(namespace, {**PROFILES[used_profile], **custom_relations}, words, faults)
-    specs = [statement for statement in statements if isinstance(statement, SpecStatement)]
-    if not specs and not any(isinstance(statement, BrokenStatement) for statement in statements):
-        end = Span(len(text), len(text))
+    spec_statements = [statement for statement in statements if isinstance(statement, SpecStatement)]
+    if not spec_statements and not any(isinstance(statement, BrokenStatement) for statement in statements):
+        end_span = Span(len(text), len(text))
         if not faults.found:
             hint = "write a formula, or: spec name = formula"
             if text.lstrip().startswith("#") and any(sign in text for sign in "<>="):
                 hint += "; # begins a comment, and a plug-in counts objects"
-            faults.add(end, "this text holds no spec", hint)
+            faults.add(end_span, "this text holds no spec", hint)
     try:
-        elaborated_specs = elaborator.specs(specs)
+        elaborated_specs = elaborator.specs(spec_statements)
     except TooLargeError:
         elaborated_specs = ()
     faults.raise_if_any()
@@ -819,12 +837,12 @@ def load_specification(
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
-        before = content[: error.start].decode("utf-8")
-        source = SourceText.of(before + "\ufffd", path.name)
+        decoded_text = content[: error.start].decode("utf-8")
+        source = SourceText.of(decoded_text + "\ufffd", path.name)
         message = f"byte 0x{content[error.start]:02x} is not UTF-8 text"
         hint = "save the file as UTF-8"
-        place = Span(len(before), len(before) + 1)
-        raise SpecificationError([source.diagnostic("error", place, message, hint)]) from error
+        span = Span(len(decoded_text), len(decoded_text) + 1)
+        raise SpecificationError([source.diagnostic("error", span, message, hint)]) from error
     return parse_specification(
         text, filename=path.name, profile=profile, relations=relations, constants=constants
     )
@@ -883,33 +901,33 @@ def constant_writer(specification: Specification) -> Callable[[Mapping[str, floa
 
     It is faster for many values than `parse_specification` with `constants`, which parses each new text.
     """
-    names = RELATION_NAMES | specification.relations
-    return _constant_writer(specification.source, specification.filename, names)
+    relation_names = RELATION_NAMES | specification.relations
+    return _constant_writer(specification.source, specification.filename, relation_names)
 
 
 # viewers change the constants of the same text repeatedly
 @lru_cache(maxsize=16)
 def _constant_writer(
-    text: str, filename: str, names: frozenset[str]
+    text: str, filename: str, relation_names: frozenset[str]
 ) -> Callable[[Mapping[str, float | str]], str]:
     faults = Faults(SourceText.of(text, filename))
     namespace = Namespace(faults)
-    namespace.declare(parse_statements(_tokens(text, names, faults), names, faults))
+    namespace.declare(parse_statements(_tokens(text, relation_names, faults), relation_names, faults))
     faults.raise_if_any()
-    lines = {
+    const_statements = {
         name: statement
         for name, statement in namespace.definitions.items()
         if isinstance(statement, ConstStatement)
     }
-    return partial(replace_constants, text, lines, namespace.constants)
+    return partial(replace_constants, text, const_statements, namespace.constants)
 
 
-def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:
+def _tokens(text: str, relation_names: frozenset[str], faults: Faults) -> list[Token]:
     if len(text) > MAX_LENGTH:
         message = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
         faults.add(Span(0, 1), message, "split it into several files")
         faults.raise_if_any()
-    tokens = tokenize(text, names, faults)
+    tokens = tokenize(text, relation_names, faults)
     if len(tokens) == MAX_TOKENS:
         faults.raise_if_any()
     return tokens
@@ -948,8 +966,8 @@ def constants_from_texts(texts: Iterable[str]) -> dict[str, float | str]:
     """
     constants: dict[str, float | str] = {}
     for text in texts:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if not (equals and name and value):
+        name, equals_sign, value = (part.strip() for part in text.partition("="))
+        if not (equals_sign and name and value):
             raise UsageError(f"{text!r} is incomplete; write NAME=VALUE, such as near=80 or hold=2s")
         if name in constants:
             raise UsageError(f"{name!r} is given twice; give one value")
@@ -981,14 +999,14 @@ def load_specifications(
         SpecificationError: a specification has faults.
         UsageError: a constant that no file has, or a number for a duration or the reverse.
     """
-    files = [_parse(source, {}) for source in sources]
+    specifications = [_parse(source, {}) for source in sources]
     if not constants:
-        return files
-    _check_names(files, constants)
-    values_by_file = [_own_constants(file, constants) for file in files]
+        return specifications
+    _check_names(specifications, constants)
+    values_by_file = [_own_constants(specification, constants) for specification in specifications]
     return [
-        _with_titles(_parse(source, values), file, values) if values else file
-        for source, file, values in zip(sources, files, values_by_file, strict=True)
+        _with_titles(_parse(source, values), specification, values) if values else specification
+        for source, specification, values in zip(sources, specifications, values_by_file, strict=True)
     ]
 
 
@@ -1004,11 +1022,11 @@ def _with_titles(
         written: specification with the values of its text.
         values: new values of constants by name.
     """
-    before = {spec.name: spec.formula for spec in written.specs}
-    pairs = {name: (changed.constants[name], written.constants[name]) for name in values}
+    written_formulas = {spec.name: spec.formula for spec in written.specs}
+    new_and_old = {name: (changed.constants[name], written.constants[name]) for name in values}
     overrides = [
         f"{name} = {_constant_text(new)} instead of {_constant_text(old)}"
-        for name, (new, old) in pairs.items()
+        for name, (new, old) in new_and_old.items()
         if new != old
     ]
     text = changed.source
@@ -1016,15 +1034,15 @@ def _with_titles(
     tokens = tokenize(text, RELATION_NAMES | changed.relations, faults)
     # backwards, so that the offsets of earlier titles stay valid
     for spec in sorted(changed.specs, key=lambda spec: spec.span.start, reverse=True):
-        if spec.title is None or spec.formula == before[spec.name]:
+        if spec.title is None or spec.formula == written_formulas[spec.name]:
             continue
-        title = next(
+        title_span = next(
             span_of(token)
             for token in tokens
             if token.type == "TITLE" and span_of(token).start >= spec.span.end
         )
-        words = quote_name(f"{title_text(spec)} ({', '.join(overrides)})")
-        text = f"{text[: title.start]}{words}{text[title.end :]}"
+        new_title = quote_name(f"{title_text(spec)} ({', '.join(overrides)})")
+        text = f"{text[: title_span.start]}{new_title}{text[title_span.end :]}"
     return _parse(SpecificationText(text, changed.filename), {})
 
 
@@ -1048,24 +1066,35 @@ def _parse(source: Path | SpecificationText, constants: Mapping[str, float | str
     return load_specification(source, constants=constants)
 
 
-def _qualify(file: Specification, constant: str) -> str:
-    return f"{PurePath(file.filename).stem}.{constant}"
+def _qualify(specification: Specification, constant: str) -> str:
+    return f"{PurePath(specification.filename).stem}.{constant}"
 
 
-def _own_constants(file: Specification, constants: Mapping[str, float | str]) -> dict[str, float | str]:
+def _own_constants(
+    specification: Specification, constants: Mapping[str, float | str]
+) -> dict[str, float | str]:
     """Return the values for the constants of one file, by their names without the stem."""
     return {
         constant_name: constants[given_name]
-        for constant_name in file.constants
-        for given_name in (constant_name, _qualify(file, constant_name))
+        for constant_name in specification.constants
+        for given_name in (constant_name, _qualify(specification, constant_name))
         if given_name in constants
     }
 
 
-def _check_names(files: Sequence[Specification], constants: Mapping[str, float | str]) -> None:
+def _check_names(specifications: Sequence[Specification], constants: Mapping[str, float | str]) -> None:
     """Raise an error for a constant that no file has."""
-    constant_names = dict.fromkeys(name for file in files for name in file.constants)
-    accepted_names = {*constant_names, *(_qualify(file, name) for file in files for name in file.constants)}
+    constant_names = dict.fromkeys(
+        name for specification in specifications for name in specification.constants
+    )
+    accepted_names = {
+        *constant_names,
+        *(
+            _qualify(specification, name)
+            for specification in specifications
+            for name in specification.constants
+        ),
+    }
     for name in constants:
         if name not in accepted_names:
             hint = (

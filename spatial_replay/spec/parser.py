@@ -87,13 +87,13 @@ class StatementError(Exception):
         self.span, self.message, self.hint = span, message, hint
 
 
-def _span(piece: Any) -> Span:
-    return span_of(piece) if isinstance(piece, Token) else piece.span
+def _span(node: Any) -> Span:
+    return span_of(node) if isinstance(node, Token) else node.span
 
 
 def _cover(children: list[Any]) -> Span:
-    present = [child for child in children if child is not None]
-    return Span(_span(present[0]).start, _span(present[-1]).end)
+    present_children = [child for child in children if child is not None]
+    return Span(_span(present_children[0]).start, _span(present_children[-1]).end)
 
 
 def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
@@ -118,11 +118,11 @@ def read_number(text: str, span: Span) -> float | Duration:
             hint = "numbers reach up to about 1.7e308"
             raise StatementError(span, f"{text} is too large for a number", hint)
         return value
-    seconds = Decimal(digits)
+    amount = Decimal(digits)
     # int() of 1e999999999s would be a number of a billion digits
-    if seconds and not -40 < seconds.adjusted() < 40:
+    if amount and not -40 < amount.adjusted() < 40:
         raise StatementError(span, f"{text} is not a usable duration", "durations go from 1e-9s to 9e9s")
-    ns = seconds * _NS[unit]
+    ns = amount * _NS[unit]
     if ns != int(ns) or ns > MAX_DURATION_NS:
         raise StatementError(span, f"{text} is not a usable duration", "give whole nanoseconds, at most 9e9s")
     return Duration(int(ns))
@@ -181,10 +181,10 @@ class TreeBuilder:
         return ScaleStatement(children[1], children[3])
 
     def region(self, children: list[Any]) -> RegionStatement:
-        _, name, _, shape, *height = children
-        if height[0] is None:
+        _, name, _, shape, *height_children = children
+        if height_children[0] is None:
             return RegionStatement(name, shape, None, None)
-        return RegionStatement(name, shape, (height[2], height[4]), _cover(height))
+        return RegionStatement(name, shape, (height_children[2], height_children[4]), _cover(height_children))
 
     def group(self, children: list[Any]) -> GroupStatement:
         _, name, _, members = children
@@ -231,8 +231,8 @@ class TreeBuilder:
         return _arithmetic("-", (children[1],), children)
 
     def arithmetic(self, children: list[Any]) -> Arithmetic:
-        first, token, second = children
-        return _arithmetic(token.value, (first, second), children)
+        left, token, right = children
+        return _arithmetic(token.value, (left, right), children)
 
     # -------------------------------------------------------------------------------------- formulas
 
@@ -241,8 +241,8 @@ class TreeBuilder:
         operator: Any = _BOOLEAN[token.type]
         span = _cover(children)
         depth = _deeper((left, right), span_of(token))
-        gathers = operator in ("and", "or") and isinstance(left, BooleanSyntax)
-        if gathers and left.operator == operator and not left.is_bracketed:
+        can_merge = operator in ("and", "or") and isinstance(left, BooleanSyntax)
+        if can_merge and left.operator == operator and not left.is_bracketed:
             # in place, because a copy for each operand would take quadratic time in a long chain
             left.operands.append(right)
             return BooleanSyntax(operator, left.operands, span, max(left.depth, 1 + depth_of(right)))
@@ -284,9 +284,9 @@ class TreeBuilder:
         return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
 
     def relation(self, children: list[Any]) -> RelationSyntax:
-        first, token, parameters, second = children
-        operator = span_of(token)
-        return RelationSyntax(token.value, operator, (first, second), parameters or (), _cover(children))
+        left, token, parameters, right = children
+        operator_span = span_of(token)
+        return RelationSyntax(token.value, operator_span, (left, right), parameters or (), _cover(children))
 
     def closer(self, children: list[Any]) -> RelationSyntax:
         first, token, second, _, third = children
@@ -304,8 +304,8 @@ class TreeBuilder:
         return RateSyntax(children[0].value, children[2] or (), _cover(children))
 
     def comparison(self, children: list[Any]) -> ComparisonSyntax:
-        present = [child for child in children if child is not None]
-        return ComparisonSyntax(tuple(present[::2]), tuple(present[1::2]), _cover(children))
+        present_children = [child for child in children if child is not None]
+        return ComparisonSyntax(tuple(present_children[::2]), tuple(present_children[1::2]), _cover(children))
 
     # ----------------------------------------------------------------------------------------- terms
 
@@ -386,72 +386,88 @@ def split_statements(tokens: Sequence[Token], faults: Faults) -> Iterator[TokenG
     if not any(token.type in STATEMENT_TYPES - {"USE"} for token in tokens):
         yield from _split_bare_formula(tokens, faults)
         return
-    current: list[Token] = []
-    brackets: list[tuple[Token, bool]] = []
-    continues = True
+    statement_tokens: list[Token] = []
+    open_brackets: list[tuple[Token, bool]] = []
+    is_continued = True
     for token in tokens:
-        if current and _begins_statement(token, current[-1], bool(brackets), continues, faults):
-            yield from _close(current, brackets, faults)
-            current, brackets = [], []
-        continues = _step(token, current, brackets)
-        current.append(token)
-    yield from _close(current, brackets, faults)
+        if statement_tokens and _begins_statement(
+            token, statement_tokens[-1], bool(open_brackets), is_continued, faults
+        ):
+            yield from _close(statement_tokens, open_brackets, faults)
+            statement_tokens, open_brackets = [], []
+        is_continued = _step(token, statement_tokens, open_brackets)
+        statement_tokens.append(token)
+    yield from _close(statement_tokens, open_brackets, faults)
 
 
 def _split_bare_formula(tokens: Sequence[Token], faults: Faults) -> Iterator[TokenGroup]:
-    start = 0
-    while start < len(tokens) and tokens[start].type == "USE":
-        line = tokens[start].line
-        end = start + 1
-        while end < len(tokens) and tokens[end].line == line and end < start + 2:
-            end += 1
-        yield TokenGroup(tuple(tokens[start:end]))
-        if end < len(tokens) and tokens[end].line == line:
+    start_index = 0
+    while start_index < len(tokens) and tokens[start_index].type == "USE":
+        line = tokens[start_index].line
+        end_index = start_index + 1
+        while end_index < len(tokens) and tokens[end_index].line == line and end_index < start_index + 2:
+            end_index += 1
+        yield TokenGroup(tuple(tokens[start_index:end_index]))
+        if end_index < len(tokens) and tokens[end_index].line == line:
             message = "a statement ends at the end of its line"
-            faults.add(span_of(tokens[end]), message, "begin a new line here")
-        start = end
-    brackets: list[tuple[Token, bool]] = []
-    formula = list(tokens[start:])
+            faults.add(span_of(tokens[end_index]), message, "begin a new line here")
+        start_index = end_index
+    open_brackets: list[tuple[Token, bool]] = []
+    formula = list(tokens[start_index:])
     for index, token in enumerate(formula):
-        _step(token, formula[:1] if index == 0 else [formula[index - 1]], brackets)
-    yield from _close(formula, brackets, faults, is_bare_formula=True)
+        _step(token, formula[:1] if index == 0 else [formula[index - 1]], open_brackets)
+    yield from _close(formula, open_brackets, faults, is_bare_formula=True)
 
 
-def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bool, faults: Faults) -> bool:
+def _begins_statement(
+    token: Token, previous: Token, is_in_bracket: bool, is_continued: bool, faults: Faults
+) -> bool:
     # directly after -, the word is the rest of a name without quotes, such as safe-region
-    if token.type in STATEMENT_TYPES and not (last.type == "MINUS" and last.end_pos == token.start_pos):
-        if token.line == last.line:
+    if token.type in STATEMENT_TYPES and not (
+        previous.type == "MINUS" and previous.end_pos == token.start_pos
+    ):
+        if token.line == previous.line:
             message = f"{token.value!r} begins a statement within a line"
             faults.add(span_of(token), message, "begin a new line")
         return True
-    return token.line != last.line and not in_bracket and not continues and token.type not in BINARY_TYPES
+    return (
+        token.line != previous.line
+        and not is_in_bracket
+        and not is_continued
+        and token.type not in BINARY_TYPES
+    )
 
 
-def _step(token: Token, before: Sequence[Token], brackets: list[tuple[Token, bool]]) -> bool:
+def _step(token: Token, previous_tokens: Sequence[Token], open_brackets: list[tuple[Token, bool]]) -> bool:
     """Update the open brackets for a token; return whether a line that ends in it is continued."""
     if token.type in _OPENING:
-        brackets.append((token, bool(before) and before[-1].type in ("PREFIX", "INFIX")))
+        open_brackets.append(
+            (token, bool(previous_tokens) and previous_tokens[-1].type in ("PREFIX", "INFIX"))
+        )
         return True
-    if token.type in ("RPAR", "RSQB") and brackets:
+    if token.type in ("RPAR", "RSQB") and open_brackets:
         # after the window of a temporal operator, its operand may be on the next line
-        opened, after_temporal = brackets.pop()
-        return after_temporal and opened.type == "LSQB"
+        bracket, is_after_temporal = open_brackets.pop()
+        return is_after_temporal and bracket.type == "LSQB"
     return token.type in BINARY_TYPES or token.type in ("PREFIX", "NOT", "EQUAL", "COLON")
 
 
 def _close(
-    tokens: list[Token], brackets: list[tuple[Token, bool]], faults: Faults, is_bare_formula: bool = False
+    tokens: list[Token],
+    open_brackets: list[tuple[Token, bool]],
+    faults: Faults,
+    is_bare_formula: bool = False,
 ) -> Iterator[TokenGroup]:
     if not tokens:
         return
-    if brackets:
-        opened = brackets[-1][0]
-        closing = ")" if opened.type == "LPAR" else "]"
-        rest = faults.source.text[tokens[-1].end_pos :].partition("\n")[0].lstrip()
-        hint = _COUNTED_HINT if _COUNTED.match(rest) else f"add a {closing!r}"
-        faults.add(span_of(opened), f"{opened.value!r} is never closed", hint)
-    broken = bool(brackets) or any(token.type == "ERROR" for token in tokens)
-    yield TokenGroup(tuple(tokens), is_bare_formula, broken)
+    if open_brackets:
+        bracket = open_brackets[-1][0]
+        closing_bracket = ")" if bracket.type == "LPAR" else "]"
+        rest_of_line = faults.source.text[tokens[-1].end_pos :].partition("\n")[0].lstrip()
+        hint = _COUNTED_HINT if _COUNTED.match(rest_of_line) else f"add a {closing_bracket!r}"
+        faults.add(span_of(bracket), f"{bracket.value!r} is never closed", hint)
+    is_broken = bool(open_brackets) or any(token.type == "ERROR" for token in tokens)
+    yield TokenGroup(tuple(tokens), is_bare_formula, is_broken)
 
 
 # ------------------------------------------------------------------------------------------ one statement
@@ -477,11 +493,11 @@ def grammar() -> Lark:
     text = _resource("grammar.lark")
     tables: Any = json.loads(_resource(TABLES_FILE), object_hook=_with_numbers)
     if tables["made_from"] == made_from(text):
-        data = tables["data"]
+        parser_data = tables["data"]
         # JSON cannot store classes, so they are put back
-        data["options"] |= {"lexer": _Tokens, "transformer": TreeBuilder()}
-        data["parser"]["lexer_conf"]["lexer_type"] = _Tokens
-        return Lark.load({"data": data, "memo": tables["memo"]})
+        parser_data["options"] |= {"lexer": _Tokens, "transformer": TreeBuilder()}
+        parser_data["parser"]["lexer_conf"]["lexer_type"] = _Tokens
+        return Lark.load({"data": parser_data, "memo": tables["memo"]})
     return built_grammar(text)
 
 
@@ -513,40 +529,40 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
     if group.is_broken:
         return _broken(tokens)
     fault_count = faults.count
-    deepest = _too_deep(tokens)
-    if deepest is not None:
+    deep_bracket = _too_deep(tokens)
+    if deep_bracket is not None:
         message = f"more than {MAX_DEPTH} brackets within one another"
-        faults.add(span_of(deepest), message, "give parts names of their own, with spec")
+        faults.add(span_of(deep_bracket), message, "give parts names of their own, with spec")
         return _broken(tokens)
     if not group.is_bare_formula and tokens[0].type not in STATEMENT_TYPES:
         words = ", ".join(_STATEMENT_WORDS)
         hint = meant_statement(tokens) or nearest_hint(tokens[0].value, _STATEMENT_WORDS)
-        for first, sign, word in zip(tokens, tokens[1:], tokens[2:], strict=False):
-            if (first.type, sign.type) == ("NAME", "MINUS") and word.type in STATEMENT_TYPES:
-                hint = f'a name with - is written in quotes: "{first.value}-{word.value}"'
+        for name, sign, word in zip(tokens, tokens[1:], tokens[2:], strict=False):
+            if (name.type, sign.type) == ("NAME", "MINUS") and word.type in STATEMENT_TYPES:
+                hint = f'a name with - is written in quotes: "{name.value}-{word.value}"'
         hint = hint or "a formula is named by spec NAME = ...; a line that goes on ends in an operator"
         faults.add(span_of(tokens[0]), f"expected a statement ({words}), found {tokens[0].value!r}", hint)
         return _broken(tokens)
-    parsing: Any = grammar().parse_interactive(start="formula" if group.is_bare_formula else "statement")
-    result: Any = None
+    parser: Any = grammar().parse_interactive(start="formula" if group.is_bare_formula else "statement")
+    node: Any = None
     try:
         for token in tokens:
-            parsing.feed_token(token)
-        result = parsing.feed_eof(tokens[-1])
+            parser.feed_token(token)
+        node = parser.feed_eof(tokens[-1])
     except UnexpectedToken as unexpected:
         if faults.is_full:
             # `parsing.accepts()` tries every kind of token, which is slow
             faults.add(_place(unexpected.token, tokens), "")
         else:
-            _report(unexpected.token, tokens, parsing.accepts(), relations, faults)
+            _report(unexpected.token, tokens, parser.accepts(), relations, faults)
     except StatementError as fault:
         faults.add(fault.span, fault.message, fault.hint)
-    if faults.count > fault_count or result is None:
+    if faults.count > fault_count or node is None:
         return _broken(tokens)
     if group.is_bare_formula:
-        formula: FormulaSyntax = result
+        formula: FormulaSyntax = node
         return SpecStatement(Name(FORMULA_NAME, Span(0, 0)), (), formula)
-    statement: Statement = result
+    statement: Statement = node
     return statement
 
 
@@ -602,21 +618,21 @@ _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
 )
 
 
-def _expectation(accepted: set[str]) -> str:
-    rest = set(accepted)
-    parts: list[str] = []
-    for marks, words in _EXPECTATIONS:
-        if marks <= rest:
-            parts.append(words)
-            rest -= marks | _COVERED.get(words, frozenset())
-    parts += [sign for kind, sign in _SIGN_OF.items() if kind in rest]
-    return " or ".join(parts) if len(parts) < 3 else ", ".join(parts[:-1]) + " or " + parts[-1]
+def _expectation(accepted_types: set[str]) -> str:
+    remaining_types = set(accepted_types)
+    phrases: list[str] = []
+    for types, phrase in _EXPECTATIONS:
+        if types <= remaining_types:
+            phrases.append(phrase)
+            remaining_types -= types | _COVERED.get(phrase, frozenset())
+    phrases += [sign for kind, sign in _SIGN_OF.items() if kind in remaining_types]
+    return " or ".join(phrases) if len(phrases) < 3 else ", ".join(phrases[:-1]) + " or " + phrases[-1]
 
 
 def _place(token: Token, tokens: Sequence[Token]) -> Span:
     if token.type == "$END":
-        last = span_of(tokens[-1])
-        return Span(last.end, last.end)
+        last_span = span_of(tokens[-1])
+        return Span(last_span.end, last_span.end)
     return span_of(token)
 
 
@@ -630,13 +646,13 @@ def _between_objects(tokens: Sequence[Token], position: int) -> str:
             arguments.append([])
         else:
             arguments[-1].append(token.value)
-    first, second, *rest = (
+    left, right, *parameters = (
         [*(" ".join(words) for words in arguments), "b"]
         if len(arguments) < 2
         else [" ".join(words) for words in arguments]
     )
-    bracket = f"[{', '.join(rest)}]" if rest else ""
-    return f"{first or 'a'} {tokens[position].value}{bracket} {second or 'b'}"
+    bracket = f"[{', '.join(parameters)}]" if parameters else ""
+    return f"{left or 'a'} {tokens[position].value}{bracket} {right or 'b'}"
 
 
 def _report(
@@ -644,25 +660,25 @@ def _report(
 ) -> None:
     """Report a token at a place where the grammar does not allow it."""
     position = next((index for index, candidate in enumerate(tokens) if candidate is token), len(tokens))
-    before = tokens[position - 1] if position else None
+    previous = tokens[position - 1] if position else None
     span = _place(token, tokens)
     if position and (advice := foreign_token_advice(tokens, position, accepted)) is not None:
         faults.add(span, *advice)
         return
     if token.type == "$END":
-        rest = faults.source.text[span.start :].partition("\n")[0].lstrip()
-        hint = _COUNTED_HINT if rest.startswith("#") else ""
+        rest_of_line = faults.source.text[span.start :].partition("\n")[0].lstrip()
+        hint = _COUNTED_HINT if rest_of_line.startswith("#") else ""
         faults.add(span, f"the statement ends too early: expected {_expectation(accepted)}", hint)
         return
     message = f"expected {_expectation(accepted)}, found {token.value!r}"
-    kinds = [token.type for token in tokens[: position + 1]]
-    if kinds.count("RPAR") > kinds.count("LPAR"):
+    token_types = [token.type for token in tokens[: position + 1]]
+    if token_types.count("RPAR") > token_types.count("LPAR"):
         faults.add(span, f"{token.value!r} closes nothing", "leave it out, or open it in front with '('")
     elif token.type == "NAME" and "RELATION" in accepted:
         words = (*relations, "dist", "closer", "between", "and", "or", "implies")
         hint = faults.nearest(token.value, words) or f"relations are {', '.join(sorted(relations))}, dist"
         faults.add(span, f"unknown relation {token.value!r}", hint)
-    elif before is not None and before.type in ("RELATION", "DIST", "CLOSER", "THAN") and token.type in (
+    elif previous is not None and previous.type in ("RELATION", "DIST", "CLOSER", "THAN") and token.type in (
         "PREFIX", "NOT", "QUANTIFIER", "TRUTH",
     ):  # fmt: skip
         hint = f"put it before the relation; an object of that name is written {quote_name(token.value)}"
@@ -675,10 +691,10 @@ def _report(
     elif token.type == "SLASH" and "NAME" in accepted:
         hint = 'a name with other characters than letters, digits and _ is written in quotes: "/a/b"'
         faults.add(span, message, hint)
-    elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and before is not None:
+    elif token.type in ("RELATION", "DIST", "CLOSER", "BETWEEN") and previous is not None:
         hint = "a relation stands between two objects, without operators inside"
-        if before.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
-            hint = f"if {before.value!r} is an object, write it in quotes: {quote_name(before.value)}"
+        if previous.type in ("PREFIX", "INFIX", "TRUTH", "NOT"):
+            hint = f"if {previous.value!r} is an object, write it in quotes: {quote_name(previous.value)}"
         faults.add(span, f"{token.value!r} needs an object, region or group on its left", hint)
     elif "NAME" in accepted and (token.value in KEYWORDS or token.type == "RELATION"):
         hint = f"that word is reserved; an object of its name is written in quotes: {quote_name(token.value)}"

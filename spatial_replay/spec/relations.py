@@ -289,12 +289,12 @@ def plugins_of(text: str) -> dict[str, Plugin]:
         UsageError: a plug-in cannot be loaded.
     """
     plugin_places = [place for place in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if place]
-    used = set(used_modules(text))
-    allowed = {Path(place).stem if place.endswith(".py") else place: place for place in plugin_places}
+    used_names = set(used_modules(text))
+    allowed_places = {Path(place).stem if place.endswith(".py") else place: place for place in plugin_places}
     # pyproject.toml is read only if a text needs it
-    if used - set(allowed):
-        allowed |= {name: name for name in _listed_plugins() if name in used}
-    return {name: load_plugin(_place(place)) for name, place in allowed.items()}
+    if used_names - set(allowed_places):
+        allowed_places |= {name: name for name in _listed_plugins() if name in used_names}
+    return {name: load_plugin(_place(place)) for name, place in allowed_places.items()}
 
 
 def _listed_plugins() -> list[str]:
@@ -346,10 +346,10 @@ def load_plugin(location: str) -> Plugin:
             f"the plug-in {location} cannot be loaded: {type(error).__name__}: {error}"
         ) from error
     relations, signals = getattr(module, "RELATIONS", {}), getattr(module, "SIGNALS", {})
-    for title, functions in (("RELATIONS", relations), ("SIGNALS", signals)):
+    for table_name, functions in (("RELATIONS", relations), ("SIGNALS", signals)):
         if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
             raise UsageError(
-                f"the plug-in {location} has a {title} that is not a dictionary of functions by name"
+                f"the plug-in {location} has a {table_name} that is not a dictionary of functions by name"
             )
     if not relations and not signals:
         raise UsageError(f"the plug-in {location} has no relations and signals; define RELATIONS or SIGNALS")
@@ -367,5 +367,5 @@ def computed_signal(signal: ComputedSignal, sample: Any) -> float:
         return nan if value is None else float(value)
     # code of a user may raise any error
     except Exception as error:
-        what = f"the plug-in {signal.plugin} fails for the signal {signal.name!r} at {sample.time_ns} ns"
-        raise UsageError(f"{what}: {type(error).__name__}: {error}") from error
+        message = f"the plug-in {signal.plugin} fails for the signal {signal.name!r} at {sample.time_ns} ns"
+        raise UsageError(f"{message}: {type(error).__name__}: {error}") from error

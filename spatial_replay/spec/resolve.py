@@ -83,9 +83,9 @@ def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
     if len(ring) > 1 and ring[0] == ring[-1]:
         ring.pop()
     if not _is_collinear(ring):
-        crossing = _crossing(ring, effort)
-        if crossing is not None:
-            (ax, ay), (bx, by) = crossing
+        crossing_corners = _crossing(ring, effort)
+        if crossing_corners is not None:
+            (ax, ay), (bx, by) = crossing_corners
             message = f"the polygon crosses itself: its edges from ({ax:g}, {ay:g}) and ({bx:g}, {by:g}) meet"
             raise OutlineError(message, "list the corners in the order of its boundary")
     return Outline(tuple(corners))
@@ -136,36 +136,40 @@ def _meet(a: Corner, b: Corner, c: Corner, d: Corner) -> bool:
     c_side, d_side, a_side, b_side = _turn(a, b, c), _turn(a, b, d), _turn(c, d, a), _turn(c, d, b)
     if ((c_side > 0 > d_side) or (c_side < 0 < d_side)) and ((a_side > 0 > b_side) or (a_side < 0 < b_side)):
         return True
-    on_line = ((c_side, a, b, c), (d_side, a, b, d), (a_side, c, d, a), (b_side, c, d, b))
-    return any(side == 0.0 and _within(*points) for side, *points in on_line)
+    touch_candidates = ((c_side, a, b, c), (d_side, a, b, d), (a_side, c, d, a), (b_side, c, d, b))
+    return any(side == 0.0 and _within(*points) for side, *points in touch_candidates)
 
 
 def _fold_back(a: Corner, b: Corner, c: Corner) -> bool:
     """Return whether the edge bc runs back over ab."""
-    forward = (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1])
-    return _turn(a, b, c) == 0.0 and forward < 0.0
+    dot_product = (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1])
+    return _turn(a, b, c) == 0.0 and dot_product < 0.0
 
 
 def _crossing(ring: Sequence[Corner], effort: Effort) -> tuple[Corner, Corner] | None:
     """Return the first corners of two edges that cross, touch or fold back; None for a simple polygon."""
-    count = len(ring)
-    edges = [(ring[index], ring[(index + 1) % count]) for index in range(count)]
-    for index in range(count):
+    corner_count = len(ring)
+    edges = [(ring[index], ring[(index + 1) % corner_count]) for index in range(corner_count)]
+    for index in range(corner_count):
         if _fold_back(*edges[index - 1], edges[index][1]):
             return edges[index - 1][0], edges[index][0]
     # a sweep along x: only edges that overlap in x are compared
-    by_left = sorted(range(count), key=lambda index: min(edges[index][0][0], edges[index][1][0]))
-    for place, first in enumerate(by_left):
-        right = max(edges[first][0][0], edges[first][1][0])
-        for second in by_left[place + 1 :]:
-            if min(edges[second][0][0], edges[second][1][0]) > right:
+    indices_by_left = sorted(
+        range(corner_count), key=lambda index: min(edges[index][0][0], edges[index][1][0])
+    )
+    for position, first_index in enumerate(indices_by_left):
+        right_end = max(edges[first_index][0][0], edges[first_index][1][0])
+        for second_index in indices_by_left[position + 1 :]:
+            if min(edges[second_index][0][0], edges[second_index][1][0]) > right_end:
                 break
             effort.left -= 1
             if effort.left < 0:
                 raise OutlineError("the polygons of this text have too many corners", "use fewer of them")
             # neighbouring edges always meet at their common corner
-            if (first - second) % count not in (1, count - 1) and _meet(*edges[first], *edges[second]):
-                return edges[min(first, second)][0], edges[max(first, second)][0]
+            if (first_index - second_index) % corner_count not in (1, corner_count - 1) and _meet(
+                *edges[first_index], *edges[second_index]
+            ):
+                return edges[min(first_index, second_index)][0], edges[max(first_index, second_index)][0]
     return None
 
 
@@ -231,10 +235,10 @@ class Namespace:
 
     def _declare(self, statement: Statement) -> None:
         name = statement.name
-        first = self.definitions.setdefault(name.text, statement)
-        if first is not statement:
-            line = self.faults.source.line_of(first.name.span.start)
-            message = f"{name.text!r} is already the name of {kind_of(first)}, in line {line}"
+        first_statement = self.definitions.setdefault(name.text, statement)
+        if first_statement is not statement:
+            line = self.faults.source.line_of(first_statement.name.span.start)
+            message = f"{name.text!r} is already the name of {kind_of(first_statement)}, in line {line}"
             self.faults.add(name.span, message, "give each definition a name of its own")
 
     def _add_scale(self, statement: ScaleStatement) -> None:
@@ -242,10 +246,10 @@ class Namespace:
         # a signal with the name "lengths" is written in quotes
         signal = None if name.text == LENGTHS and not name.is_quoted else name.text
         divisor = self.plain_number(statement.value)
-        defined = self.definitions.get(name.text)
-        if signal is not None and defined is not None:
+        definition = self.definitions.get(name.text)
+        if signal is not None and definition is not None:
             hint = f"scale takes a signal of the log, or {LENGTHS}"
-            self.faults.add(name.span, f"{name.text!r} is {kind_of(defined)}", hint)
+            self.faults.add(name.span, f"{name.text!r} is {kind_of(definition)}", hint)
         elif any(scale.signal == signal for scale in self.scales):
             self.faults.add(name.span, f"{name.text!r} is scaled twice", "leave one out")
         elif self.faults.count == fault_count and divisor <= 0.0:
@@ -258,14 +262,14 @@ class Namespace:
     def constant(self, name: str) -> float | Duration | None:
         """Return the value of a constant; report a fault and return None if its definition is circular."""
         # a stack instead of recursion: a chain of constants can be longer than Python's recursion limit
-        pending = [name]
-        while pending:
-            current = pending[-1]
-            statement = self.definitions.get(current)
-            if current in self.constants or not isinstance(statement, ConstStatement):
-                pending.pop()
+        pending_names = [name]
+        while pending_names:
+            current_name = pending_names[-1]
+            statement = self.definitions.get(current_name)
+            if current_name in self.constants or not isinstance(statement, ConstStatement):
+                pending_names.pop()
                 continue
-            needed = next(
+            needed_name = next(
                 (
                     operand_name
                     for operand_name in names_in(statement.value)
@@ -273,14 +277,14 @@ class Namespace:
                 ),
                 None,
             )
-            if needed is None:
-                self.constants[current] = value_of(statement.value, self.named_value, self.faults.add)
-            elif needed.text in pending:
-                message = f"const {needed.text!r} is defined in terms of itself"
-                self.faults.add(needed.span, message, "give it a number")
-                self.constants[current] = None
+            if needed_name is None:
+                self.constants[current_name] = value_of(statement.value, self.named_value, self.faults.add)
+            elif needed_name.text in pending_names:
+                message = f"const {needed_name.text!r} is defined in terms of itself"
+                self.faults.add(needed_name.span, message, "give it a number")
+                self.constants[current_name] = None
             else:
-                pending.append(needed.text)
+                pending_names.append(needed_name.text)
         return self.constants.get(name)
 
     def _is_pending(self, name: Name) -> bool:
@@ -288,7 +292,7 @@ class Namespace:
 
     def constant_ranges(self) -> dict[str, Constant]:
         """Return the constants that have a value; report those outside of their range."""
-        ranges: dict[str, Constant] = {}
+        constants: dict[str, Constant] = {}
         for name, statement in self.definitions.items():
             value = self.constants.get(name)
             if value is None or not isinstance(statement, ConstStatement):
@@ -303,8 +307,8 @@ class Namespace:
             fault = None if ends is None else range_fault(value, ends)
             if fault is not None:
                 self.faults.add(statement.value.span, f"const {name!r}: {fault[0]}", fault[1])
-            ranges[name] = constant_of(statement.value, value, ends)
-        return ranges
+            constants[name] = constant_of(statement.value, value, ends)
+        return constants
 
     def _report_not_a_number(self, name: Name, statement: Statement | None) -> None:
         """Report that a name is not a number; `statement` is its definition, or None."""
@@ -316,12 +320,12 @@ class Namespace:
             hint = f"an object gets another name by a group: group NAME = {quote_name(name.text)}"
             self.faults.add(name.span, "a text, where a number or a duration is expected", hint)
         elif statement is None:
-            consts = (
+            constant_names = (
                 constant_name
-                for constant_name, what in self.definitions.items()
-                if isinstance(what, ConstStatement)
+                for constant_name, definition in self.definitions.items()
+                if isinstance(definition, ConstStatement)
             )
-            hint = self.faults.nearest(name.text, consts) or (
+            hint = self.faults.nearest(name.text, constant_names) or (
                 f"define it: const {name.text} = 1.0; a text stands in quotes,"
                 f" mode == {quote_name(name.text)}; a signal is not compared with a signal"
             )
@@ -359,12 +363,12 @@ class Namespace:
 
     def _region(self, statement: RegionStatement, effort: Effort) -> Outline:
         shape = statement.shape
-        before = self.faults.count
+        fault_count = self.faults.count
         corners = [(self.plain_number(x), self.plain_number(y)) for x, y in shape.points]
         radius = self.plain_number(shape.radius) if shape.radius is not None else 0.0
         height = self._height(statement)
         # a placeholder, so that the uses of the region are checked, too
-        if self.faults.count > before:
+        if self.faults.count > fault_count:
             return Outline(((0.0, 0.0),))
         try:
             match shape.kind:
@@ -394,9 +398,11 @@ class Namespace:
             return Group(name, class_name=class_of(statement.open_group))
         members: dict[str, Span] = {}
         for member in statement.members or ():
-            defined = self.definitions.get(member.text)
-            if defined is not None and not isinstance(defined, BrokenStatement):
-                message = f"{member.text!r} is {kind_of(defined)}; a group has objects of the log as members"
+            definition = self.definitions.get(member.text)
+            if definition is not None and not isinstance(definition, BrokenStatement):
+                message = (
+                    f"{member.text!r} is {kind_of(definition)}; a group has objects of the log as members"
+                )
                 self.faults.add(member.span, message)
             elif member.text in members:
                 self.faults.add(member.span, f"{member.text!r} is listed twice", "leave one out")
@@ -516,18 +522,18 @@ class Resolver:
 
     def _exclusion(self, written: Exclusion, scope: Scope) -> Term:
         group = self.term(written.group, scope)
-        excluded = [self._term_of_name(name, scope) for name in written.excluded]
+        excluded_terms = [self._term_of_name(name, scope) for name in written.excluded]
         if not isinstance(group, Group):
             if not self.is_unknown(written.group, scope):
                 self.fault(written.group.span, scope, "only a group can leave something out with except")
             return group
-        left_out = dict.fromkeys(group.excluded)
-        for name, term in zip(written.excluded, excluded, strict=True):
+        excluded_members = dict.fromkeys(group.excluded)
+        for name, term in zip(written.excluded, excluded_terms, strict=True):
             if isinstance(term, (TrackedName, Variable)):
-                left_out[term] = None
+                excluded_members[term] = None
             else:
                 self.fault(name.span, scope, f"except leaves out one object; {name.text!r} is not an object")
-        return replace(group, excluded=tuple(left_out))
+        return replace(group, excluded=tuple(excluded_members))
 
     def is_unknown(self, written: TermSyntax, scope: Scope) -> bool:
         """Return whether a name has no known meaning: an `Anything` parameter or a broken definition."""
@@ -535,8 +541,8 @@ class Resolver:
             return False
         if isinstance(scope.values.get(written.text), Anything):
             return True
-        defined = self.names.definitions.get(written.text)
-        return written.text not in scope.values and isinstance(defined, BrokenStatement)
+        definition = self.names.definitions.get(written.text)
+        return written.text not in scope.values and isinstance(definition, BrokenStatement)
 
     def _delay(self, term: Term, written: Delayed, scope: Scope) -> Term:
         # a delay applies to the footprint before it is enlarged or reduced to its centre
@@ -587,9 +593,9 @@ class Resolver:
 
     def is_number(self, name: Name, scope: Scope) -> bool:
         """Return whether a name is a constant, or a macro parameter with a number as its argument."""
-        local = scope.values.get(name.text)
-        if local is not None:
-            return isinstance(local, (float, Duration))
+        local_value = scope.values.get(name.text)
+        if local_value is not None:
+            return isinstance(local_value, (float, Duration))
         return isinstance(self.names.definitions.get(name.text), ConstStatement)
 
     def number(self, written: Quantity, scope: Scope) -> float:
@@ -635,37 +641,39 @@ class Resolver:
         unit: Literal["samples", "ns"] = "ns" if "ns" in units else "samples"
         if units == {"samples"} and self._lacks_unit(operator, window, scope):
             return None
-        first = self._whole(lower, window.lower, scope)
-        last = None if upper is None else self._whole(upper, window.upper, scope)
-        if last is not None and last < first:
+        whole_lower = self._whole(lower, window.lower, scope)
+        whole_upper = None if upper is None else self._whole(upper, window.upper, scope)
+        if whole_upper is not None and whole_upper < whole_lower:
             text = self.faults.source.text[window.span.start : window.span.end]
             hint = "the smaller end comes first"
             self.fault(window.span, scope, f"the window {text} is empty: its ends are reversed", hint)
             return None
-        return Bound(first, last, unit)
+        return Bound(whole_lower, whole_upper, unit)
 
     def _lacks_unit(self, operator: TemporalSyntax, written: BoundSyntax, scope: Scope) -> bool:
         """Report a window without a unit that is decimal, or has the spelling of a tool with other units."""
         text, ends = self.faults.source.text, (written.lower, written.upper)
-        word, window = (text[span.start : span.end] for span in (operator.keyword, written.span))
-        values = [self._end(end, scope) for end in ends]
-        numbers = [value for value in values if isinstance(value, float)]
+        keyword, window_text = (text[span.start : span.end] for span in (operator.keyword, written.span))
+        end_values = [self._end(end, scope) for end in ends]
+        numbers = [value for value in end_values if isinstance(value, float)]
         is_whole = all(number.is_integer() for number in numbers)
         is_decimal = not is_whole or any("." in text[end.span.start : end.span.end] for end in ends)
         # other tools write windows in seconds without a unit: always[0:5]
-        is_ours = word == operator.operator and ":" not in window
-        if (is_ours and not is_decimal) or numbers[0] < 0.0 or numbers != sorted(numbers):
+        is_own_spelling = keyword == operator.operator and ":" not in window_text
+        if (is_own_spelling and not is_decimal) or numbers[0] < 0.0 or numbers != sorted(numbers):
             return False
 
         def remedy(unit: str) -> str:
             end_texts = [
-                format_number(value) + unit if isinstance(value, float) else "inf" for value in values
+                format_number(value) + unit if isinstance(value, float) else "inf" for value in end_values
             ]
             return f"{operator.operator}[{', '.join(end_texts)}] for {'seconds' if unit else 'samples'}"
 
-        kind = "needs its unit in this spelling" if not is_ours else "of decimal numbers needs its unit"
+        reason = (
+            "needs its unit in this spelling" if not is_own_spelling else "of decimal numbers needs its unit"
+        )
         remedies = [remedy(unit) for unit in (["", "s"] if is_whole else ["s"])]
-        self.fault(written.span, scope, f"a window {kind}", f"write {', '.join(remedies)}")
+        self.fault(written.span, scope, f"a window {reason}", f"write {', '.join(remedies)}")
         return True
 
     def _end(self, written: Quantity, scope: Scope) -> float | Duration | None:

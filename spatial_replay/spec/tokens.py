@@ -169,46 +169,48 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
 
     A word is replaced only where the grammar allows no name, so an object can be named `always` or `until`.
     """
-    macros = {name.value for word, name in pairwise(tokens) if word.type in ("DEF", "SPEC")}
-    result: list[Token] = []
-    brackets: list[str] = []
+    macro_names = {name.value for keyword, name in pairwise(tokens) if keyword.type in ("DEF", "SPEC")}
+    new_tokens: list[Token] = []
+    open_brackets: list[str] = []
     for index, token in enumerate(tokens):
         if token.type in ("LPAR", "LSQB"):
-            brackets.append(token.type)
-        elif token.type in ("RPAR", "RSQB") and brackets:
-            brackets.pop()
-        following = tokens[index + 1 : index + 4]
-        pair = token.value + following[0].value if following else ""
-        if pair in ("[]", "<>") and _starts(result) and following[0].start_pos == token.end_pos:
-            _report(_as(token, "ERROR", pair), faults)
-            result.append(_as(token, "ERROR", pair))
-        elif token.type == "COLON" and brackets and brackets[-1] == "LSQB":
+            open_brackets.append(token.type)
+        elif token.type in ("RPAR", "RSQB") and open_brackets:
+            open_brackets.pop()
+        next_tokens = tokens[index + 1 : index + 4]
+        sign_pair = token.value + next_tokens[0].value if next_tokens else ""
+        if sign_pair in ("[]", "<>") and _starts(new_tokens) and next_tokens[0].start_pos == token.end_pos:
+            _report(_as(token, "ERROR", sign_pair), faults)
+            new_tokens.append(_as(token, "ERROR", sign_pair))
+        elif token.type == "COLON" and open_brackets and open_brackets[-1] == "LSQB":
             # G[0:5], as other tools write windows
-            result.append(_as(token, "COMMA", ","))
-        elif token.type == "NAME" and following and not _is_quoted(token):
-            word = _word(token, result, following, macros)
-            if word.type == "ERROR":
+            new_tokens.append(_as(token, "COMMA", ","))
+        elif token.type == "NAME" and next_tokens and not _is_quoted(token):
+            new_token = _word(token, new_tokens, next_tokens, macro_names)
+            if new_token.type == "ERROR":
                 # the limit keeps the time of a text full of such words linear
-                after = tokens[index + 1 : index + 1000]
-                if following[0].value in macros or _holds_formula(after):
+                later_tokens = tokens[index + 1 : index + 1000]
+                if next_tokens[0].value in macro_names or _holds_formula(later_tokens):
                     _report(token, faults)
                 else:
-                    word = token
-            if following[0].type == "LPAR" and token.value not in macros:
-                word = _as(token, _CALLED.get(token.value, word.type), word.value)
-            result.append(word)
+                    new_token = token
+            if next_tokens[0].type == "LPAR" and token.value not in macro_names:
+                new_token = _as(token, _CALLED.get(token.value, new_token.type), new_token.value)
+            new_tokens.append(new_token)
         else:
-            result.append(token)
-    return result
+            new_tokens.append(token)
+    return new_tokens
 
 
-def _word(token: Token, before: Sequence[Token], after: Sequence[Token], macros: set[str]) -> Token:
+def _word(
+    token: Token, previous: Sequence[Token], next_tokens: Sequence[Token], macro_names: set[str]
+) -> Token:
     prefix, infix = _PREFIX_WORDS.get(token.value), _INFIX_WORDS.get(token.value)
-    if infix is not None and _is_between(before, after):
+    if infix is not None and _is_between(previous, next_tokens):
         return _as(token, *infix)
-    if (prefix is None and _plain(token) not in _MEANT) or not _is_in_front(before, after):
+    if (prefix is None and _plain(token) not in _MEANT) or not _is_in_front(previous, next_tokens):
         return token
-    if token.value in macros and (prefix is None or after[0].type == "LPAR"):
+    if token.value in macro_names and (prefix is None or next_tokens[0].type == "LPAR"):
         return token
     return _as(token, "ERROR", token.value) if prefix is None else _as(token, *prefix)
 
@@ -218,10 +220,10 @@ def _plain(token: Token) -> str:
     return str(token.value).lower().removesuffix("_")
 
 
-def _holds_formula(after: Sequence[Token]) -> bool:
+def _holds_formula(later_tokens: Sequence[Token]) -> bool:
     """Return whether the bracket after a word contains a relation, and so a formula instead of arguments."""
     depth = 0
-    for token in after:
+    for token in later_tokens:
         depth += {"LPAR": 1, "LSQB": 1, "RPAR": -1, "RSQB": -1}.get(token.type, 0)
         if token.type in _RELATIONS:
             return True
@@ -231,43 +233,45 @@ def _holds_formula(after: Sequence[Token]) -> bool:
 
 
 def _report(token: Token, faults: Faults) -> None:
-    meant = _MEANT[_plain(token)]
-    example = "a ovlp b -> c ovlp d" if meant == "->" else f"{meant} (a ovlp b)"
-    hint = f"the operator is written {meant}, as in {example}; a macro is defined with def"
-    end = (token.start_pos or 0) + len(token.value)
-    faults.add(Span(token.start_pos or 0, end), f"{token.value!r} is not an operator", hint)
+    operator_text = _MEANT[_plain(token)]
+    example = "a ovlp b -> c ovlp d" if operator_text == "->" else f"{operator_text} (a ovlp b)"
+    hint = f"the operator is written {operator_text}, as in {example}; a macro is defined with def"
+    end_offset = (token.start_pos or 0) + len(token.value)
+    faults.add(Span(token.start_pos or 0, end_offset), f"{token.value!r} is not an operator", hint)
 
 
-def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
+def _is_in_front(previous: Sequence[Token], next_tokens: Sequence[Token]) -> bool:
     """Return whether the grammar allows a prefix operator between these tokens, but no name."""
-    if not _starts(before):
+    if not _starts(previous):
         return False
-    if after[0].type == "LSQB":
-        is_index = [token.type for token in after[1:]] == ["NAME", "RSQB"]
-        return len(after) > 1 and after[1].type != "MINUS" and not is_index
+    if next_tokens[0].type == "LSQB":
+        is_index = [token.type for token in next_tokens[1:]] == ["NAME", "RSQB"]
+        return len(next_tokens) > 1 and next_tokens[1].type != "MINUS" and not is_index
     # in "always until p", `always` is a name; if a relation follows, `until` is the name
-    if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
-        return len(after) > 1 and after[1].type in _RELATIONS
-    return after[0].type in STARTS_FORMULA - {"MINUS"}
+    if next_tokens[0].value in _INFIX_WORDS and next_tokens[0].type == "NAME":
+        return len(next_tokens) > 1 and next_tokens[1].type in _RELATIONS
+    return next_tokens[0].type in STARTS_FORMULA - {"MINUS"}
 
 
-def _starts(before: Sequence[Token]) -> bool:
+def _starts(previous: Sequence[Token]) -> bool:
     """Return whether a formula can start after these tokens."""
-    first = (
-        not before or before[-1].type in _BEFORE_FORMULA or before[-1].type in ("PREFIX", "INFIX", "ERROR")
+    can_start = (
+        not previous
+        or previous[-1].type in _BEFORE_FORMULA
+        or previous[-1].type in ("PREFIX", "INFIX", "ERROR")
     )
-    return first or (len(before) > 1 and before[-2].type == "USE")
+    return can_start or (len(previous) > 1 and previous[-2].type == "USE")
 
 
-def _is_between(before: Sequence[Token], after: Sequence[Token]) -> bool:
+def _is_between(previous: Sequence[Token], next_tokens: Sequence[Token]) -> bool:
     """Return whether the grammar allows an infix operator between these tokens, but no name."""
-    if not before or before[-1].type not in _AFTER_OPERAND:
+    if not previous or previous[-1].type not in _AFTER_OPERAND:
         return False
-    if len(before) > 1 and before[-2].type in ("USE", "SPEC", "DEF", "CONST", "REGION", "GROUP", "SCALE"):
+    if len(previous) > 1 and previous[-2].type in ("USE", "SPEC", "DEF", "CONST", "REGION", "GROUP", "SCALE"):
         return False
-    if after[0].type == "LSQB":
-        return len(after) > 1 and after[1].type != "MINUS"
-    return after[0].type in STARTS_FORMULA
+    if next_tokens[0].type == "LSQB":
+        return len(next_tokens) > 1 and next_tokens[1].type != "MINUS"
+    return next_tokens[0].type in STARTS_FORMULA
 
 
 def _as(token: Token, kind: str, value: str) -> Token:
@@ -298,8 +302,8 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
         return f"lengths are in the unit of the log's footprints: write {metres} if those are metres"
     if unit in ("deg", "degrees", "rad", "radians"):
         angle = float(number) if unit.startswith("rad") else radians(float(number))
-        turned = format(1.0 - cos(angle), ".4g")
-        return f"orientations are compared by 1 - cos of their angle: write {turned}"
+        threshold = format(1.0 - cos(angle), ".4g")
+        return f"orientations are compared by 1 - cos of their angle: write {threshold}"
     if unit == "px":
         return f"lengths are in the unit of the log's footprints: write {number} if those are pixels"
     if unit in _TIMES:
@@ -316,84 +320,96 @@ def foreign_token_advice(
         position: index of the token; the number of tokens means the end.
         accepted: types of tokens that the grammar allows at this position.
     """
-    missing = Token("$END", "")
-    token = tokens[position] if position < len(tokens) else missing
-    last, before, *_ = [*reversed(tokens[max(0, position - 2) : position]), missing, missing]
-    after = tokens[position + 1] if position + 1 < len(tokens) else missing
+    no_token = Token("$END", "")
+    token = tokens[position] if position < len(tokens) else no_token
+    previous, earlier, *_ = [*reversed(tokens[max(0, position - 2) : position]), no_token, no_token]
+    following = tokens[position + 1] if position + 1 < len(tokens) else no_token
     message = f"{token.value!r} cannot stand here"
     if position == 1 and (statement := meant_statement(tokens)):
-        return f"{last.value!r} begins no statement", statement
+        return f"{previous.value!r} begins no statement", statement
     operator = tokens[position - 3].value if position > 2 else ""
-    is_bound = before.type == "LSQB" and last.type == "NUMBER" and token.type == "RSQB"
+    is_bound = earlier.type == "LSQB" and previous.type == "NUMBER" and token.type == "RSQB"
     if is_bound and operator in ("X", "WX", "Y"):
-        within = f"{'O' if operator == 'Y' else 'F'}[0, {last.value}]"
-        return f"{operator} takes no window", f"it means one sample; within {last.value} is {within} (...)"
+        window_formula = f"{'O' if operator == 'Y' else 'F'}[0, {previous.value}]"
+        return (
+            f"{operator} takes no window",
+            f"it means one sample; within {previous.value} is {window_formula} (...)",
+        )
     if window := _meant_window(tokens, position):
         return message, f"a window is written with both of its ends: {window}"
-    relation = last if last.type == "RELATION" else before
-    if token.type == "NUMBER" and relation.value in _WITH_NUMBER and last.type in ("RELATION", "LPAR"):
+    relation = previous if previous.type == "RELATION" else earlier
+    if token.type == "NUMBER" and relation.value in _WITH_NUMBER and previous.type in ("RELATION", "LPAR"):
         return message, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
-    if before.type == "RSQB" and last.value in ("s", "ms"):
-        return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
-    if token.type in _RELATIONS and before.type in ("SLASH", "MINUS") and last.type == "NAME":
-        first = tokens[position - 3].value if position > 2 else ""
-        hint = f'a name with {before.value} is written in quotes: "{first}{before.value}{last.value}"'
+    if earlier.type == "RSQB" and previous.value in ("s", "ms"):
+        return f"{previous.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
+    if token.type in _RELATIONS and earlier.type in ("SLASH", "MINUS") and previous.type == "NAME":
+        name_start = tokens[position - 3].value if position > 2 else ""
+        hint = (
+            f'a name with {earlier.value} is written in quotes: "{name_start}{earlier.value}{previous.value}"'
+        )
         return f"{token.value!r} needs an object, region or group on its left", hint
-    if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.value.isidentifier():
-        return message, f'a name with - is written in quotes: "{last.value}-{after.value}"'
-    if (before.type, last.type) == ("NAME", "MINUS") and token.value[1:].isidentifier():
-        return message, f'a name with - is written in quotes: "{before.value}-{token.value}"'
-    if token.type in _RELATIONS and before.type == "LPAR" and last.type == "NAME" and position > 2:
+    if token.type == "MINUS" and earlier.type in _RELATIONS - {"COMPARE"} and following.value.isidentifier():
+        return message, f'a name with - is written in quotes: "{previous.value}-{following.value}"'
+    if (earlier.type, previous.type) == ("NAME", "MINUS") and token.value[1:].isidentifier():
+        return message, f'a name with - is written in quotes: "{earlier.value}-{token.value}"'
+    if token.type in _RELATIONS and earlier.type == "LPAR" and previous.type == "NAME" and position > 2:
         name = tokens[position - 3]
         if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):
             return f"{name.value!r} is not a function", hint
-    if tokens[0].type == "GROUP" and last.type == "EQUAL" and token.type in ("LSQB", "LPAR"):
+    if tokens[0].type == "GROUP" and previous.type == "EQUAL" and token.type in ("LSQB", "LPAR"):
         return message, f"members stand without brackets: group {tokens[1].value} = a, b"
     if shape := _meant_shape(tokens, position, accepted):
         return message, shape
     if (token.value == "=>" and "COMPARE" in accepted) or (
-        before.value == "=>" and token.type in ("RPAR", "$END")
+        earlier.value == "=>" and token.type in ("RPAR", "$END")
     ):
         return "'=>' means implies", "at least is written >="
-    if token.value == "=" and last.value in ("==", "!="):
-        return message, f"it is written {last.value}"
-    if token.type == "NOT" and last.type == "LSQB" and before.value in ("X", "WX"):
-        return f"{before.value}[!] is no operator", "a next sample that has to be there is written X (...)"
+    if token.value == "=" and previous.value in ("==", "!="):
+        return message, f"it is written {previous.value}"
+    if token.type == "NOT" and previous.type == "LSQB" and earlier.value in ("X", "WX"):
+        return f"{earlier.value}[!] is no operator", "a next sample that has to be there is written X (...)"
     if token.value == "=" and (
-        sign := {"<": "<=", ">": ">="}.get(after.value if "COMPARE" in accepted else last.value)
+        sign := {"<": "<=", ">": ">="}.get(following.value if "COMPARE" in accepted else previous.value)
     ):
         return message, f"it is written {sign}, without a blank"
-    if token.type == "TRUTH" and last.type == "COMPARE":
-        return message, f"a flag is a number: {before.value} {last.value} {int(token.value == 'true')}"
+    if token.type == "TRUTH" and previous.type == "COMPARE":
+        return message, f"a flag is a number: {earlier.value} {previous.value} {int(token.value == 'true')}"
     if token.value == "dist" and _is_quoted(token):
-        return message, f"a relation stands without quotes: {last.value} dist {after.value or 'b'}"
-    if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
+        return message, f"a relation stands without quotes: {previous.value} dist {following.value or 'b'}"
+    if token.type == "NUMBER" and (operator := _AT_TIMES.get(previous.value.lower())):
         return message, f"a window stands behind its operator: {operator.format(token.value)} (...)"
-    if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
+    if previous.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
-        return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
+        return f"{token.value!r} is {kind}, so no name for a {previous.value}", "give it another name"
     if tokens[0].type == "DEF" and position == 2 and token.type in ("EQUAL", "COLON"):
-        return f"{last.value!r} has no parameters", f"such a formula is named by spec {last.value} = ..."
+        return (
+            f"{previous.value!r} has no parameters",
+            f"such a formula is named by spec {previous.value} = ...",
+        )
     if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
         return _meant_definition(tokens, position)
-    if last.type == "NUMBER" and token.type == "NAME":
-        per = tokens[position + 2].value if after.type == "SLASH" and position + 2 < len(tokens) else ""
-        hint = unit_hint(last.value, token.value, per)
+    if previous.type == "NUMBER" and token.type == "NAME":
+        per = tokens[position + 2].value if following.type == "SLASH" and position + 2 < len(tokens) else ""
+        hint = unit_hint(previous.value, token.value, per)
         return f"{token.value!r} is no unit here", hint or f"only s and ms are units: leave out {token.value}"
-    if token.type == "COMMA" and last.type == after.type == "NUMBER" and token.end_pos == after.start_pos:
-        return "a comma within a number", f"decimals have a point: {last.value}.{after.value}"
-    if token.type == "NOT" and "RELATION" in accepted and after.type in _RELATIONS:
+    if (
+        token.type == "COMMA"
+        and previous.type == following.type == "NUMBER"
+        and token.end_pos == following.start_pos
+    ):
+        return "a comma within a number", f"decimals have a point: {previous.value}.{following.value}"
+    if token.type == "NOT" and "RELATION" in accepted and following.type in _RELATIONS:
         return (
             "'not' cannot stand within a relation",
-            f"write it in front: not {last.value} {after.value} ...",
+            f"write it in front: not {previous.value} {following.value} ...",
         )
     if token.type in ("NAME", "IN", "ALL"):
-        return _meant_word(token, last, after, accepted)
-    is_delayed = last.type == "RSQB" and "DIST" in accepted and "AND" not in accepted
+        return _meant_word(token, previous, following, accepted)
+    is_delayed = previous.type == "RSQB" and "DIST" in accepted and "AND" not in accepted
     if is_delayed and token.type in (*_ARITHMETIC, "COMPARE", "RPAR", "$END"):
         hint = "rate(x) is its change since its last report, Y (x >= 1) looks at the sample before"
         return "a signal has no [-n]", hint
-    if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
+    if token.type == "COMPARE" and previous.type in ("RPAR", "AND", "OR"):
         hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
         return message, f"{hint}; a range is two comparisons, joined by and"
     return None
@@ -401,19 +417,19 @@ def foreign_token_advice(
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:
     """Return the probable window of the nearest operator before a position; "" if it has none."""
-    places = range(position - 1, max(-1, position - 6), -1)
-    start = next((n for n in places if tokens[n].type in ("PREFIX", "INFIX")), None)
-    if start is None:
+    positions = range(position - 1, max(-1, position - 6), -1)
+    operator_index = next((index for index in positions if tokens[index].type in ("PREFIX", "INFIX")), None)
+    if operator_index is None:
         return ""
-    inner = tokens[start + 1 : start + 6]
-    kinds = [token.type for token in inner]
-    numbers = [token.value.strip(".") for token in inner if token.type == "NUMBER"]
-    operator = tokens[start].value
+    window_tokens = tokens[operator_index + 1 : operator_index + 6]
+    types = [token.type for token in window_tokens]
+    numbers = [token.value.strip(".") for token in window_tokens if token.type == "NUMBER"]
+    operator = tokens[operator_index].value
     if operator in ("X", "WX", "Y"):
         return ""
-    match kinds:
+    match types:
         case ["COMPARE", "NUMBER", *_] | ["LSQB", "COMPARE", "NUMBER", *_]:
-            sign = next(token.value for token in inner if token.type == "COMPARE")
+            sign = next(token.value for token in window_tokens if token.type == "COMPARE")
             return f"{operator}[{numbers[0]}, inf]" if sign[0] == ">" else f"{operator}[0, {numbers[0]}]"
         case ["LSQB", "NUMBER", "RSQB", *_]:
             return f"{operator}[0, {numbers[0]}]"
@@ -425,7 +441,7 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
         ):
             return f"{operator}[{numbers[0]}, {numbers[1]}]"
         case ["LSQB", "NUMBER", "COMMA", "NAME", "RPAR"]:
-            return f"{operator}[{numbers[0]}, {inner[3].value}]"
+            return f"{operator}[{numbers[0]}, {window_tokens[3].value}]"
     return ""
 
 
@@ -439,27 +455,33 @@ def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str]
     return f"{token.value!r} stands where = is missing", f"write {tokens[0].value} {name} = ..."
 
 
-def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
+def _meant_word(
+    token: Token, previous: Token, following: Token, accepted: Collection[str]
+) -> tuple[str, str] | None:
     word = str(token.value).lower()
     message = f"{token.value!r} cannot stand here"
-    if word in _ORDERING and "AND" in accepted and (after.type != "NUMBER" or word == "by"):
+    if word in _ORDERING and "AND" in accepted and (following.type != "NUMBER" or word == "by"):
         return message, _ORDERING[word]
-    if (str(last.value).lower(), word) == ("exactly", "once"):
+    if (str(previous.value).lower(), word) == ("exactly", "once"):
         return message, "p holds in one sample only is written (not p) U (p and WX (G not p))"
     if "RELATION" in accepted:
         if word in ("is", "are"):
-            relation = after.value if after.type in _RELATIONS else "leftof"
-            text = f'; a text is compared as {last.value} == "AUTO"' if after.type not in _RELATIONS else ""
-            return message, f"leave it out: {last.value} {relation} ...{text}"
-        if quantifier := _QUANTIFYING.get(str(last.value).lower()):
+            relation = following.value if following.type in _RELATIONS else "leftof"
+            example = (
+                f'; a text is compared as {previous.value} == "AUTO"'
+                if following.type not in _RELATIONS
+                else ""
+            )
+            return message, f"leave it out: {previous.value} {relation} ...{example}"
+        if quantifier := _QUANTIFYING.get(str(previous.value).lower()):
             return message, f"write {quantifier} {token.value if token.type == 'NAME' else 'x'} in GROUP: ..."
-        if word in _MEANT_RELATIONS and after.type == "NAME":
-            hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
+        if word in _MEANT_RELATIONS and following.type == "NAME":
+            hint = f"write {previous.value} {_MEANT_RELATIONS[word]} {following.value or 'b'}"
             return f"unknown relation {token.value!r}", hint
     if "AND" in accepted and word in _MEANT_BETWEEN:
         return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
     if "AND" in accepted and word in _AT_TIMES:
-        window = _AT_TIMES[word].format(after.value or "5s")
+        window = _AT_TIMES[word].format(following.value or "5s")
         return message, f"a window stands behind its operator: {window} (...)"
     return None
 
@@ -487,7 +509,7 @@ def meant_statement(tokens: Sequence[Token]) -> str:
 
 def _source_text(tokens: Sequence[Token]) -> str:
     """Return the text of tokens; blanks between them are reduced to one."""
-    gaps = ["" if first.end_pos == second.start_pos else " " for first, second in pairwise(tokens)]
+    gaps = ["" if left.end_pos == right.start_pos else " " for left, right in pairwise(tokens)]
     return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
 
 
@@ -496,23 +518,28 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
     token = tokens[position] if position < len(tokens) else None
     if token is not None and "CIRCLE" in accepted and token.value.lower() in _SHAPES:
         return f"it is written {_SHAPES[token.value.lower()]}"
-    called = next((n for n in (position, position - 1) if is_called(tokens, n)), 0)
-    shape = _SHAPES.get(tokens[called].value.lower())
-    if called and shape and tokens[0].type != "REGION" and tokens[called - 1].type not in _STATEMENTS:
+    called_index = next((index for index in (position, position - 1) if is_called(tokens, index)), 0)
+    shape = _SHAPES.get(tokens[called_index].value.lower())
+    if (
+        called_index
+        and shape
+        and tokens[0].type != "REGION"
+        and tokens[called_index - 1].type not in _STATEMENTS
+    ):
         return f"a shape gets a name first: region goal = {shape}"
-    start = next((n for n, token in enumerate(tokens[:position]) if token.type in _SHAPE), None)
-    if start is None or "HEIGHT" in {*accepted, *(token.type for token in tokens[:position])}:
+    shape_index = next((index for index, token in enumerate(tokens[:position]) if token.type in _SHAPE), None)
+    if shape_index is None or "HEIGHT" in {*accepted, *(token.type for token in tokens[:position])}:
         return ""
-    numbers = _numbers(tokens[start:])
-    pairs = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
-    match tokens[start].type:
+    numbers = _numbers(tokens[shape_index:])
+    points = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
+    match tokens[shape_index].type:
         case "BOX" if len(numbers) == 4:
             return f"a box has four numbers: box({', '.join(numbers)})"
         case "CIRCLE" if len(numbers) == 3:
-            return f"the centre stands in brackets: circle({pairs[0]}, {numbers[2]})"
+            return f"the centre stands in brackets: circle({points[0]}, {numbers[2]})"
         case "POLYGON" if len(numbers) > 3:
-            return f"each corner stands in brackets: polygon({', '.join(pairs)})"
-    return f"it is written {_SHAPES[tokens[start].value]}; decimals have a point"
+            return f"each corner stands in brackets: polygon({', '.join(points)})"
+    return f"it is written {_SHAPES[tokens[shape_index].value]}; decimals have a point"
 
 
 def is_called(tokens: Sequence[Token], position: int) -> bool:
@@ -525,10 +552,12 @@ _SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
 
 def _numbers(tokens: Sequence[Token]) -> list[str]:
     """Return the numbers of a line with their signs."""
-    line = [token for token in tokens if token.line == tokens[0].line]
-    signs = ["-" if before.type == "MINUS" else "" for before in line]
+    line_tokens = [token for token in tokens if token.line == tokens[0].line]
+    signs = ["-" if previous.type == "MINUS" else "" for previous in line_tokens]
     return [
-        sign + token.value for sign, token in zip(signs, line[1:], strict=False) if token.type == "NUMBER"
+        sign + token.value
+        for sign, token in zip(signs, line_tokens[1:], strict=False)
+        if token.type == "NUMBER"
     ]
 
 
@@ -678,9 +707,9 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
     """
     tokens: list[Token] = []
     line = 1
-    for piece in _TOKEN.finditer(text):
-        kind, value = piece.lastgroup, piece.group()
-        span = Span(piece.start(), piece.end())
+    for token_match in _TOKEN.finditer(text):
+        kind, value = token_match.lastgroup, token_match.group()
+        span = Span(token_match.start(), token_match.end())
         if kind == "line":
             line += 1
             continue
@@ -702,22 +731,26 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             faults.add(span, f"'{sign}' is not part of the language", meant_sign(sign))
             token_type = "ERROR"
         elif kind == "unknown":
-            _report_unknown(value, span, faults, tokens, text[piece.end() : piece.end() + 1])
+            _report_unknown(value, span, faults, tokens, text[token_match.end() : token_match.end() + 1])
             token_type = "ERROR"
         else:
             token_type = "NUMBER"
-            unit = piece.group("unit")
+            unit = token_match.group("unit")
             if unit is not None and unit not in ("s", "ms"):
-                per = _PER.match(text, piece.end())
+                per_match = _PER.match(text, token_match.end())
                 # in a window, m most likely stands for minutes instead of metres
-                is_window = unit == "m" and {"PREFIX", "INFIX"} & {token.type for token in tokens[-4:-1]}
-                meant_unit = "min" if is_window and "LSQB" in {token.type for token in tokens[-3:]} else unit
-                hint = unit_hint(value.removesuffix(unit), meant_unit, per.group(1) if per else "")
+                is_in_window = unit == "m" and {"PREFIX", "INFIX"} & {token.type for token in tokens[-4:-1]}
+                meant_unit = (
+                    "min" if is_in_window and "LSQB" in {token.type for token in tokens[-3:]} else unit
+                )
+                hint = unit_hint(
+                    value.removesuffix(unit), meant_unit, per_match.group(1) if per_match else ""
+                )
                 hint = hint or f"units of time are s and ms; a name is written in quotes: {quote_name(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
                 # in 3m/s the next tokens are the rest of the unit; ERROR prevents further faults about them
-                token_type = "ERROR" if per else token_type
+                token_type = "ERROR" if per_match else token_type
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
     return read_spellings(_with_scales(_join_published_spellings(tokens)), faults)
 
@@ -725,22 +758,22 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
 def _with_scales(tokens: list[Token]) -> list[Token]:
     """Mark `scale NAME =` at the beginning of a line as a statement; `scale` is not a reserved word."""
     for index, token in enumerate(tokens[:-2]):
-        following = [token.type for token in tokens[index + 1 : index + 3]]
-        if token.value == "scale" and token.type == "NAME" and following == ["NAME", "EQUAL"]:
-            before = tokens[index - 1] if index else None
-            if before is None or before.line != token.line:
+        next_types = [token.type for token in tokens[index + 1 : index + 3]]
+        if token.value == "scale" and token.type == "NAME" and next_types == ["NAME", "EQUAL"]:
+            previous = tokens[index - 1] if index else None
+            if previous is None or previous.line != token.line:
                 token.type = "SCALE"
     return tokens
 
 
-def _is_title_expected(before: list[Token]) -> bool:
+def _is_title_expected(previous: list[Token]) -> bool:
     """Return whether a quoted text after these tokens is the title of a spec."""
-    if not before:
+    if not previous:
         return False
-    if before[-1].type == "NAME":
-        return len(before) > 1 and before[-2].type == "SPEC"
+    if previous[-1].type == "NAME":
+        return len(previous) > 1 and previous[-2].type == "SPEC"
     # no quoted name can follow a closing bracket
-    return before[-1].type == "RPAR"
+    return previous[-1].type == "RPAR"
 
 
 def _unquote(literal: str, span: Span, faults: Faults) -> str:
@@ -750,30 +783,34 @@ def _unquote(literal: str, span: Span, faults: Faults) -> str:
         return "?"
     for escape in _ESCAPED.finditer(name):
         if escape.group(1) not in '"\\':
-            at = span.start + 1 + escape.start()
+            escape_start = span.start + 1 + escape.start()
             hint = 'in quotes, \\" stands for a quote and \\\\ for a backslash'
-            faults.add(Span(at, at + 2), f"unknown escape {escape.group()!r} in a name", hint)
+            faults.add(
+                Span(escape_start, escape_start + 2), f"unknown escape {escape.group()!r} in a name", hint
+            )
     return _ESCAPED.sub(r"\1", name)
 
 
-def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Token], after: str) -> None:
-    if text == "." and (not after or after.isspace()):
+def _report_unknown(
+    text: str, span: Span, faults: Faults, previous: Sequence[Token], next_character: str
+) -> None:
+    if text == "." and (not next_character or next_character.isspace()):
         faults.add(span, "a full stop behind a statement", meant_sign(";"))
         return
-    if text == "}" and any(token.value == "{" for token in before[-8:]):
+    if text == "}" and any(token.value == "{" for token in previous[-8:]):
         # the opening { is already reported
         return
-    if text == "." and before and before[-1].type == "NAME" and before[-1].end_pos == span.start:
-        owner = before[-1].value
-        message = f"an object has no fields, so nothing is behind {owner!r}"
+    if text == "." and previous and previous[-1].type == "NAME" and previous[-1].end_pos == span.start:
+        object_name = previous[-1].value
+        message = f"an object has no fields, so nothing is behind {object_name!r}"
         hint = (
-            f"places are compared by relations, such as {owner} leftof b, speeds by speed({owner}) <= 1; "
-            "a name with a dot is written in quotes"
+            f"places are compared by relations, such as {object_name} leftof b, "
+            f"speeds by speed({object_name}) <= 1; a name with a dot is written in quotes"
         )
         faults.add(span, message, hint)
         return
-    if text[0] == "{" and [token.type for token in before[-3:]] == ["GROUP", "NAME", "EQUAL"]:
-        hint = f"members stand without brackets: group {before[-2].value} = a, b"
+    if text[0] == "{" and [token.type for token in previous[-3:]] == ["GROUP", "NAME", "EQUAL"]:
+        hint = f"members stand without brackets: group {previous[-2].value} = a, b"
         faults.add(span, "'{' cannot stand here", hint)
         return
     if text.startswith('"'):
@@ -788,22 +825,22 @@ def _join_published_spellings(tokens: list[Token]) -> list[Token]:
 
     These are the spellings of `not` and `->` in the published implementation; elsewhere `t` is a name.
     """
-    joined: list[Token] = []
+    new_tokens: list[Token] = []
     for index, token in enumerate(tokens):
         if (
             token.value == "t"
-            and joined
-            and joined[-1].value in ("!", "->")
-            and joined[-1].end_pos == token.start_pos
+            and new_tokens
+            and new_tokens[-1].value in ("!", "->")
+            and new_tokens[-1].end_pos == token.start_pos
             and (token.end_pos or 0) - (token.start_pos or 0) == 1
             and index + 1 < len(tokens)
             and tokens[index + 1].type in STARTS_FORMULA
         ):
-            sign = joined.pop()
+            sign = new_tokens.pop()
             value = sign.value + "t"
-            joined.append(
+            new_tokens.append(
                 Token(sign.type, value, sign.start_pos, sign.line, None, sign.line, None, token.end_pos)
             )
         else:
-            joined.append(token)
-    return joined
+            new_tokens.append(token)
+    return new_tokens

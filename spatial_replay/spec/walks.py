@@ -84,28 +84,28 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
     """Yield an expression and all its subexpressions."""
     stack = [expression]
     while stack:
-        current = stack.pop()
-        yield current
-        match current:
+        subexpression = stack.pop()
+        yield subexpression
+        match subexpression:
             case Sum():
-                stack += (current.second, current.first)
+                stack += (subexpression.second, subexpression.first)
             case Negative() | Product() | Scaled():
-                stack.append(current.operand)
+                stack.append(subexpression.operand)
             case Equality():
-                stack.append(current.signal)
+                stack.append(subexpression.signal)
             case HasRate():
-                stack.append(current.rate)
+                stack.append(subexpression.rate)
             case Minimum() | Maximum():
-                stack += reversed(current.operands)
+                stack += reversed(subexpression.operands)
 
 
 def terms_of(expression: Expression) -> Iterator[Term]:
     """Yield the measured terms of an expression; a rate yields its current and its earlier terms."""
-    for part in iter_expressions(expression):
-        if isinstance(part, Measurement):
-            yield from part.terms
-        elif isinstance(part, Rate):
-            yield from terms_of(change_of(part))
+    for subexpression in iter_expressions(expression):
+        if isinstance(subexpression, Measurement):
+            yield from subexpression.terms
+        elif isinstance(subexpression, Rate):
+            yield from terms_of(change_of(subexpression))
 
 
 def speed_of(*terms: Term) -> Rate:
@@ -148,11 +148,11 @@ def change_of(rate: Rate) -> Sum | SignedDistance:
     """Return the change of a rate's quantity between two reports; divided by `step_of`, it is the rate."""
     match rate.terms:
         case (first, second):
-            before = (_moved_back(term, _moving(rate)) for term in rate.terms)
-            return SignedDistance(*before) - SignedDistance(first, second)
+            earlier_terms = (_moved_back(term, _moving(rate)) for term in rate.terms)
+            return SignedDistance(*earlier_terms) - SignedDistance(first, second)
         case (term,):
-            alone: Any = base_of(term)
-            return SignedDistance(Centre(alone), _moved_back(Centre(alone), _moving(rate)))
+            base: Any = base_of(term)
+            return SignedDistance(Centre(base), _moved_back(Centre(base), _moving(rate)))
     signal = rate.signal or Signal("")
     return signal - PreviousSignal(signal.name, signal)
 
@@ -170,17 +170,17 @@ def _moving(rate: Rate) -> tuple[TrackedName | Variable | Group, ...]:
 def _moved_back(term: Term, rate: tuple[TrackedName | Variable | Group, ...]) -> Term:
     if isinstance(term, RegionName):
         return term
-    inner: Any = term
+    inner_term: Any = term
     if isinstance(term, Enlarged | Centre):
-        inner = _moved_back(term.term, rate)
-        return replace(term, term=inner)
-    return Earlier(inner, rate=rate)
+        inner_term = _moved_back(term.term, rate)
+        return replace(term, term=inner_term)
+    return Earlier(inner_term, rate=rate)
 
 
 def logged_signals(expression: Expression) -> Iterator[str]:
     """Yield the names of the logged signals in an expression."""
-    for part in iter_expressions(expression):
-        signal = part.signal if isinstance(part, Rate) else part
+    for subexpression in iter_expressions(expression):
+        signal = subexpression.signal if isinstance(subexpression, Rate) else subexpression
         signal = signal.signal if isinstance(signal, PreviousSignal) else signal
         if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal | HasRate | Present):
             yield signal.name
@@ -195,24 +195,24 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
     """Yield a formula and its subformulas in text order, bodies of quantifiers included."""
     stack = [formula]
     while stack:
-        current = stack.pop()
-        yield current
-        match current:
+        subformula = stack.pop()
+        yield subformula
+        match subformula:
             case Boolean() | Temporal():
-                stack += reversed(current.operands)
+                stack += reversed(subformula.operands)
             case Quantified():
-                stack.append(current.body)
+                stack.append(subformula.body)
 
 
 def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ...]]]:
     """Yield the formulas of `iter_formulas`, each with its enclosing quantifiers, outermost first."""
     stack: list[tuple[Formula, tuple[Quantified, ...]]] = [(formula, ())]
     while stack:
-        node, around = stack.pop()
-        yield node, around
+        node, quantifiers = stack.pop()
+        yield node, quantifiers
         if isinstance(node, Quantified):
-            stack.append((node.body, (*around, node)))
-        stack += [(operand, around) for operand in reversed(operands_of(node))]
+            stack.append((node.body, (*quantifiers, node)))
+        stack += [(operand, quantifiers) for operand in reversed(operands_of(node))]
 
 
 def iter_atoms(formula: Formula) -> Iterator[Atom]:
@@ -240,17 +240,17 @@ def nodes_of(formula: Formula) -> list[Formula]:
 def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
     """Return all nodes of a tree in the order of their ids, each with the ids of its operands."""
     nodes: list[tuple[Formula, list[int]]] = []
-    for identifier, parent, node in iter_nodes(formula):
+    for node_id, parent, node in iter_nodes(formula):
         nodes.append((node, []))
         if parent is not None:
-            nodes[parent][1].append(identifier)
+            nodes[parent][1].append(node_id)
     return nodes
 
 
 def named_members(group: Group) -> tuple[str, ...]:
     """Return the members of a named group without excluded ones; an open group has none."""
-    left_out = {member.name for member in group.excluded}
-    return tuple(name for name in group.members or () if name not in left_out)
+    excluded_names = {member.name for member in group.excluded}
+    return tuple(name for name in group.members or () if name not in excluded_names)
 
 
 def is_spatial(formula: Formula) -> bool:
@@ -268,18 +268,18 @@ def looks_ahead(formula: Formula) -> bool:
 def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:
     """Yield the terms of atoms and the groups of open quantifiers, in text order."""
     for formula in formulas:
-        for part in iter_formulas(formula):
-            if isinstance(part, Atom):
-                yield from terms_of(part.expression)
-            elif isinstance(part, Quantified):
-                yield part.group
+        for subformula in iter_formulas(formula):
+            if isinstance(subformula, Atom):
+                yield from terms_of(subformula.expression)
+            elif isinstance(subformula, Quantified):
+                yield subformula.group
 
 
 def other_names(formula: Formula) -> frozenset[str]:
     """Return the names of objects, regions, groups and specs in a formula; variables are left out."""
     names = {part.name for part in iter_formulas(formula) if part.name is not None}
-    objects = (part.term for part in iter_parts(formula) if isinstance(part, Present))
-    for base in map(base_of, chain(iter_terms([formula]), objects)):
+    present_terms = (part.term for part in iter_parts(formula) if isinstance(part, Present))
+    for base in map(base_of, chain(iter_terms([formula]), present_terms)):
         if isinstance(base, (TrackedName, RegionName, Group)):
             names.add(base.name)
         if isinstance(base, Group):
@@ -301,11 +301,11 @@ def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
     signs: set[int] = set()
     stack: list[tuple[Formula, int]] = [(node.expansion or node, 1)]
     while stack:
-        current, sign = stack.pop()
-        if current is stand_ins[operand]:
+        subformula, sign = stack.pop()
+        if subformula is stand_ins[operand]:
             signs.add(sign)
-        below = -sign if operator_of(current) == "not" else sign
-        stack.extend((inner, below) for inner in operands_of(current))
+        operand_sign = -sign if operator_of(subformula) == "not" else sign
+        stack.extend((inner, operand_sign) for inner in operands_of(subformula))
     return tuple(sorted(signs, reverse=True))
 
 
@@ -370,8 +370,8 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
             return replace(formula, text=text, terms=terms, expression=expression)
         case Quantified():
             group: Any = substitute_term(formula.group, names)
-            inner = {old: new for old, new in names.items() if old not in formula.variables}
-            return replace(formula, group=group, body=substitute(formula.body, inner, relations))
+            free_names = {old: new for old, new in names.items() if old not in formula.variables}
+            return replace(formula, group=group, body=substitute(formula.body, free_names, relations))
         case _:
             operands = tuple([substitute(operand, names, relations) for operand in formula.operands])
             return replace(formula, operands=operands)
@@ -397,23 +397,23 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
         return formula
     if node == 0:
         return replace(formula, operands=operands)
-    replaced: list[Formula] = []
-    place = 1
+    new_operands: list[Formula] = []
+    operand_id = 1
     for operand in formula.operands:
-        count = sum(1 for _ in iter_nodes(operand))
-        is_within = place <= node < place + count
-        replaced.append(with_operands(operand, node - place, operands) if is_within else operand)
-        place += count
-    return replace(formula, operands=tuple(replaced))
+        node_count = sum(1 for _ in iter_nodes(operand))
+        is_within = operand_id <= node < operand_id + node_count
+        new_operands.append(with_operands(operand, node - operand_id, operands) if is_within else operand)
+        operand_id += node_count
+    return replace(formula, operands=tuple(new_operands))
 
 
 def without_variables(formula: Quantified) -> Formula:
     """Return the body of a quantifier with numbered variables, so that bodies with other names are equal."""
-    inner = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
+    quantifier_count = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
     # a name of a text begins with a blank only in quotes, so in practice these clash with no other name
     return substitute(
         formula.body,
-        {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
+        {name: Variable(f" {quantifier_count}.{index}") for index, name in enumerate(formula.variables)},
     )
 
 
@@ -425,12 +425,12 @@ def substitute_term(term: Term, names: Names) -> Term:
         case Group():
             return replace(term, excluded=tuple(_object(member, names) for member in term.excluded))
         case Earlier(rate=(_, *_)):
-            moved: Any = substitute_term(term.term, names)
-            rate: Any = tuple(substitute_term(moving, names) for moving in term.rate)
-            return replace(term, term=moved, rate=rate)
+            moved_term: Any = substitute_term(term.term, names)
+            rate: Any = tuple(substitute_term(rate_term, names) for rate_term in term.rate)
+            return replace(term, term=moved_term, rate=rate)
         case Earlier() | Enlarged() | Centre():
-            inner: Any = substitute_term(term.term, names)
-            return replace(term, term=inner)
+            inner_term: Any = substitute_term(term.term, names)
+            return replace(term, term=inner_term)
         case _:
             return term
 
@@ -550,9 +550,9 @@ def units_text(units: Sequence[Unit]) -> str:
     """Return a sentence with the units that a robustness combines; "" for fewer than two."""
     if len(units) < 2:
         return ""
-    *others, last = map(str, units)
-    what = "different units" if is_mixed(units) else "units made comparable"
-    return f"Its robustness is the least of numbers in {what}: {', '.join(others)} and {last}."
+    *first_units, last_unit = map(str, units)
+    kind = "different units" if is_mixed(units) else "units made comparable"
+    return f"Its robustness is the least of numbers in {kind}: {', '.join(first_units)} and {last_unit}."
 
 
 def divide_by_scale(expression: Expression, scales: Sequence[Scale]) -> Expression:
@@ -567,13 +567,16 @@ def divide_by_scale(expression: Expression, scales: Sequence[Scale]) -> Expressi
 
 def _units(expression: Expression) -> list[Unit]:
     divisor = expression.divisor if isinstance(expression, Scaled) else None
-    whole = expression.operand if isinstance(expression, Scaled) else expression
-    parts = list(iter_expressions(whole))
-    if any(isinstance(part, Equality) for part in parts):
+    unscaled = expression.operand if isinstance(expression, Scaled) else expression
+    subexpressions = list(iter_expressions(unscaled))
+    if any(isinstance(subexpression, Equality) for subexpression in subexpressions):
         return []
-    if leaves := _unit_leaves(whole):
+    if leaves := _unit_leaves(unscaled):
         return list(dict.fromkeys(_unit_of(leaf, divisor) for leaf in leaves))
-    is_number = all(isinstance(part, Number | Sum | Negative | Minimum | Maximum) for part in parts)
+    is_number = all(
+        isinstance(subexpression, Number | Sum | Negative | Minimum | Maximum)
+        for subexpression in subexpressions
+    )
     return [] if is_number else [Unit("signal", MULTIPLES, divisor)]
 
 
