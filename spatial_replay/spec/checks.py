@@ -141,15 +141,16 @@ def _grouping_warnings(level: _Level, operator: Token, source: SourceText) -> It
 
 
 def _differs(first_operator: Token, second_operator: Token) -> bool:
+    """Return whether the published grammar groups two consecutive operators differently."""
     if "INFIX" in (first_operator.type, second_operator.type):
         return first_operator.type != second_operator.type
     return _TIGHTNESS[first_operator.type] > _TIGHTNESS[second_operator.type]
 
 
 def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each operator in a foreign spelling that its tool defines differently.
+    """Yield a warning for each operator in the spelling of a tool that defines the operator differently.
 
-    A bounded until has the same spelling in R2U2. It is warned about only if the text contains `&&` or `||`.
+    A bounded until has the same spelling in R2U2, so its warning requires `&&` or `||` in the text.
     """
     connectives = (token for token in tokens if token.type in ("AND", "OR"))
     has_r2u2_sign = any(_source_text(token, source) in _R2U2_SIGNS for token in connectives)
@@ -267,7 +268,7 @@ def scale_warnings(
 
 
 def object_names(specification: Specification) -> tuple[str, ...]:
-    """Return the tracked objects in atoms of the specs, members of named groups included, in text order."""
+    """Return the tracked objects of the specs' atoms in text order, including members of named groups."""
     names: dict[str, None] = {}
     for atom in _atoms(specification):
         for term in terms_of(atom.expression):
@@ -330,8 +331,8 @@ def check_names(
 
     Returns:
         Errors and warnings in text order. Each object, signal and template class that the log lacks is an
-        error with the nearest name. The class of an open group is an error only if a class of the log has a
-        similar name. Each object of the log that is hidden by a definition of the same name is a warning.
+        error with the nearest name. A missing class of an open group is an error only if a class of the log
+        has a similar name. A definition that hides an object of the log is a warning.
     """
     known_objects, known_signals = tuple(known), tuple(signals)
     known_classes = tuple(classes)
@@ -448,7 +449,7 @@ def _listing(kind: str, names: tuple[str, ...]) -> str:
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
-    """Return two maps from names to places: the first occurrence, and the definition."""
+    """Return the place of the first occurrence by name, and the place of the definition by name."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))
     first_places: dict[str, Span] = {}

@@ -306,7 +306,7 @@ class ComparisonBuilder:
         return term
 
     def _signal(self, name: Name, scope: Scope) -> Signal:
-        """Return a signal of the log or of a plug-in; report a fault for a name with another meaning."""
+        """Return a signal of the log or of a plug-in; report a fault if the name has another meaning."""
         plugin = self.resolver.names.signals.get(name.text)
         definition = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
@@ -349,7 +349,7 @@ class ComparisonBuilder:
             return
         constant_names = [name for name in definitions if isinstance(definitions[name], ConstStatement)]
         if isinstance(quantity, Name):
-            # two signals of one comparison often have similar names, so only another case is a misspelling
+            # compared signals often have similar names, so only a difference in case is a misspelling
             constant_names = [name for name in constant_names if name.casefold() == limit.text.casefold()]
         if advice := self.resolver.faults.nearest(limit.text, constant_names):
             hint = f"{advice} A signal of that name is written in quotes: {quote_name(limit.text)}"
@@ -401,7 +401,7 @@ class ComparisonBuilder:
 
 
 def _written_terms(expression: Expression) -> tuple[Term, ...]:
-    """Return the terms of a distance or a speed; none of other expressions."""
+    """Return the terms of a distance or a speed; () for other expressions."""
     match expression:
         case Rate():
             return expression.terms

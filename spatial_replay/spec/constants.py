@@ -1,4 +1,4 @@
-"""Values of constants: arithmetic, ranges, and values from outside that replace those of the text."""
+"""Values of constants: arithmetic, ranges, and new values from callers or the command line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def value_of(
     """Return the value of a quantity; report a fault and return None if it has no value.
 
     Args:
-        named: function that returns the value of a name; without a value it reports a fault and returns None.
+        named: function from a name to its value; for a name without value, it reports a fault and returns
+            None.
         report: function that receives a fault: place, message and hint.
     """
     if isinstance(written, NumberSyntax):
@@ -102,7 +103,7 @@ def _round(result: Fraction, is_duration: bool) -> Value:
 
 
 def constant_of(written: Quantity, value: Value, ends: tuple[Value, Value] | None) -> Constant:
-    """Return the entry of `Specification.constants` for a constant; `ends` are those of its range."""
+    """Return the entry of `Specification.constants` for a constant; `ends` are the ends of its range."""
     is_computed = any(True for _ in names_in(written))
     span = None if ends is None else (_plain(ends[0]), _plain(ends[1]))
     return Constant(_plain(value), value.ns if isinstance(value, Duration) else None, span, is_computed)

@@ -16,13 +16,13 @@ MAX_FAULTS = 100
 """Maximum number of faults in one report; further faults are only counted."""
 
 _MAX_SUGGESTION_EFFORT = 10_000
-"""Maximum number of name comparisons for the hints of one text, which might otherwise need millions."""
+"""Maximum number of name comparisons for the hints of one text; otherwise millions might be needed."""
 # not str.splitlines, which also splits at form feeds and Unicode line separators
 _LINE_END = re.compile(r"\r\n|\r|\n")
 
 
 class Span(NamedTuple):
-    """Place in a source text: offset of its first character, and of the character after its last."""
+    """Place in a source text: half-open range of character offsets, from `start` to before `end`."""
 
     start: int
     end: int

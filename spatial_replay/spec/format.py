@@ -45,7 +45,7 @@ from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import quote_name, written_name
 
 _LARGEST_PLAIN = 1e16
-"""Whole numbers from here on are written with an exponent, as by `repr`."""
+"""Smallest whole number that is written with an exponent, as by `repr`."""
 
 
 def format_number(value: float) -> str:
@@ -288,7 +288,7 @@ def _format_outline(outline: Outline) -> str:
 
 
 class Branch(NamedTuple):
-    """Node of a tree for one line of text.
+    """Node of a formula's tree, printed as one line.
 
     Attributes:
         id: number of the node in text order; the root is 0.

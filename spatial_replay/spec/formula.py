@@ -102,8 +102,8 @@ class Earlier:
     """Delayed term; exactly one of `samples`, `duration_ns` and `rate` is given.
 
     `a[-3]` is the term 3 samples earlier. `a[-2.5s]` is the term in the last sample that is at least 2.5 s
-    earlier. With `rate`, the term is moved back along its velocity between its last two reports. The time of
-    this step is the shortest report interval of the terms in `rate`.
+    earlier. With `rate`, the term is moved back along its velocity between its last two reports, by the
+    shortest report interval of the terms in `rate`.
     """
 
     term: TrackedName | Variable | RegionName | Group
@@ -128,7 +128,7 @@ class Centre:
 
 
 DerivedTerm: TypeAlias = Earlier | Enlarged | Centre
-"""Term with an inner term, `term`; `replace(term, term=...)` applies the same change to another term."""
+"""Term with an inner term, `term`; `replace(term, term=...)` derives another term in the same way."""
 Term: TypeAlias = TrackedName | Variable | RegionName | Group | DerivedTerm
 
 # ---------------------------------------------------------------------------------------- expressions
@@ -188,12 +188,12 @@ class Measurement(_Arithmetic):
 
     @abstractmethod
     def with_terms(self, *terms: Term) -> Self:
-        """Return the same measurement of other terms; their number must be the same."""
+        """Return the same measurement of as many other terms."""
 
     @property
     @abstractmethod
     def extrema(self) -> tuple[Side, ...]:
-        """Extreme over the members of each term, if it is a group; that of the first term is taken last."""
+        """Extreme over the members of each term that is a group; the first term's extreme comes last."""
 
     @property
     def radius_effects(self) -> tuple[int, ...]:
@@ -318,7 +318,7 @@ class ComputedSignal(Signal):
 
 @dataclass(frozen=True, slots=True)
 class PreviousSignal(Signal):
-    """Signal at the report before the one in the sample."""
+    """Signal at the report before the report of the sample."""
 
     signal: Signal
 
@@ -506,9 +506,9 @@ class Atom:
 BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec", "given", "with"]
 """Boolean operators of the language, and three internal operators.
 
-`spec` has one operand and its value: a spec that only repeats another spec under its own name. `given` and
+`spec` has the value of its one operand: the spec only repeats another spec under a new name. `given` and
 `with` occur only in expansions: they make an operator skip samples without a rate (see `judged_operands`).
-Their first operand is the condition that the rate has a value; their last operand is the written one.
+Their first operand is the condition that the rate has a value; their last operand is that of the text.
 """
 
 
@@ -590,9 +590,9 @@ Formula: TypeAlias = Truth | Atom | Boolean | Temporal | Quantified
 def expand(formula: Formula) -> Formula:
     """Return an equal formula whose outermost operator is implemented by the engines.
 
-    Engines implement `not`, `and`, `or`, X, F, G, U, Y, O, H and S. Every other operator gets its `expansion`
-    in these when its node is made. Trees, texts and ids are those of the written formula. Operands are not
-    expanded.
+    Engines implement `not`, `and`, `or`, X, F, G, U, Y, O, H and S. The node of every other
+    operator has an `expansion` into these operators. Trees, texts and node ids show the formula as written.
+    Operands are not expanded.
     """
     while isinstance(formula, (Boolean, Temporal)) and formula.expansion is not None:
         formula = formula.expansion
@@ -651,7 +651,7 @@ _LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyTyp
 def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
     """Return operands that skip the samples or members in which a rate has no value yet.
 
-    The result is the given tuple if there is nothing to skip: no rates, or only in operators that skip them.
+    If there is nothing to skip, the result is `operands` itself.
     """
     conditions = [rate_conditions(operand) for operand in operands] if operator in _LEFT_OUT_AS else []
     if not any(conditions):
@@ -676,7 +676,7 @@ def judged_operator(formula: Temporal) -> Temporal:
 def rate_conditions(formula: Formula) -> list[Formula]:
     """Return one condition for each rate in a formula: the rate has a value in the sample that is read.
 
-    Rates inside an operator that skips samples itself have no condition. Conditions hold before the first
+    A rate inside an operator that already skips samples has no condition. Conditions hold before the first
     and after the last sample, where there is no sample to skip.
     """
     match formula:
@@ -810,7 +810,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Divisor for the numbers of all atoms of one signal; if `signal` is None, of all atoms of lengths."""
+    """Divisor of all atoms that compare one signal, or lengths if `signal` is None."""
 
     signal: str | None
     divisor: float

@@ -117,10 +117,10 @@ _AXES: tuple[str, ...] = get_args(Axis)
 
 
 def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...]:
-    """Return the parameters after the terms of a relation; a text has them in square brackets.
+    """Return a relation's parameters without its terms; a text has these parameters in square brackets.
 
     Raises:
-        UsageError: the function has too few parameters, or some that are not positional.
+        UsageError: the function has too few parameters, or a parameter that is not positional.
     """
     parameters = tuple(inspect.signature(relation).parameters.values())
     positional_kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -233,7 +233,7 @@ class AtomBuilder:
     # ---------------------------------------------------------------------------------------- checks
 
     def _check(self, expression: Expression, written: RelationSyntax, scope: Scope) -> None:
-        """Report relations of orientations with terms that have none, and negative radii."""
+        """Report terms without orientation in a relation that compares orientations, and negative radii."""
         for node in iter_expressions(expression):
             if isinstance(node, Measurement) and node.needs_orientation:
                 for term in node.terms:
@@ -256,7 +256,7 @@ class QuantifierBuilder:
     """Builder of the quantified formulas of one text.
 
     Attributes:
-        words: all words of the text; a renamed variable gets none of them.
+        words: all words of the text, which renamed variables avoid.
         elaborate: function that returns the formula of a body in a scope.
     """
 
@@ -289,7 +289,7 @@ class QuantifierBuilder:
         return Truth(True)
 
     def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
-        """Report the faults of a body whose quantifier has no members."""
+        """Report the faults of a body that is not expanded over members."""
         values = dict(scope.values) | {name.text: TrackedName(name.text) for name in written.variables}
         self.elaborate(written.body, replace(scope.deeper(), values=values))
 
@@ -364,7 +364,7 @@ class QuantifierBuilder:
 
 
 def first_repetition(names: Sequence[Name]) -> Name | None:
-    """Return the first name that repeats an earlier one; None if all are distinct."""
+    """Return the first name that repeats an earlier name; None if all names are distinct."""
     texts: set[str] = set()
     for name in names:
         if name.text in texts:
@@ -374,7 +374,7 @@ def first_repetition(names: Sequence[Name]) -> Name | None:
 
 
 def _split_title(text: str | None) -> tuple[str | None, str | None]:
-    """Return the requirement id and the title; the id is the text before ": " if that has no blanks."""
+    """Return the requirement id and the title of "ID: TITLE"; an id has no blanks."""
     if text is None:
         return None, None
     identifier, _, title = text.partition(": ")
@@ -406,7 +406,11 @@ class Elaborator:
     """Elaborator of the statements of one text.
 
     Attributes:
-        words: all words of the text; a renamed variable gets none of them.
+        words: all words of the text, which renamed variables avoid.
+        known: elaborated specs by name.
+        referred: names of specs that other specs use.
+        deepest: greatest depth of a node in the current spec.
+        shared: total size of the specs that the current spec uses.
     """
 
     names: Namespace
@@ -444,7 +448,7 @@ class Elaborator:
             if isinstance(definition, DefStatement):
                 self._check_macro(definition)
         specs = [entry.spec for entry in self.known.values()]
-        # the size of a spec includes those of the specs that it names
+        # the size of a spec includes the sizes of the specs that it uses
         total_size = sum(entry.size for name, entry in self.known.items() if name not in self.referred)
         if total_size > MAX_SIZE:
             self._too_large(statements[-1].name.span)
@@ -713,9 +717,9 @@ def parse_specification(
         text: statements, or one formula, which becomes a spec named "spec".
         filename: name of the text in messages.
         profile: relation profile of a text without a `use` line: "paper" (the default) or "spatial_spec".
-        relations: further relations by name, as functions; see `relations`.
-        constants: values that replace those of `const` lines: numbers, or durations as texts, such as "2s".
-            `Specification.source` is the text with these values; the rest of it is unchanged.
+        relations: functions of further relations by name (see module `relations`).
+        constants: new values of `const` lines by name: numbers, or durations as texts such as "2s".
+            `Specification.source` is the text with these values, otherwise unchanged.
 
     Raises:
         SpecificationError: the text has faults; the error lists them.
@@ -815,8 +819,8 @@ def load_specification(
     Raises:
         MissingFileError: the file is missing or cannot be read.
         SpecificationError: the text has faults; the error lists them.
-        UsageError: not a path, a log, a YAML file, a formula, or an argument that `parse_specification`
-            refuses.
+        UsageError: the path is a log, a YAML file, a formula or not a path, or `parse_specification` refuses
+            an argument.
     """
     _require_path(path)
     path = Path(path)
@@ -899,7 +903,7 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
 def constant_writer(specification: Specification) -> Callable[[Mapping[str, float | str]], str]:
     """Return a function from values of constants to the text of a specification with these values.
 
-    It is faster for many values than `parse_specification` with `constants`, which parses each new text.
+    For many values, this is faster than `parse_specification` with `constants`, which parses each text.
     """
     relation_names = RELATION_NAMES | specification.relations
     return _constant_writer(specification.source, specification.filename, relation_names)
@@ -988,7 +992,7 @@ def load_specifications(
     *,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
-    """Parse several files or texts with other values of their constants.
+    """Parse several files or texts, with new values for their constants.
 
     Args:
         constants: values by name; `NAME` applies to all files with that constant, `STEM.NAME` only to the
@@ -1015,7 +1019,7 @@ def _with_titles(
 ) -> Specification:
     """Return a specification whose titles list the changed values of constants.
 
-    A title such as "keep 30 cm from people" may otherwise contain a number that is no longer true.
+    A title such as "keep 30 cm from people" may otherwise contain an outdated number.
 
     Args:
         changed: specification with the new values.
@@ -1053,7 +1057,7 @@ def _constant_text(constant: Constant) -> str:
 
 
 def is_formula(source: Path) -> bool:
-    """Return whether an argument for a file is a formula instead."""
+    """Return whether the argument for a file is a formula."""
     text = str(source)
     return bool(_FORMULA.search(text)) and not text.endswith(".spatial") and not source.exists()
 
@@ -1073,7 +1077,7 @@ def _qualify(specification: Specification, constant: str) -> str:
 def _own_constants(
     specification: Specification, constants: Mapping[str, float | str]
 ) -> dict[str, float | str]:
-    """Return the values for the constants of one file, by their names without the stem."""
+    """Return the new values of one file's constants by name, without the stem."""
     return {
         constant_name: constants[given_name]
         for constant_name in specification.constants

@@ -1,4 +1,4 @@
-"""Text to statements: each statement is parsed separately, so that all faulty ones are reported."""
+"""Text to statements: each statement is parsed separately, so that all faults are reported."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _looking_back(written: Quantity) -> Quantity:
             if leftmost is written:
                 operand: Quantity = written.operands[0]
                 return operand
-            # in [-a + b] the sign belongs to a alone, so the delay is the negative of the whole
+            # in [-a + b] the sign belongs to a alone, so the delay is the negative of the whole sum
             return Arithmetic("-", (written,), written.span, written.depth + 1)
     hint = "write [-3] for three samples earlier, [-2.5s] for 2.5 seconds"
     if isinstance(written, Name):
@@ -167,7 +167,7 @@ def _looking_back(written: Quantity) -> Quantity:
 
 
 class TreeBuilder:
-    """Builder of syntax nodes; lark calls the method with the name of a rule, with its tokens and nodes."""
+    """Builder of syntax nodes; lark calls the method named after a rule with the rule's tokens and nodes."""
 
     # ------------------------------------------------------------------------------------ statements
 
@@ -280,7 +280,7 @@ class TreeBuilder:
         inner = children[1]
         if isinstance(inner, BooleanSyntax):
             return inner._replace(span=_cover(children), is_bracketed=True)
-        # brackets do not widen the span of a name, because its length says whether the name is quoted
+        # brackets do not widen the span of a name, because the span's length says whether the name is quoted
         return inner if isinstance(inner, Name) else inner._replace(span=_cover(children))
 
     def relation(self, children: list[Any]) -> RelationSyntax:
@@ -363,8 +363,9 @@ class TokenGroup:
 
 
 def parse_statements(tokens: Sequence[Token], relations: Collection[str], faults: Faults) -> list[Statement]:
-    """Return the statements of a text without faults; the faults of the others are reported.
+    """Return the statements of a text and report its faults.
 
+    A faulty statement becomes a `BrokenStatement` if its name is readable; otherwise it is left out.
     A bare formula becomes a `spec` with the name `FORMULA_NAME`.
     """
     statements: list[Statement] = []
@@ -439,7 +440,10 @@ def _begins_statement(
 
 
 def _step(token: Token, previous_tokens: Sequence[Token], open_brackets: list[tuple[Token, bool]]) -> bool:
-    """Update the open brackets for a token; return whether a line that ends in it is continued."""
+    """Update the open brackets for a token; return whether a line break after the token is allowed.
+
+    An open bracket has a flag: whether it follows a temporal operator.
+    """
     if token.type in _OPENING:
         open_brackets.append(
             (token, bool(previous_tokens) and previous_tokens[-1].type in ("PREFIX", "INFIX"))
@@ -474,7 +478,7 @@ def _close(
 
 
 class _Tokens(Lexer):
-    """Lexer without tokens; lark requires one, but tokens are fed to the parser one by one."""
+    """Lexer without tokens; lark requires a lexer, but tokens are fed to the parser one by one."""
 
     def __init__(self, lexer_conf: object) -> None:
         super().__init__()

@@ -197,12 +197,12 @@ def _centroid_before(a: Term, b: Term, axis: Axis) -> Expression:
 
 
 def leftof_by_centroid(a: Term, b: Term) -> Expression:
-    """`a leftof b`: least x of the centroids of b's parts minus greatest x of those of a's parts."""
+    """`a leftof b`: least centroid x of b's parts minus greatest centroid x of a's parts."""
     return _centroid_before(a, b, "x")
 
 
 def below_by_centroid(a: Term, b: Term) -> Expression:
-    """`a below b`: least y of the centroids of b's parts minus greatest y of those of a's parts."""
+    """`a below b`: least centroid y of b's parts minus greatest centroid y of a's parts."""
     return _centroid_before(a, b, "y")
 
 
@@ -275,12 +275,12 @@ class Plugin(NamedTuple):
 
 
 def used_modules(text: str) -> dict[str, tuple[int, int]]:
-    """Return the plug-in names in `use` lines of a text, with their offsets; profiles are left out."""
+    """Return the start and end offsets of plug-ins in `use` lines by name; profiles are left out."""
     return {use[1]: use.span(1) for use in _USED.finditer(text) if use[1] not in PROFILES}
 
 
 def plugins_of(text: str) -> dict[str, Plugin]:
-    """Load the plug-ins of the command line, and those that a text uses and the user allows.
+    """Load all plug-ins of the command line, and further plug-ins that a text uses and the user allows.
 
     A `use` line alone loads no module, because loading runs code. The user allows a module by `--plugin`, or
     by `[tool.spatial-replay] plugins` in the pyproject.toml of the current folder.

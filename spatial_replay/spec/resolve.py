@@ -1,4 +1,4 @@
-"""Name resolution: definitions of a text, and the terms, numbers and windows of its names."""
+"""Name resolution: definitions of a text, and terms, numbers and windows that refer to them."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def polygon(corners: Sequence[Corner], effort: Effort) -> Outline:
     """
     if not corners:
         raise OutlineError("a polygon without corners", "write at least one corner (x, y)")
-    # repeated corners would be edges of length 0, which touch their neighbours
+    # repeated corners would give edges of length 0, which touch their neighbours
     ring = [corner for index, corner in enumerate(corners) if index == 0 or corner != corners[index - 1]]
     if len(ring) > 1 and ring[0] == ring[-1]:
         ring.pop()
@@ -147,7 +147,7 @@ def _fold_back(a: Corner, b: Corner, c: Corner) -> bool:
 
 
 def _crossing(ring: Sequence[Corner], effort: Effort) -> tuple[Corner, Corner] | None:
-    """Return the first corners of two edges that cross, touch or fold back; None for a simple polygon."""
+    """Return the start corners of two edges that cross, touch or fold back; None for a simple polygon."""
     corner_count = len(ring)
     edges = [(ring[index], ring[(index + 1) % corner_count]) for index in range(corner_count)]
     for index in range(corner_count):
@@ -291,7 +291,7 @@ class Namespace:
         return name.text not in self.constants and isinstance(self.definitions.get(name.text), ConstStatement)
 
     def constant_ranges(self) -> dict[str, Constant]:
-        """Return the constants that have a value; report those outside of their range."""
+        """Return the constants that have a value, by name; report values outside of their range."""
         constants: dict[str, Constant] = {}
         for name, statement in self.definitions.items():
             value = self.constants.get(name)
@@ -347,7 +347,7 @@ class Namespace:
         return self.constant(name.text)
 
     def with_constant_name(self, name: str, value: float | Duration | None) -> float | Duration | None:
-        """Return the value of a constant with its name, if only formulas depend on the constant."""
+        """Return a constant's value, as a `NamedNumber` if only formulas depend on the constant."""
         if isinstance(value, float) and name not in self.entangled:
             return NamedNumber(value, (name,), is_plain=True)
         return value
@@ -436,7 +436,7 @@ class Scope:
 
     Attributes:
         values: values of parameters and variables by name.
-        call: place of the use of the outermost macro that is being expanded; None outside of macros.
+        call: place where the text uses the outermost macro being expanded; None outside of macros.
         macros: names of the macros that are being expanded, outermost first.
         bound: variables of the enclosing quantifiers and template, after renaming.
         depth: number of enclosing operators, plus 1.
@@ -651,7 +651,10 @@ class Resolver:
         return Bound(whole_lower, whole_upper, unit)
 
     def _lacks_unit(self, operator: TemporalSyntax, written: BoundSyntax, scope: Scope) -> bool:
-        """Report a window without a unit that is decimal, or has the spelling of a tool with other units."""
+        """Report a window that needs a unit, because of its decimal numbers or of another tool's spelling.
+
+        Return whether the window is reported.
+        """
         text, ends = self.faults.source.text, (written.lower, written.upper)
         keyword, window_text = (text[span.start : span.end] for span in (operator.keyword, written.span))
         end_values = [self._end(end, scope) for end in ends]

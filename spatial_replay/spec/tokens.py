@@ -188,7 +188,7 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
         elif token.type == "NAME" and next_tokens and not _is_quoted(token):
             new_token = _word(token, new_tokens, next_tokens, macro_names)
             if new_token.type == "ERROR":
-                # the limit keeps the time of a text full of such words linear
+                # the limit keeps the time linear in a text full of such words
                 later_tokens = tokens[index + 1 : index + 1000]
                 if next_tokens[0].value in macro_names or _holds_formula(later_tokens):
                     _report(token, faults)
@@ -241,7 +241,7 @@ def _report(token: Token, faults: Faults) -> None:
 
 
 def _is_in_front(previous: Sequence[Token], next_tokens: Sequence[Token]) -> bool:
-    """Return whether the grammar allows a prefix operator between these tokens, but no name."""
+    """Return whether a word between these tokens can be a prefix operator, but no name."""
     if not _starts(previous):
         return False
     if next_tokens[0].type == "LSQB":
@@ -264,7 +264,7 @@ def _starts(previous: Sequence[Token]) -> bool:
 
 
 def _is_between(previous: Sequence[Token], next_tokens: Sequence[Token]) -> bool:
-    """Return whether the grammar allows an infix operator between these tokens, but no name."""
+    """Return whether a word between these tokens can be an infix operator, but no name."""
     if not previous or previous[-1].type not in _AFTER_OPERAND:
         return False
     if len(previous) > 1 and previous[-2].type in ("USE", "SPEC", "DEF", "CONST", "REGION", "GROUP", "SCALE"):
@@ -294,7 +294,7 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
     """Return the remedy for a number with a unit; "" if the unit is unknown.
 
     Args:
-        per: unit of time in the unit of a speed, such as "s" of "m/s".
+        per: unit of time of a speed, such as "s" in "m/s".
     """
     if unit in _LENGTHS:
         seconds = _TIMES.get(per, 1.0)
@@ -314,10 +314,10 @@ def unit_hint(number: str, unit: str, per: str = "") -> str:
 def foreign_token_advice(
     tokens: Sequence[Token], position: int, accepted: Collection[str]
 ) -> tuple[str, str] | None:
-    """Return message and hint for a misplaced token if its tokens are typical of another language, else None.
+    """Return message and hint for a misplaced token that is typical of another language, else None.
 
     Args:
-        position: index of the token; the number of tokens means the end.
+        position: index of the token; `len(tokens)` for the end of the statement.
         accepted: types of tokens that the grammar allows at this position.
     """
     no_token = Token("$END", "")

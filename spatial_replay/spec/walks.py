@@ -145,7 +145,7 @@ def is_about_having_rates(leaf: Formula) -> bool:
 
 
 def change_of(rate: Rate) -> Sum | SignedDistance:
-    """Return the change of a rate's quantity between two reports; divided by `step_of`, it is the rate."""
+    """Return the change of a rate's quantity between two reports; the rate is change / `step_of`."""
     match rate.terms:
         case (first, second):
             earlier_terms = (_moved_back(term, _moving(rate)) for term in rate.terms)
@@ -216,7 +216,7 @@ def iter_bound(formula: Formula) -> Iterator[tuple[Formula, tuple[Quantified, ..
 
 
 def iter_atoms(formula: Formula) -> Iterator[Atom]:
-    """Yield the atoms of a formula in text order, those in quantifiers included."""
+    """Yield the atoms of a formula in text order, including atoms in quantifiers."""
     return (part for part in iter_formulas(formula) if isinstance(part, Atom))
 
 
@@ -248,7 +248,7 @@ def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
 
 
 def named_members(group: Group) -> tuple[str, ...]:
-    """Return the members of a named group without excluded ones; an open group has none."""
+    """Return the members of a named group without excluded members; () for an open group."""
     excluded_names = {member.name for member in group.excluded}
     return tuple(name for name in group.members or () if name not in excluded_names)
 
@@ -288,7 +288,7 @@ def other_names(formula: Formula) -> frozenset[str]:
 
 
 def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
-    """Return the possible signs of an operand's robustness in that of its node: 1, -1 or both.
+    """Return the signs of an operand's robustness in the robustness of its node: 1, -1 or both.
 
     Args:
         operand: index of the operand.
@@ -327,9 +327,9 @@ def horizon_ns(formula: Formula) -> float:
 
 
 def can_settle(formula: Formula, *, satisfied: bool) -> bool:
-    """Return False if no prefix of a run can permanently satisfy a formula (violate it, if not `satisfied`).
+    """Return whether a prefix of a run may permanently satisfy a formula; violate it if not `satisfied`.
 
-    The check looks only at the operators, so True means that such a prefix may exist.
+    The check looks only at operators: without such a prefix, the result can still be True.
     """
     match formula:
         case Boolean(operator="not", operands=(operand,)):
@@ -392,7 +392,7 @@ def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
 
 
 def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) -> Formula:
-    """Return a formula in which the node with an id has other operands."""
+    """Return a formula with new operands for the node with the id `node`."""
     if not isinstance(formula, Boolean | Temporal):
         return formula
     if node == 0:
@@ -408,7 +408,7 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
 
 
 def without_variables(formula: Quantified) -> Formula:
-    """Return the body of a quantifier with numbered variables, so that bodies with other names are equal."""
+    """Return the body of a quantifier with numbered variables, so that their names do not affect equality."""
     quantifier_count = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
     # a name of a text begins with a blank only in quotes, so in practice these clash with no other name
     return substitute(
@@ -508,7 +508,7 @@ def units_of(formula: Formula) -> tuple[Unit, ...]:
     An equality such as `mode == 2` has no unit, because its robustness is infinite.
 
     A minimum over atoms with the same unit has that unit. A minimum over several units may compare numbers
-    that are not comparable, unless each of them is scaled (see `is_mixed`).
+    that are not comparable, unless all units are scaled (see `is_mixed`).
     """
     return tuple(dict.fromkeys(unit for atom in iter_atoms(formula) for unit in _units(atom.expression)))
 
