@@ -166,19 +166,19 @@ def main() -> NoReturn:
     sys.unraisablehook = _interrupt_again
     # a short run has little garbage, and a hundred collections take 5 % of its time
     gc.set_threshold(50_000, 20, 20)
-    code = run()
-    if code == ExitCode.INTERRUPTED:
-        _end_waiting_threads(code)
-    sys.exit(code)
+    exit_code = run()
+    if exit_code == ExitCode.INTERRUPTED:
+        _end_waiting_threads(exit_code)
+    sys.exit(exit_code)
 
 
 _PATIENCE_S = 0.5
 """Time that an interrupted program waits for its threads, seconds."""
 
 
-def _end_waiting_threads(code: int) -> None:
+def _end_waiting_threads(exit_code: int) -> None:
     """End the process if a thread still waits, for example for data of a pipe."""
-    until_s = time.monotonic() + _PATIENCE_S
+    deadline_s = time.monotonic() + _PATIENCE_S
     main_thread = threading.main_thread()
     # an interruption may come before a new thread starts, and such a thread cannot be joined
     threads = [
@@ -187,12 +187,12 @@ def _end_waiting_threads(code: int) -> None:
         if thread is not main_thread and not thread.daemon and thread.ident is not None
     ]
     for thread in threads:
-        thread.join(max(until_s - time.monotonic(), 0.0))
+        thread.join(max(deadline_s - time.monotonic(), 0.0))
     if any(thread.is_alive() for thread in threads):
         # `sys.exit` would wait for the thread
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)
+        os._exit(exit_code)
 
 
 _AGAIN_S = 0.05
@@ -222,7 +222,7 @@ def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the program with these arguments (by default those of the process) and return its exit code."""
     try:
-        code = application.main(
+        exit_code = application.main(
             args=None if arguments is None else list(arguments),
             prog_name=PROGRAM,
             complete_var=COMPLETION_VARIABLE,
@@ -231,9 +231,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
             color=False if os.environ.get("NO_COLOR") else None,
         )
         sys.stdout.flush()
-    except SystemExit as leaving:
+    except SystemExit as exit_request:
         # click exits by itself in two cases: after completing a line for a shell, and on a broken pipe
-        return int(leaving.code or 0) if COMPLETION_VARIABLE in os.environ else ExitCode.BROKEN_PIPE
+        return int(exit_request.code or 0) if COMPLETION_VARIABLE in os.environ else ExitCode.BROKEN_PIPE
     except BrokenPipeError:
         # buffered output must not fail again at exit:
         # https://docs.python.org/3/library/signal.html#note-on-sigpipe
@@ -241,11 +241,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return ExitCode.BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
         # click turns every EOFError into an Abort, which stands for an interruption otherwise
-        is_end = isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError)
-        reported = error.__cause__ or error if is_end else error
-        report_error(reported)
-        return exit_code_from_error(reported)
-    return int(code or 0)
+        is_end_of_file = isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError)
+        reported_error = error.__cause__ or error if is_end_of_file else error
+        report_error(reported_error)
+        return exit_code_from_error(reported_error)
+    return int(exit_code or 0)
 
 
 class ExitCode(IntEnum):
@@ -321,19 +321,19 @@ def message_from_error(error: BaseException) -> str:
             notes = getattr(error.__cause__ or error, "__notes__", ())
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
-            path, what = context.command_path, error.format_message()
+            command_path, message = context.command_path, error.format_message()
             if isinstance(error, click.MissingParameter):
                 # click lists the choices of a parameter one per line, after tabs
-                what = " ".join(what.split())
+                message = " ".join(message.split())
             if isinstance(error, click.NoSuchOption):
                 remedy = new_form(error.option_name, context.command)
-                what = f"no option {error.option_name}; {remedy}" if remedy else what
+                message = f"no option {error.option_name}; {remedy}" if remedy else message
             parameters = context.command.params
-            if "unexpected extra" in what and any("--spec" in parameter.opts for parameter in parameters):
-                what += f"; specifications come after --spec: {path} LOG --spec FILE; batch takes many logs"
-            if "'--spec'" in what and any(parameter.name == "specification" for parameter in parameters):
-                what += f" {path} FILE takes the specification without it."
-            return f"{what}\n  see '{path} --help'"
+            if "unexpected extra" in message and any("--spec" in parameter.opts for parameter in parameters):
+                message += f"; specifications come after --spec: {command_path} LOG --spec FILE; batch takes many logs"
+            if "'--spec'" in message and any(parameter.name == "specification" for parameter in parameters):
+                message += f" {command_path} FILE takes the specification without it."
+            return f"{message}\n  see '{command_path} --help'"
         case click.ClickException():
             return error.format_message()
         case SpecificationError(diagnoses=[_, *_] as diagnoses):
@@ -355,10 +355,10 @@ def new_form(option: str, command: click.Command) -> str | None:
     """Return the remedy for an option of an earlier version; None for any other option."""
     from spatial_replay.mapping.yaml_document import schema_of
 
-    key = option.removeprefix("--").replace("-", "_")
-    is_planner = any("--set" in parameter.opts for parameter in command.params)
-    if is_planner and key in schema_of("planning", "settings")["properties"]:
-        return f"write --set {key}=VALUE"
+    setting_key = option.removeprefix("--").replace("-", "_")
+    has_settings = any("--set" in parameter.opts for parameter in command.params)
+    if has_settings and setting_key in schema_of("planning", "settings")["properties"]:
+        return f"write --set {setting_key}=VALUE"
     return FORMER_OPTIONS.get(option)
 
 

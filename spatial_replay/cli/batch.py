@@ -72,22 +72,22 @@ def print_totals(table: pa.Table, by: By) -> None:
     # imported here so that --help stays fast
     from spatial_replay.batch.run_table import EDITED_SINCE, counts_of, totals
 
-    rows = totals(table, by)
-    has_cases = len({total.group["case"] for total in rows}) > 1
-    titles = [_title(total, by, has_cases) for total in rows]
-    columns = counts_of(rows)
+    group_totals = totals(table, by)
+    has_cases = len({total.group["case"] for total in group_totals}) > 1
+    titles = [_title(total, by, has_cases) for total in group_totals]
+    counts_by_heading = counts_of(group_totals)
     width = max([len(by), *map(len, titles)])
-    show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in columns)}  least robustness")
-    for place, (title, total) in enumerate(zip(titles, rows, strict=True)):
+    show(f"  {by:<{width}}  {'  '.join(f'{heading:>9}' for heading in counts_by_heading)}  least robustness")
+    for index, (title, total) in enumerate(zip(titles, group_totals, strict=True)):
         line: list[str | Coloured] = [f"  {title:<{width}}"]
-        for name, counts in columns.items():
-            count = counts[place]
+        for name, counts in counts_by_heading.items():
+            count = counts[index]
             # if all verdicts are as expected, none is coloured as bad
             colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
             cell = f"{count:>9,}" if count else f"{'-':>9}"
             line += ["  ", Coloured(cell, colour) if count and colour else cell]
-        least = "not determined" if total.least is None else with_unit(total.least, total.unit or "")
-        show((*line, f"  {least:>16}"))
+        least_text = "not determined" if total.least is None else with_unit(total.least, total.unit or "")
+        show((*line, f"  {least_text:>16}"))
         for text in filter(None, (total.title, EDITED_SINCE if total.is_edited else None)):
             show(f"    {text}")
 
@@ -110,13 +110,13 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
     for row in worst_rows(table, count):
         if failing and row["failure"] is None:
             return
-        name = row["spec"] or row["file"]
-        name = result_name(name, row["object"])
+        result = row["spec"] or row["file"]
+        result = result_name(result, row["object"])
         verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
         robustness = robustness_of(row)
-        show((f"  {row['log']}: {name}: ", verdict, f", robustness {robustness}" if robustness else ""))
-        usual = f"{row['verdict']}, expected satisfied"
-        failure = None if row["failure"] == usual else row["failure"]
+        show((f"  {row['log']}: {result}: ", verdict, f", robustness {robustness}" if robustness else ""))
+        usual_failure = f"{row['verdict']}, expected satisfied"
+        failure = None if row["failure"] == usual_failure else row["failure"]
         for line in (requirement_of(row), failure, row["reason"]):
             if line:
                 show(*(f"      {part}" for part in line.split("\n")))
@@ -131,8 +131,8 @@ def write_json_lines(
     if isinstance(table, Sequence):
         batches: Iterable[Sequence[Mapping[str, Any]]] = [table]
     else:
-        begins = range(0, len(table), _BATCH)
-        batches = (table.slice(begin, _BATCH).to_pylist() for begin in begins)
+        slice_starts = range(0, len(table), _BATCH)
+        batches = (table.slice(start, _BATCH).to_pylist() for start in slice_starts)
     texts = (
         "".join(f"{json.dumps(json_value(row), ensure_ascii=False)}\n" for row in rows) for rows in batches
     )
@@ -147,15 +147,17 @@ def write_json_lines(
 
 def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
     """Return the exit code of a run, as of a replay; expected results count as satisfied."""
-    names = ("failure", "error_kind", "verdict", "faults")
+    columns = ("failure", "error_kind", "verdict", "faults")
     codes = set()
-    for failure, kind, verdict, faults in zip(*(table.column(n).to_pylist() for n in names), strict=True):
+    for failure, error_kind, verdict, faults in zip(
+        *(table.column(n).to_pylist() for n in columns), strict=True
+    ):
         if faults:
             codes.add(ExitCode.DAMAGED)
         if failure is None or (faults and failure.startswith(DAMAGED)):
             continue
-        if kind is not None:
-            codes.add(_KIND_CODES[kind])
+        if error_kind is not None:
+            codes.add(_KIND_CODES[error_kind])
         elif failure.startswith(VACUOUS) or (verdict == "unknown" and "unknown" in fail_on):
             codes.add(ExitCode.VIOLATED)
         elif failure.startswith(DOUBTFUL):
@@ -169,9 +171,9 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
 
 def code_of_errors(table: pa.Table) -> ExitCode:
     """Return the exit code of damaged logs and of errors."""
-    rows = _columns(table, "faults", "error_kind")
-    codes = [_KIND_CODES[kind] for _, kind in rows if kind is not None]
-    return most_severe([*codes, *(ExitCode.DAMAGED for faults, _ in rows if faults)])
+    error_rows = _columns(table, "faults", "error_kind")
+    codes = [_KIND_CODES[kind] for _, kind in error_rows if kind is not None]
+    return most_severe([*codes, *(ExitCode.DAMAGED for faults, _ in error_rows if faults)])
 
 
 def _title(total: Total, by: By, with_case: bool) -> str:
@@ -282,43 +284,43 @@ def batch(
     cases = prepare(suite, progress)
     warnings = [warning for case in cases for file in case.files for warning in file.warnings]
     show_diagnostics({str(warning): warning for warning in warnings}.values())
-    folder = outputs.output
-    if folder is None:
-        folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
-    tolerance, before = _baseline(outputs)
+    results_folder = outputs.output
+    if results_folder is None:
+        results_folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
+    tolerance, baseline_table = _baseline(outputs)
     check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, inputs_of(suite))
     workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
-    with resumable(folder):
-        evaluated = run_batch(cases, folder, workers, fail_on=fail_on, progress=progress)
-        differences = None if before is None else compare(evaluated.table, before, tolerance)
+    with resumable(results_folder):
+        evaluated = run_batch(cases, results_folder, workers, fail_on=fail_on, progress=progress)
+        differences = None if baseline_table is None else compare(evaluated.table, baseline_table, tolerance)
 
         def with_comparison(evaluated: BatchResult) -> BatchResult:
             # results that are worse than the baseline fail in all outputs
-            if before is None:
+            if baseline_table is None:
                 return evaluated
-            return replace(evaluated, table=with_baseline(evaluated.table, before, differences or ()))
+            return replace(evaluated, table=with_baseline(evaluated.table, baseline_table, differences or ()))
 
         is_exported = any((outputs.junit, outputs.html, outputs.json_file, is_github()))
-        failing = failing_places(with_comparison(evaluated).table, None if is_exported else _WORST)
+        failing_rows = failing_places(with_comparison(evaluated).table, None if is_exported else _WORST)
         # rows of gone results come last, and have no log to explain
-        failing = [place for place in failing if place < len(evaluated.table)]
+        failing_rows = [place for place in failing_rows if place < len(evaluated.table)]
         # the stored table gets the explanations, but not the comparison
-        evaluated = explain_batch(evaluated, failing, workers, results=folder, progress=progress)
-        result = with_comparison(evaluated)
-        _write_outputs(outputs, suite, evaluated, result, workers)
+        evaluated = explain_batch(evaluated, failing_rows, workers, results=results_folder, progress=progress)
+        compared_result = with_comparison(evaluated)
+        _write_outputs(outputs, suite, evaluated, compared_result, workers)
         if outputs.json_file != "-":
-            _print(result, evaluated, folder)
+            _print(compared_result, evaluated, results_folder)
         warn(*first_lines(evaluated.remarks, _MOST_WARNINGS))
         warn_of_names(evaluated.table)
         warn_of_damage(evaluated.table)
         if is_github():
-            for line in worst_annotations(result.table, suite.folder):
+            for line in worst_annotations(compared_result.table, suite.folder):
                 show(line, err=True)
-            write_summary(result.table)
-        code = exit_code_from_table(evaluated.table, fail_on)
+            write_summary(compared_result.table)
+        exit_code = exit_code_from_table(evaluated.table, fail_on)
         if differences is not None and _print_differences(differences, outputs.json_file == "-"):
-            code = most_severe([code, ExitCode.VIOLATED])
-    return code
+            exit_code = most_severe([exit_code, ExitCode.VIOLATED])
+    return exit_code
 
 
 @contextmanager
@@ -347,8 +349,8 @@ def _write_outputs(
     if outputs.html is not None:
         pages = write_pages(result, outputs.html, suite.name, workers, progress=progress)
     if outputs.junit is not None:
-        attached = {key: path.as_posix() for key, path in pages.items()}
-        write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
+        report_paths = {key: path.as_posix() for key, path in pages.items()}
+        write_junit(outputs.junit, result.table, suite.name, report_paths, inputs=inputs)
     if outputs.update_baseline and outputs.baseline is not None:
         ResultsFolder.create(outputs.baseline).write_run(evaluated.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
@@ -356,7 +358,7 @@ def _write_outputs(
         write_json_lines(result.table, outputs.json_file, inputs)
 
 
-def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
+def _suite(logs: tuple[str, ...], arguments: ConditionArguments, semantics: Semantics) -> Suite:
     """Return the named suite, or the suite of given logs and options.
 
     Raises:
@@ -367,10 +369,10 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     # metadata.yaml belongs to a ROS 2 bag
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
     if not suites:
-        return suite_of_logs(logs, given, semantics)
+        return suite_of_logs(logs, arguments, semantics)
     if len(logs) > 1:
         raise UsageError(f"{suites[0]} is a suite, which names its logs; give it alone")
-    if given.specs or _conditions(given, semantics) != Conditions():
+    if arguments.specs or _conditions(arguments, semantics) != Conditions():
         raise UsageError(
             f"{suites[0]} says how its logs are evaluated; change it there, or give logs and options"
         )
@@ -395,12 +397,12 @@ def suite_of_logs(logs: tuple[str, ...], given: ConditionArguments, semantics: S
     return Suite.of_logs(logs, tuple(specs), _conditions(given, semantics))
 
 
-def _conditions(given: ConditionArguments, semantics: Semantics) -> Conditions:
+def _conditions(options: ConditionArguments, semantics: Semantics) -> Conditions:
     from spatial_replay.batch.suite import Conditions
 
-    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
-    objects = objects_by_parameter(given.choices)
-    return Conditions.from_tables(given.reading, objects, given.constants, semantics=semantics, **others)
+    fields = {name: getattr(options, name) for name in ("start", "end", "every", "strict_names")}
+    objects = objects_by_parameter(options.choices)
+    return Conditions.from_tables(options.reading, objects, options.constants, semantics=semantics, **fields)
 
 
 def inputs_of(suite: Suite) -> list[Path]:
@@ -451,60 +453,62 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     from spatial_replay.batch.run_table import WORSE, flaky_results, summary_text, totals
 
     reused = result.logs - result.evaluated
-    news = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
+    counts = f"{result.evaluated:,} evaluated now, {reused:,} known" if reused else "all evaluated now"
     # gone logs count here as on the page and in the summary
-    gone = len(set(result.table["log"].to_pylist()) - set(evaluated.table["log"].to_pylist()))
-    news = f"{news}, {gone:,} gone" if gone else news
-    show(f"{plural(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
+    gone_count = len(set(result.table["log"].to_pylist()) - set(evaluated.table["log"].to_pylist()))
+    counts = f"{counts}, {gone_count:,} gone" if gone_count else counts
+    show(f"{plural(result.logs + gone_count, 'log')}, {summary_text(result.table)} ({counts})")
     print_totals(result.table, "spec")
-    cut = pc.sum(pc.equal(result.table["tested"], "cut")).as_py()
-    if cut:
-        show(f"{plural(cut, 'result')} decided by a window that the end of the log cut: see --fail-on cut")
-    failures = len(result.failures)
-    if failures:
-        summary = f"{failures:,} failed"
+    cut_count = pc.sum(pc.equal(result.table["tested"], "cut")).as_py()
+    if cut_count:
+        show(
+            f"{plural(cut_count, 'result')} decided by a window that the end of the log cut: see --fail-on cut"
+        )
+    failure_count = len(result.failures)
+    if failure_count:
+        summary = f"{failure_count:,} failed"
         if WORSE in result.table.column_names:
-            specs = totals(result.table)
+            spec_totals = totals(result.table)
             summary += (
-                f", {sum(spec.worse or 0 for spec in specs):,} of them worse than the baseline, or gone"
+                f", {sum(spec.worse or 0 for spec in spec_totals):,} of them worse than the baseline, or gone"
             )
-            if edited := sum(spec.worse_edited or 0 for spec in specs):
-                summary += f", {edited:,} of specs edited since"
-        show(f"{summary}, the worst {_WORST}:" if failures > _WORST else f"{summary}:")
+            if edited_count := sum(spec.worse_edited or 0 for spec in spec_totals):
+                summary += f", {edited_count:,} of specs edited since"
+        show(f"{summary}, the worst {_WORST}:" if failure_count > _WORST else f"{summary}:")
         print_worst(result.table, _WORST, failing=True)
-    flaky = [result.text for result in flaky_results(result.table)]
-    show(*(f"  {line}" for line in first_lines(flaky, _MOST_DIFFERENCES)))
+    flaky_texts = [result.text for result in flaky_results(result.table)]
+    show(*(f"  {line}" for line in first_lines(flaky_texts, _MOST_DIFFERENCES)))
     show(f"wrote {folder}")
 
 
 def warn_of_names(table: pa.Table) -> None:
     """Warn of missing names, and show remarks on logs. Equal messages are reported once."""
-    logs: dict[str, tuple[str, dict[str, None]]] = {}
-    for name in ("missing", "remarks"):
-        for log, messages in _columns(table, "log", name):
+    findings: dict[str, tuple[str, dict[str, None]]] = {}
+    for column_name in ("missing", "remarks"):
+        for log, messages in _columns(table, "log", column_name):
             for message in messages:
                 text = message.removeprefix(f"{Path(log).name}: ")
-                logs.setdefault(without_numbers(text), (text, {}))[1][log] = None
-    messages_with_logs = [f"{text} (in {_join_names(list(names))})" for text, names in logs.values()]
+                findings.setdefault(without_numbers(text), (text, {}))[1][log] = None
+    messages_with_logs = [f"{text} (in {_join_names(list(logs))})" for text, logs in findings.values()]
     warn(*first_lines(messages_with_logs, _MOST_WARNINGS))
 
 
 def warn_of_damage(table: pa.Table) -> None:
     """Warn of damaged, unreadable and unfit logs, which give the exit code 3."""
-    rows = _columns(table, "log", "faults", "error_kind")
-    for what, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
-        logs = dict.fromkeys(
-            log for log, faults, error_kind in rows if error_kind == kind or (faults and kind == "log")
+    log_rows = _columns(table, "log", "faults", "error_kind")
+    for damage, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
+        log_names = dict.fromkeys(
+            log for log, faults, error_kind in log_rows if error_kind == kind or (faults and kind == "log")
         )
-        if logs:
-            warn(f"{what}: {_join_names(list(logs))}")
+        if log_names:
+            warn(f"{damage}: {_join_names(list(log_names))}")
 
 
 def _join_names(names: Sequence[str]) -> str:
     """Return the first few names, and the number of others."""
-    more = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
-    parts = [*names[:_MOST_NAMED], *more]
-    return " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
+    other_text = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
+    listed_names = [*names[:_MOST_NAMED], *other_text]
+    return " and ".join(filter(None, [", ".join(listed_names[:-1]), listed_names[-1]]))
 
 
 def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:
@@ -516,15 +520,15 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
     failing = [difference for difference in differences if difference.fails]
     worse = [difference for difference in failing if not difference.is_edited]
     edited = [difference for difference in failing if difference.is_edited]
-    better = len(differences) - len(failing)
-    heads = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
-    heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
-    show("; ".join(heads) + (":" if worse else ""), err=to_errors)
+    better_count = len(differences) - len(failing)
+    summary = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
+    summary += [f"{better_count:,} better: --update-baseline keeps that"] if better_count else []
+    show("; ".join(summary) + (":" if worse else ""), err=to_errors)
     for line in first_lines([difference.text for difference in worse], _MOST_DIFFERENCES):
         show(f"  {line}", err=to_errors)
     if edited:
-        specs = _join_names(list(dict.fromkeys(f"{result.spec} ({result.file})" for result in edited)))
-        show(f"worse, and the spec was edited since the baseline: {specs}:", err=to_errors)
+        spec_names = _join_names(list(dict.fromkeys(f"{result.spec} ({result.file})" for result in edited)))
+        show(f"worse, and the spec was edited since the baseline: {spec_names}:", err=to_errors)
         for line in first_lines([difference.text for difference in edited], _MOST_DIFFERENCES):
             show(f"  {line}", err=to_errors)
     return bool(failing)
@@ -586,10 +590,10 @@ def results(
     refuse_values({"--tolerance": tolerance}, "applies to two runs; give the results of the later one, too")
     table = ResultsFolder.open(folder).read_run()
     if where is not None:
-        rows = rows_where(table, where)
-        if not len(rows):
+        matching_rows = rows_where(table, where)
+        if not len(matching_rows):
             warn(*absent_values(table, where))
-        table = rows
+        table = matching_rows
     table = explain_table_rows(table, range(len(table)) if json_file else worst_places(table, worst))
     if json_file is not None:
         write_json_lines(table, json_file, ())
@@ -619,16 +623,18 @@ def explain_table_rows(table: pa.Table, places: Collection[int]) -> pa.Table:
     return table
 
 
-def _compare_results(folder: str, other: str, json_file: str | None, tolerance: str | None) -> ExitCode:
+def _compare_results(
+    folder: str, later_folder: str, json_file: str | None, tolerance: str | None
+) -> ExitCode:
     """Show the differences between two runs."""
     from spatial_replay.batch.flips import diff_runs
     from spatial_replay.batch.run_table import Tolerance
     from spatial_replay.batch.store import ResultsFolder
 
     with naming_option("--tolerance"):
-        allowed = Tolerance.parse(tolerance or "0")
-    before, now = (ResultsFolder.open(place).read_run() for place in (folder, other))
-    flips = diff_runs(before, now, allowed, (folder, other), explain=explain_table_rows)
+        allowed_loss = Tolerance.parse(tolerance or "0")
+    before, now = (ResultsFolder.open(place).read_run() for place in (folder, later_folder))
+    flips = diff_runs(before, now, allowed_loss, (folder, later_folder), explain=explain_table_rows)
     if json_file is not None:
         write_json_lines([change.document for change in flips.changes], json_file, ())
     if json_file != "-":

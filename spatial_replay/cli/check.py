@@ -209,12 +209,12 @@ def check(
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
-    compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
+    comparison = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
     findings = examine(parsed, examples=False).findings
     diagnostics = [
         *parsed.warnings,
         *last_sample_warnings(parsed),
-        *compared.diagnostics,
+        *comparison.diagnostics,
         *(finding.diagnostic for finding in findings),
     ]
     show_diagnostics(diagnostics)
@@ -223,7 +223,7 @@ def check(
         raise SpecificationError([diagnostic for diagnostic in diagnostics if diagnostic.severity == "error"])
     if form == "text":
         show_result(
-            lambda: _document(parsed, diagnostics, compared), lambda: _lines(parsed, compared), as_json
+            lambda: _document(parsed, diagnostics, comparison), lambda: _lines(parsed, comparison), as_json
         )
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, hz, quiet=as_json)
@@ -265,48 +265,48 @@ def _compare_with_log(
 
     source = open_source(log, **reading)
     specification = with_numbers(specification, source.axes.units)
-    numbers, names = LogNumbers(specification), LogNames()
-    evaluation = _CutResults(specification)
-    ends = RunEnds(Needs.of([specification], {}))
+    log_numbers, log_names = LogNumbers(specification), LogNames()
+    cut_results = _CutResults(specification)
+    run_ends = RunEnds(Needs.of([specification], {}))
     faults: list[str] = []
     doubts: list[Doubt] = []
 
     def compare(traces: Iterable[Trace]) -> None:
         for trace in traces:
-            numbers.add(trace)
-            evaluation.add(trace)
+            log_numbers.add(trace)
+            cut_results.add(trace)
 
     with progress("samples") as advance:
         for block in source.keeping().iter_blocks():
-            names.add(block.trace)
-            compare(ends.add(block.trace))
+            log_names.add(block.trace)
+            compare(run_ends.add(block.trace))
             faults += block.trace.faults
             doubts += block.doubts
             advance(len(block.trace))
-    compare(ends.finish())
+    compare(run_ends.finish())
     remarks = [doubt.remark(source.name) for doubt in dict.fromkeys(doubts)]
-    remarks += [Sentence(f"{source.name}: ", remark) for remark in ends.remarks]
-    zero_ns = log_zero_ns(source, Window(), ends)
+    remarks += [Sentence(f"{source.name}: ", remark) for remark in run_ends.remarks]
+    zero_ns = log_zero_ns(source, Window(), run_ends)
     warn(*counted_from((*faults, *remarks), zero_ns))
-    unknown = names.check(specification, {})
-    missing = sum(diagnostic.severity == "error" for diagnostic in unknown)
+    unknown_names = log_names.check(specification, {})
+    missing_count = sum(diagnostic.severity == "error" for diagnostic in unknown_names)
     if not strict_names:
-        unknown = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown)
-    doubtful = (
-        *plausibility_warnings(specification, numbers, zero_ns),
-        *evaluation.warnings(source, ends, zero_ns),
+        unknown_names = tuple(replace(diagnostic, severity="warning") for diagnostic in unknown_names)
+    log_warnings = (
+        *plausibility_warnings(specification, log_numbers, zero_ns),
+        *cut_results.warnings(source, run_ends, zero_ns),
     )
-    counts = [plural(missing, "name") + " that it never has"] if missing else []
-    others = len(unknown) - missing + len(doubtful)
-    counts += [plural(others, "other warning" if missing else "warning")] if others else []
-    summary = (
-        f"compared with {plural(numbers.samples, 'sample')} of {source.name} over {numbers.seconds:.3f} s: "
+    count_texts = [plural(missing_count, "name") + " that it never has"] if missing_count else []
+    other_count = len(unknown_names) - missing_count + len(log_warnings)
+    count_texts += (
+        [plural(other_count, "other warning" if missing_count else "warning")] if other_count else []
     )
+    summary = f"compared with {plural(log_numbers.samples, 'sample')} of {source.name} over {log_numbers.seconds:.3f} s: "
     return _Compared(
-        (*unknown, *doubtful),
-        window_lines(specification, numbers),
-        numbers.ranges,
-        summary + (" and ".join(counts) or "all names, thresholds and windows fit"),
+        (*unknown_names, *log_warnings),
+        window_lines(specification, log_numbers),
+        log_numbers.ranges,
+        summary + (" and ".join(count_texts) or "all names, thresholds and windows fit"),
     )
 
 
@@ -319,14 +319,14 @@ class _CutResults:
         from spatial_replay.trace.trace import FOREVER
 
         self._specification = specification
-        plain = tuple(spec for spec in specification.specs if spec.parameter is None)
-        instances = find_instances(replace(specification, specs=plain), {}, [], 0, FOREVER)
+        plain_specs = tuple(spec for spec in specification.specs if spec.parameter is None)
+        instances = find_instances(replace(specification, specs=plain_specs), {}, [], 0, FOREVER)
         self._stream = EvaluationStream(instances, specification.regions)
-        self._kept: list[list[SeriesBlock]] = [[] for _ in instances]
+        self._blocks_by_instance: list[list[SeriesBlock]] = [[] for _ in instances]
 
     def add(self, trace: Trace) -> None:
         """Evaluate the next samples."""
-        for blocks, block in zip(self._kept, self._stream.extend(trace), strict=True):
+        for blocks, block in zip(self._blocks_by_instance, self._stream.extend(trace), strict=True):
             # only leaves are needed, and a view without a copy would keep the whole series in memory
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
@@ -340,8 +340,8 @@ class _CutResults:
             return (ends.trim(block.trace) for block in source.keeping().iter_blocks())
 
         specification, units = self._specification, source.axes.units
-        text = SourceText.of(specification.source, specification.filename)
-        for stream, blocks in zip(self._stream.streams, self._kept, strict=True):
+        source_text = SourceText.of(specification.source, specification.filename)
+        for stream, blocks in zip(self._stream.streams, self._blocks_by_instance, strict=True):
             if not len(stream):
                 continue
             evidence = Evidence(stream.instance, specification.regions, traces, units, zero_ns)
@@ -350,7 +350,7 @@ class _CutResults:
                 node = nodes_of(result.formula)[part.node or 0]
                 message = f"{result.name} would be {result.verdict}: {str(part.message).removesuffix('.')}"
                 hint = "record a longer log; `replay --fail-on cut` fails such a result"
-                yield text.diagnostic("warning", node.span, message, hint)
+                yield source_text.diagnostic("warning", node.span, message, hint)
 
 
 def _heading(spec: NamedSpec) -> str:
@@ -358,21 +358,21 @@ def _heading(spec: NamedSpec) -> str:
     return head if spec.title is None else f"{head} {quote_name(title_text(spec))}"
 
 
-def _lines(specification: Specification, compared: _Compared) -> Iterator[str]:
+def _lines(specification: Specification, comparison: _Compared) -> Iterator[str]:
     for number, spec in enumerate(specification.results):
         if number:
             yield ""
         yield _heading(spec)
         branches = list(iter_branches(spec.formula))
-        width = len(str(len(branches) - 1))
-        for identifier, stem, node in branches:
-            yield f"  {identifier:>{width}}  {stem}{label_of(node)}"
-    if compared.summary:
-        yield from ("", *compared.windows, *map(str, compared.ranges), compared.summary)
+        id_width = len(str(len(branches) - 1))
+        for node_id, branch_lines, node in branches:
+            yield f"  {node_id:>{id_width}}  {branch_lines}{label_of(node)}"
+    if comparison.summary:
+        yield from ("", *comparison.windows, *map(str, comparison.ranges), comparison.summary)
 
 
 def _document(
-    specification: Specification, diagnostics: list[Diagnostic], compared: _Compared
+    specification: Specification, diagnostics: list[Diagnostic], comparison: _Compared
 ) -> dict[str, object]:
     return {
         "file": specification.filename,
@@ -389,7 +389,7 @@ def _document(
             name: json_fields(constant, "value", "duration_ns", "range")
             for name, constant in specification.constants.items()
         },
-        "windows": list(compared.windows),
+        "windows": list(comparison.windows),
         "thresholds": [
             {
                 "atom": atom_range.atom.text,
@@ -397,7 +397,7 @@ def _document(
                 **json_fields(atom_range, "least", "greatest"),
                 **({} if atom_range.least <= atom_range.greatest else {"least": None, "greatest": None}),
             }
-            for atom_range in compared.ranges
+            for atom_range in comparison.ranges
         ],
         "warnings": [
             json_fields(diagnostic, "line", "column", "message", "hint") for diagnostic in diagnostics
@@ -407,14 +407,14 @@ def _document(
 
 def _node_rows(formula: Formula) -> list[dict[str, object]]:
     """Return the nodes as rows of a table: id, parent, operator, name, text."""
-    names = ("id", "parent", "operator", "name", "text")
+    columns = ("id", "parent", "operator", "name", "text")
     nodes = iter_nodes(formula)
-    rows = ((*place, operator_of(node), node.name, format_formula(node)) for *place, node in nodes)
-    return [dict(zip(names, row, strict=True)) for row in rows]
+    rows = ((*ids, operator_of(node), node.name, format_formula(node)) for *ids, node in nodes)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def _check_automaton_options(
-    specification: Specification, name: str | None, file: str, inputs: Sequence[Path]
+    specification: Specification, spec_name: str | None, file: str, inputs: Sequence[Path]
 ) -> None:
     """Check the options of `_write_automata` before anything is printed.
 
@@ -424,20 +424,20 @@ def _check_automaton_options(
     from spatial_replay.automata.compile import chosen_spec
     from spatial_replay.logs.output_file import refuse_inputs
 
-    if name is not None:
-        chosen_spec(specification, name)
+    if spec_name is not None:
+        chosen_spec(specification, spec_name)
     if file == _STANDARD_OUTPUT:
         return
     path = Path(file)
     if path.suffix not in _AUTOMATON_FILES:
         raise UsageError(f"{file}: automata are written to .dot, .hoa or .svg files, or as text to -")
-    require_choice(specification, name)
+    require_choice(specification, spec_name)
     refuse_inputs(path, inputs)
 
 
 def _write_automata(
     specification: Specification,
-    name: str | None,
+    spec_name: str | None,
     file: str,
     inputs: Sequence[Path],
     hz: float | None,
@@ -461,32 +461,34 @@ def _write_automata(
     from spatial_replay.logs.output_file import replacing
 
     if file == _STANDARD_OUTPUT:
-        names = [name] if name else [spec.name for spec in specification.results]
-        _print_automata(specification, names, hz)
+        spec_names = [spec_name] if spec_name else [spec.name for spec in specification.results]
+        _print_automata(specification, spec_names, hz)
         return
     path = Path(file)
-    graph = automaton(specification, name, rate_hz=hz)
+    dfa = automaton(specification, spec_name, rate_hz=hz)
     writers = Automaton.to_dot, Automaton.to_hoa, svg_text
-    text = dict(zip(_AUTOMATON_FILES, writers, strict=True))[path.suffix](graph)
+    automaton_text = dict(zip(_AUTOMATON_FILES, writers, strict=True))[path.suffix](dfa)
     with replacing(path, inputs) as stream:
-        stream.write(text.encode())
-    show(f"wrote {path}: {size_words(graph)}", err=quiet)
-    bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, name).formula, hz)
+        stream.write(automaton_text.encode())
+    show(f"wrote {path}: {size_words(dfa)}", err=quiet)
+    bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, spec_name).formula, hz)
     if bounds:
         show(bounds, err=quiet)
 
 
-def _print_automata(specification: Specification, names: Sequence[str], hz: float | None) -> None:
+def _print_automata(specification: Specification, spec_names: Sequence[str], hz: float | None) -> None:
     from spatial_replay.automata.automaton import words_text
     from spatial_replay.automata.compile import automaton, chosen_spec
     from spatial_replay.automata.ltlf import bounds_in_samples
 
     faults = []
-    for name in names:
+    for spec_name in spec_names:
         try:
-            text = words_text(automaton(specification, name, rate_hz=hz))
-            bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, name).formula, hz)
-            show("", *text.split("\n"), *([bounds] if bounds else []))
+            automaton_text = words_text(automaton(specification, spec_name, rate_hz=hz))
+            bounds = (
+                "" if hz is None else bounds_in_samples(chosen_spec(specification, spec_name).formula, hz)
+            )
+            show("", *automaton_text.split("\n"), *([bounds] if bounds else []))
         except NoAutomatonError as error:
             faults.append(str(error))
     if faults:
@@ -546,7 +548,7 @@ def doctor(
     return ExitCode.VIOLATED if examination.findings else ExitCode.SATISFIED
 
 
-def _write(found: Examination, output: Path, inputs: list[Path]) -> dict[tuple[str, str], Path]:
+def _write(examination: Examination, output: Path, inputs: list[Path]) -> dict[tuple[str, str], Path]:
     """Write the samples of all examples; return the files."""
     from spatial_replay.logs.output_file import replacing
 
@@ -555,15 +557,15 @@ def _write(found: Examination, output: Path, inputs: list[Path]) -> dict[tuple[s
     except OSError as error:
         raise OutputError(f"{output}: cannot be made: {error.strerror}; choose another folder") from error
     files: dict[tuple[str, str], Path] = {}
-    stems: Counter[str] = Counter()
-    for spec in found.specs:
-        stem = _UNSAFE.sub("-", spec.name).strip("-") or "spec"
-        stems[stem] += 1
-        if stems[stem] > 1:
-            stem += f"-{stems[stem]}"
+    stem_counts: Counter[str] = Counter()
+    for spec in examination.specs:
+        file_stem = _UNSAFE.sub("-", spec.name).strip("-") or "spec"
+        stem_counts[file_stem] += 1
+        if stem_counts[file_stem] > 1:
+            file_stem += f"-{stem_counts[file_stem]}"
         for example in (spec.satisfied, spec.violated):
             if example is not None and example.samples is not None:
-                path = output / f"{stem}.{example.verdict}.jsonl"
+                path = output / f"{file_stem}.{example.verdict}.jsonl"
                 with replacing(path, inputs) as stream:
                     stream.write(example.jsonl.encode())
                 files[spec.name, example.verdict] = path

@@ -100,18 +100,18 @@ def clip(
     return ExitCode.DAMAGED if clip.whole.faults else ExitCode.SATISFIED
 
 
-def _summary(found: Clip) -> str:
-    first_ns = found.whole.first_ns
-    if found.is_whole:
+def _summary(cut: Clip) -> str:
+    first_ns = cut.whole.first_ns
+    if cut.is_whole:
         return "  nothing smaller has these verdicts and witnesses: the clip holds every sample of the log"
-    window = " to ".join(time_text(at, first_ns) for at in (found.start_ns, found.end_ns))
-    size = f"{found.clip_bytes:,} bytes"
-    if found.source_bytes and found.clip_bytes >= found.source_bytes:
-        size += f"; the log itself, {found.source_bytes:,} bytes, is smaller than its schemas and annotations"
-    elif found.source_bytes:
-        size += f", {found.clip_bytes / found.source_bytes:.2%} of the log's {found.source_bytes:,}"
-    samples = f"{found.replayed.samples:,} of {plural(found.whole.samples, 'sample')}"
-    return f"  {', '.join(found.kept)}: {samples}, {window} of the log; {size}"
+    window_text = " to ".join(time_text(at, first_ns) for at in (cut.start_ns, cut.end_ns))
+    size = f"{cut.clip_bytes:,} bytes"
+    if cut.source_bytes and cut.clip_bytes >= cut.source_bytes:
+        size += f"; the log itself, {cut.source_bytes:,} bytes, is smaller than its schemas and annotations"
+    elif cut.source_bytes:
+        size += f", {cut.clip_bytes / cut.source_bytes:.2%} of the log's {cut.source_bytes:,}"
+    samples_text = f"{cut.replayed.samples:,} of {plural(cut.whole.samples, 'sample')}"
+    return f"  {', '.join(cut.kept)}: {samples_text}, {window_text} of the log; {size}"
 
 
 _MOST_LISTED = 20
@@ -146,40 +146,40 @@ def recover(log: LogFile, output: Path) -> int:
 
 
 def _lines(recovery: Recovery, output: Path) -> Iterator[str]:
-    topics = sum(count > 0 for count in recovery.saved.values())
-    saved = f"{plural(recovery.messages, 'message')} on {plural(topics, 'topic')}"
+    topic_count = sum(count > 0 for count in recovery.saved.values())
+    saved_text = f"{plural(recovery.messages, 'message')} on {plural(topic_count, 'topic')}"
     if recovery.is_whole:
-        yield f"{recovery.name}: nothing is missing; {output.name} holds {saved}"
+        yield f"{recovery.name}: nothing is missing; {output.name} holds {saved_text}"
         return
-    yield f"{recovery.name}: {saved} saved in {output.name}; {recovery.losses}"
+    yield f"{recovery.name}: {saved_text} saved in {output.name}; {recovery.losses}"
     yield from _entry_lines("time", (_span(*span, recovery) for span in recovery.spans))
     yield from _entry_lines("samples", (_gap(gap, recovery.start_ns) for gap in recovery.samples))
-    counts = ((topic, missing + recovery.saved[topic]) for topic, missing in recovery.missing.items())
+    totals = ((topic, missing + recovery.saved[topic]) for topic, missing in recovery.missing.items())
     yield from _entry_lines(
         "topic",
-        (f"{topic}: {recovery.missing[topic]:,} of {plural(all_, 'message')}" for topic, all_ in counts),
+        (f"{topic}: {recovery.missing[topic]:,} of {plural(total, 'message')}" for topic, total in totals),
     )
 
 
-def _entry_lines(what: str, entries: Iterable[str]) -> Iterator[str]:
+def _entry_lines(label: str, entries: Iterable[str]) -> Iterator[str]:
     lines = list(entries)
-    yield from (f"  {what:<8} {entry}" for entry in lines[:_MOST_LISTED])
+    yield from (f"  {label:<8} {entry}" for entry in lines[:_MOST_LISTED])
     if len(lines) > _MOST_LISTED:
-        yield f"  {what:<8} and {len(lines) - _MOST_LISTED:,} more, in the metadata of the output"
+        yield f"  {label:<8} and {len(lines) - _MOST_LISTED:,} more, in the metadata of the output"
 
 
 def _span(start_ns: int, end_ns: int, recovery: Recovery) -> str:
-    start, end = (time_text(at, recovery.start_ns) for at in (start_ns, end_ns))
+    start, end = (time_text(time_ns, recovery.start_ns) for time_ns in (start_ns, end_ns))
     if start_ns >= recovery.end_ns:
         return f"from {start} on"
     return f"at {start}" if start_ns == end_ns else f"{start} to {end}"
 
 
 def _gap(gap: SampleGap, first_ns: int) -> str:
-    numbers = f"{gap.first} to {gap.last}" if gap.last > gap.first else str(gap.first)
+    sample_numbers = f"{gap.first} to {gap.last}" if gap.last > gap.first else str(gap.first)
     sides = (("after", gap.after_ns), ("before", gap.before_ns))
-    bounds = " and ".join(f"{word} {time_text(at, first_ns)}" for word, at in sides if at is not None)
-    return f"{numbers}, {bounds}" if bounds else numbers
+    time_bounds = " and ".join(f"{word} {time_text(at, first_ns)}" for word, at in sides if at is not None)
+    return f"{sample_numbers}, {time_bounds}" if time_bounds else sample_numbers
 
 
 @click.command()
@@ -262,40 +262,40 @@ def verify(
         options = ReadOptions(**reading).non_defaults()
         original = open_source(source, **{**reading, **recorded_reading(annotated, source.name), **options})
     with progress("samples") as advance:
-        verified = verify_certificate(annotated, original, advance, explain=explain)
-    faults = list(verified.faults)
-    differences = [f"{log.name}: {difference}" for difference in verified.differences]
-    if verified.recorded and not differences:
+        verification = verify_certificate(annotated, original, advance, explain=explain)
+    faults = list(verification.faults)
+    differences = [f"{log.name}: {difference}" for difference in verification.differences]
+    if verification.recorded and not differences:
         show(f"{log.name}: samples, messages, specifications and results match")
-        show(*(f"{log.name}: {note}" for note in verified.notes if not decisions))
+        show(*(f"{log.name}: {note}" for note in verification.notes if not decisions))
     if decisions:
-        planned = annotated if original is None else original
+        plan_log = annotated if original is None else original
         with progress("samples") as advance:
-            recomputed = recompute_decisions(planned, advance)
-        faults += counted_from(recomputed.faults, known_zero_ns(planned) if recomputed.faults else 0)
-        differences += [f"{planned.name}: {difference}" for difference in recomputed.differences]
+            recomputed = recompute_decisions(plan_log, advance)
+        faults += counted_from(recomputed.faults, known_zero_ns(plan_log) if recomputed.faults else 0)
+        differences += [f"{plan_log.name}: {difference}" for difference in recomputed.differences]
         if not recomputed.differences:
             show(
-                f"{planned.name}: {plural(recomputed.decisions, 'decision')} recomputed with "
+                f"{plan_log.name}: {plural(recomputed.decisions, 'decision')} recomputed with "
                 f"{plural(recomputed.maps, 'map')}, all match"
             )
     warn(*dict.fromkeys(faults))
     for difference in differences:
         show(difference)
-    show(*(f"  {line}" for line in verified.explanation))
-    if signer is not None and verified.recorded:
-        signed_by = signer_of(verified.recorded, signature, signer)
-        if signed_by is None:
+    show(*(f"  {line}" for line in verification.explanation))
+    if signer is not None and verification.recorded:
+        signer_name = signer_of(verification.recorded, signature, signer)
+        if signer_name is None:
             differences.append("the signature")
             show(
                 f"{log.name}: {signature.name} is no signature of its certificate by anyone in {signer.name}"
             )
         else:
-            show(f"{log.name}: its certificate is signed by {signed_by}")
+            show(f"{log.name}: its certificate is signed by {signer_name}")
     if sign is not None and differences:
         warn(f"{log.name} was not signed, because its certificate does not match")
     elif sign is not None:
         with replacing(signature, local_files([log, sign])) as stream:
-            stream.write(sign_certificate(verified.recorded, sign))
+            stream.write(sign_certificate(verification.recorded, sign))
         show(f"{log.name}: signed in {signature}")
     return ExitCode.VIOLATED if differences else ExitCode.SATISFIED

@@ -20,7 +20,7 @@ def completion(context: click.Context, shell: str) -> None:
     Example, for the current shell (add it to ~/.bashrc to keep it):
       eval "$(spatial-replay completion bash)"
     """
-    kind = get_completion_class(shell)
-    if kind is None:
+    completion_class = get_completion_class(shell)
+    if completion_class is None:
         raise UsageError(f"no completion for {shell!r}; choose bash, zsh or fish")
-    show_file(kind(context.find_root().command, {}, PROGRAM, COMPLETION_VARIABLE).source())
+    show_file(completion_class(context.find_root().command, {}, PROGRAM, COMPLETION_VARIABLE).source())

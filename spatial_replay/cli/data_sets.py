@@ -55,8 +55,8 @@ def show_episode(data_set: DataSet, number: int, as_json: bool) -> int:
     episode, features = data_set.episode(number), mappable_features(data_set)
     columns = data_set.columns(number, _any_rate(data_set), [feature.name for feature in features])
     name = f"{data_set.name}#{number}"
-    unjudged = [columns.unjudged] if columns.unjudged else []
-    warn(*(f"{name}: {text}" for text in (*columns.faults, *columns.remarks, *unjudged)))
+    unjudged_reasons = [columns.unjudged] if columns.unjudged else []
+    warn(*(f"{name}: {text}" for text in (*columns.faults, *columns.remarks, *unjudged_reasons)))
 
     def document() -> dict[str, Any]:
         return {
@@ -82,26 +82,26 @@ def _episode_lines(
     data_set: DataSet, number: int, columns: EpisodeColumns, features: Sequence[Feature]
 ) -> Iterator[str]:
     episode = data_set.episode(number)
-    length = f" in {_seconds(columns):.3f} s" if data_set.fps else ""
-    frames = plural(len(columns.times_ns), "frame")
-    yield f"{data_set.name}#{number}: {data_set.kind} episode, {frames}{length}"
+    length_text = f" in {_seconds(columns):.3f} s" if data_set.fps else ""
+    frames_text = plural(len(columns.times_ns), "frame")
+    yield f"{data_set.name}#{number}: {data_set.kind} episode, {frames_text}{length_text}"
     if episode.task:
         yield f"task     {printable(episode.task)}"
     if columns.label is not None:
         yield f"label    {_label_text(data_set, columns)}"
     for feature in features:
         yield printable(feature.name)
-        ranges = list(_ranges(feature, columns))
+        range_rows = list(_ranges(feature, columns))
         yield from align_rows(
             (
                 row["place"],
                 f"first {row['first']:.4g}",
                 f"from {row['least']:.4g} to {row['greatest']:.4g}",
             )
-            for row in ranges[:_MOST_PLACES]
+            for row in range_rows[:_MOST_PLACES]
         )
-        if len(ranges) > _MOST_PLACES:
-            yield f"  … and {len(ranges) - _MOST_PLACES:,} more; --json prints all"
+        if len(range_rows) > _MOST_PLACES:
+            yield f"  … and {len(range_rows) - _MOST_PLACES:,} more; --json prints all"
 
 
 def _seconds(columns: EpisodeColumns) -> float:
@@ -126,8 +126,8 @@ def _read_labels(data_set: DataSet) -> list[bool | None]:
         for episode in episodes:
             address = f"{data_set.name}#{episode.number}"
             try:
-                success = data_set.success(episode.number)
-                labels.append(None if success is None else bool(success.any()))
+                success_flags = data_set.success(episode.number)
+                labels.append(None if success_flags is None else bool(success_flags.any()))
             except LogError as error:
                 reason = str(error).removeprefix(f"{address}: ")
                 numbers_by_error.setdefault(without_numbers(reason), [reason]).append(f"#{episode.number}")
@@ -188,53 +188,53 @@ def _lines(
 ) -> Iterator[str]:
     from spatial_replay.mapping.suggest_features import mappable_features, places_text, why_poseless
 
-    frames = [episode.frames for episode in data_set.episodes]
-    total = plural(sum(map(int, filter(None, frames))), "frame") if None not in frames else ""
-    rate = f"at {data_set.fps:g} Hz" if data_set.fps else ""
+    frame_counts = [episode.frames for episode in data_set.episodes]
+    total = plural(sum(map(int, filter(None, frame_counts))), "frame") if None not in frame_counts else ""
+    rate_text = f"at {data_set.fps:g} Hz" if data_set.fps else ""
     facts = [
         data_set.kind,
         plural(len(data_set.episodes), "episode"),
-        " ".join(filter(None, (total, rate))),
+        " ".join(filter(None, (total, rate_text))),
         f"robot {data_set.robot}" if data_set.robot else "",
     ]
     yield f"{data_set.name}: {', '.join(filter(None, facts))}"
     if not data_set.fps and not data_set.has_times:
         yield "rate     not in the data set: a mapping says it, such as `fps: 20`"
-    tasks = Counter(printable(episode.task) for episode in data_set.episodes if episode.task)
-    if tasks:
-        texts = [f"{task} ({count:,})" for task, count in tasks.most_common(_MOST_TASKS)]
-        more = f", and {len(tasks) - _MOST_TASKS:,} more" if len(tasks) > _MOST_TASKS else ""
-        yield f"tasks    {', '.join(texts)}{more}"
+    task_counts = Counter(printable(episode.task) for episode in data_set.episodes if episode.task)
+    if task_counts:
+        task_texts = [f"{task} ({count:,})" for task, count in task_counts.most_common(_MOST_TASKS)]
+        more_text = f", and {len(task_counts) - _MOST_TASKS:,} more" if len(task_counts) > _MOST_TASKS else ""
+        yield f"tasks    {', '.join(task_texts)}{more_text}"
     yield f"label    {_labels_text(data_set, labels)}"
     if bodies:
         yield f"objects  {', '.join(_body_text(body) for body in bodies)}"
     features = mappable_features(data_set)
     for number, line in enumerate(align_rows((feature.name, places_text(feature)) for feature in features)):
         yield f"{'features' if number == 0 else '':8} {line.strip()}"
-    pictures = [feature.name for feature in data_set.features if not feature.width]
-    if pictures:
-        yield f"pictures {printable(', '.join(pictures), 400)}"
+    picture_names = [feature.name for feature in data_set.features if not feature.width]
+    if picture_names:
+        yield f"pictures {printable(', '.join(picture_names), 400)}"
     if not data_set.episodes or why_poseless(data_set):
         return
     if not data_set.names_bodies:
         yield "a mapping says which of these are objects: --suggest-mapping"
     elif bodies:
         has_times = data_set.fps or data_set.has_times
-        rest = ", so it needs no mapping" if has_times else "; a mapping with `fps:` is enough"
-        yield f"it names its objects{rest}"
-    first = f"{shlex.quote(str(data_set.path))}#{data_set.episodes[0].number}"
-    yield f"each episode is a log: spatial-replay info {first}"
+        mapping_hint = ", so it needs no mapping" if has_times else "; a mapping with `fps:` is enough"
+        yield f"it names its objects{mapping_hint}"
+    first_address = f"{shlex.quote(str(data_set.path))}#{data_set.episodes[0].number}"
+    yield f"each episode is a log: spatial-replay info {first_address}"
 
 
 def _labels_text(data_set: DataSet, labels: Sequence[bool | None]) -> str:
     """Return a text with the number of labelled successes, and the state that a label describes."""
     if data_set.label is None:
         return "none; `label: FIELD` in a mapping names one"
-    about = "; it is about the state after each frame's action" if data_set.label.is_about_next else ""
-    first = "the first " if len(labels) < len(data_set.episodes) else ""
-    unlabelled = f" ({labels.count(None):,} without a label)" if None in labels else ""
-    count = f"true in {labels.count(True):,} of {first}{plural(len(labels), 'episode')}{unlabelled}"
-    return f"{data_set.label.field}: {count}{about}"
+    state_note = "; it is about the state after each frame's action" if data_set.label.is_about_next else ""
+    scope = "the first " if len(labels) < len(data_set.episodes) else ""
+    unlabelled_text = f" ({labels.count(None):,} without a label)" if None in labels else ""
+    count_text = f"true in {labels.count(True):,} of {scope}{plural(len(labels), 'episode')}{unlabelled_text}"
+    return f"{data_set.label.field}: {count_text}{state_note}"
 
 
 def _body_text(body: dict[str, Any]) -> str:
@@ -245,21 +245,21 @@ def _label_text(data_set: DataSet, columns: EpisodeColumns) -> str:
     field = data_set.label.field if data_set.label else "label"
     if columns.success is None or columns.success.ndim == 0 or not columns.label:
         return f"{field}: {str(columns.label).lower()}"
-    first = int(columns.success.argmax())
-    return f"{field}: true in {plural(int(columns.success.sum()), 'frame')}, first in frame {first}"
+    first_frame = int(columns.success.argmax())
+    return f"{field}: true in {plural(int(columns.success.sum()), 'frame')}, first in frame {first_frame}"
 
 
 def _ranges(feature: Feature, columns: EpisodeColumns) -> Iterator[dict[str, Any]]:
     """Yield the first, least and greatest number in each place of a feature; null if no number is finite."""
     if feature.name not in columns.features:
         return
-    rows = columns.features[feature.name].reshape(len(columns.times_ns), -1)
-    for index, column in enumerate(rows.T):
-        numbers = column[np.isfinite(column)]
+    frame_rows = columns.features[feature.name].reshape(len(columns.times_ns), -1)
+    for index, column in enumerate(frame_rows.T):
+        finite_numbers = column[np.isfinite(column)]
         place = feature.places[index] if feature.places else f"[{index}]"
         yield {
             "place": place,
             "first": json_number(float(column[0])) if len(column) else None,
-            "least": float(numbers.min()) if len(numbers) else None,
-            "greatest": float(numbers.max()) if len(numbers) else None,
+            "least": float(finite_numbers.min()) if len(finite_numbers) else None,
+            "greatest": float(finite_numbers.max()) if len(finite_numbers) else None,
         }

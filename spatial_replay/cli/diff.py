@@ -117,23 +117,23 @@ def _log(text: str) -> LogFile:
 
 
 def _for_log(conditions: ConditionArguments, log: str) -> EvaluationArguments:
-    values = {field.name: getattr(conditions, field.name) for field in fields(ConditionArguments)}
-    return EvaluationArguments(**values, log=_log(log))
+    condition_values = {field.name: getattr(conditions, field.name) for field in fields(ConditionArguments)}
+    return EvaluationArguments(**condition_values, log=_log(log))
 
 
 def _are_many(logs: Sequence[str], specs: Sequence[LogFile]) -> bool:
     """Return whether two specifications are compared over several logs, a folder, or a pattern."""
     if len(specs) != 2:
         return False
-    (log, *others), path = logs, Path(logs[0])
+    (log, *other_logs), path = logs, Path(logs[0])
     is_folder = (
         log.endswith("/") if is_address(log) else path.is_dir() and not (path / BAG_METADATA).is_file()
     )
-    return bool(others) or is_folder or (has_magic(log) and not path.exists())
+    return bool(other_logs) or is_folder or (has_magic(log) and not path.exists())
 
 
 def _over_logs(
-    logs: Sequence[str], given: ConditionArguments, as_json: bool, semantics: Semantics
+    logs: Sequence[str], arguments: ConditionArguments, as_json: bool, semantics: Semantics
 ) -> ExitCode:
     """Show the verdicts that an edit flips over many logs."""
     from tempfile import TemporaryDirectory
@@ -146,22 +146,22 @@ def _over_logs(
     from spatial_replay.batch.suite import Conditions, Suite
     from spatial_replay.cli.batch import code_of_errors, explain_table_rows, warn_of_damage, warn_of_names
 
-    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names")}
-    objects = objects_by_parameter(given.choices)
+    condition_values = {name: getattr(arguments, name) for name in ("start", "end", "every", "strict_names")}
+    objects = objects_by_parameter(arguments.choices)
     conditions = Conditions.from_tables(
-        given.reading, objects, given.constants, semantics=semantics, **others
+        arguments.reading, objects, arguments.constants, semantics=semantics, **condition_values
     )
-    cases = prepare(Suite.of_logs(logs, [sendable(spec) for spec in given.specs], conditions), progress)
+    cases = prepare(Suite.of_logs(logs, [sendable(spec) for spec in arguments.specs], conditions), progress)
     old, new = cases[0].files
     show_diagnostics({str(warning): warning for file in (old, new) for warning in file.warnings}.values())
     workers = workers_of(min(os.cpu_count() or 1, len(cases[0].logs)))
     with TemporaryDirectory() as folder:
         table = run_batch(cases, folder, workers, progress=progress).table
-    before, now = (table.filter(pc.equal(table["file"], file.name)) for file in (old, new))
-    flips = diff_runs(before, now, names=(old.name, new.name), explain=explain_table_rows)
-    paths = {log.name: log.path for log in cases[0].logs}
+    old_rows, new_rows = (table.filter(pc.equal(table["file"], file.name)) for file in (old, new))
+    flips = diff_runs(old_rows, new_rows, names=(old.name, new.name), explain=explain_table_rows)
+    paths_by_log = {log.name: log.path for log in cases[0].logs}
     specifications = parsed_specifications((old.text, new.text), conditions)
-    causes = list(_causes(flips, paths, given, specifications, semantics))
+    causes = list(_causes(flips, paths_by_log, arguments, specifications, semantics))
     if as_json:
         documents = [{"log": log, **spec.document} for log, _, spec in causes]
         show_json({"old": old.name, "new": new.name, **flips.document, "causes": documents})
@@ -182,7 +182,7 @@ def _over_logs(
 def _causes(
     flips: RunDiff,
     paths: Mapping[str, str],
-    given: ConditionArguments,
+    arguments: ConditionArguments,
     specifications: Sequence[Specification],
     semantics: Semantics,
 ) -> Iterator[tuple[str, int, SpecDiff]]:
@@ -195,12 +195,12 @@ def _causes(
     from spatial_replay.compare.specifications import diff_over_source
 
     old, new = specifications
-    firsts: dict[str, Difference] = {}
+    first_flips: dict[str, Difference] = {}
     for change in flips.flipped:
         if None not in (change.difference.before, change.difference.now):
-            firsts.setdefault(change.difference.spec, change.difference)
-    for result in list(firsts.values())[:_MOST_CAUSES]:
-        inputs = open_inputs(_for_log(given, paths[result.log]), known=specifications)
+            first_flips.setdefault(change.difference.spec, change.difference)
+    for result in list(first_flips.values())[:_MOST_CAUSES]:
+        inputs = open_inputs(_for_log(arguments, paths[result.log]), known=specifications)
         difference = diff_over_source(inputs.source, old, new, inputs.options(semantics))
         for spec in difference.specs:
             if (spec.name, spec.new.object) == (result.spec, result.object):
@@ -223,11 +223,11 @@ def _of_specifications(
     if len(request.specs) == 1:
         if not recorded_texts(inputs.source):
             raise UsageError(f"{inputs.source.name} holds no specification of its own; give --spec OLD, too")
-        recorded = open_inputs(replace(request, specs=()))
-        if len(recorded.files) != 1:
-            names = ", ".join(file.filename for file in recorded.files)
-            raise UsageError(f"{inputs.source.name} has several specifications: {names}; give OLD, too")
-        files.insert(0, recorded.files[0])
+        recorded_inputs = open_inputs(replace(request, specs=()))
+        if len(recorded_inputs.files) != 1:
+            filenames = ", ".join(file.filename for file in recorded_inputs.files)
+            raise UsageError(f"{inputs.source.name} has several specifications: {filenames}; give OLD, too")
+        files.insert(0, recorded_inputs.files[0])
     options = inputs.options(semantics)
     with progress("samples") as advance:
         difference = diff_over_source(inputs.source, files[0], files[-1], options, advance=advance)
@@ -238,23 +238,25 @@ def _of_specifications(
 
 
 def _of_logs(
-    request: EvaluationArguments, other: LogFile, align: str, output: Path | None, semantics: Semantics
+    request: EvaluationArguments, second_log: LogFile, align: str, output: Path | None, semantics: Semantics
 ) -> LogDiff:
     from spatial_replay.compare.runs import diff_sources
     from spatial_replay.report.write import write_comparison
 
-    first = open_inputs(request, can_do_without=True)
-    second = open_inputs(replace(request, log=other), known=first.files, can_do_without=True)
-    sources, files = (first.source, second.source), first.files or second.files
-    options = first.options(semantics), second.options(semantics)
+    first_inputs = open_inputs(request, can_do_without=True)
+    second_inputs = open_inputs(
+        replace(request, log=second_log), known=first_inputs.files, can_do_without=True
+    )
+    sources, files = (first_inputs.source, second_inputs.source), first_inputs.files or second_inputs.files
+    options = first_inputs.options(semantics), second_inputs.options(semantics)
     with progress("samples") as advance:
         difference = diff_sources(sources, files, options, align=align, advance=advance)
         if output is not None:
             sides = (sources[0], files, options[0]), (sources[1], files, options[1])
-            write_comparison(difference, sides, output, inputs=_inputs(request, other), advance=advance)
+            write_comparison(difference, sides, output, inputs=_inputs(request, second_log), advance=advance)
     return difference
 
 
-def _inputs(request: EvaluationArguments, other: LogFile | None) -> Sequence[Path]:
+def _inputs(request: EvaluationArguments, second_log: LogFile | None) -> Sequence[Path]:
     """Return the input files."""
-    return request.inputs if other is None else (*request.inputs, *local_files([other]))
+    return request.inputs if second_log is None else (*request.inputs, *local_files([second_log]))

@@ -34,21 +34,21 @@ def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]
         if doubt.topic == topic:
             mark = "accepted" if doubt.is_accepted else "DOUBTFUL"
             yield mark, f"{doubt.assumption}: {doubt.text.removeprefix(f'{topic}: ')}"
-    beginning = f"{overview.name}: {topic}: "
+    prefix = f"{overview.name}: {topic}: "
     for remark in counted_from(overview.remarks, overview.start_ns or 0):
-        if remark.startswith(beginning):
-            yield "REMARK", remark.removeprefix(beginning)
+        if remark.startswith(prefix):
+            yield "REMARK", remark.removeprefix(prefix)
 
 
 def _arrivals(facts: TopicFacts, first_ns: int) -> str:
-    messages, period = plural(facts.messages, "message"), facts.period_s
-    if facts.first_ns is None or facts.last_ns is None or period is None:
-        return messages
-    span = f"from {time_text(facts.first_ns, first_ns)} to {time_text(facts.last_ns, first_ns)}"
-    is_pause = period.greatest > _LONG_PAUSE * period.median and period.greatest_ns is not None
-    until = f", until {time_text(period.greatest_ns or 0, first_ns)}" if is_pause else ""
-    most = f"at most {number_text(period.greatest)} s apart{until}"
-    return f"{messages} {span}, every {number_text(period.median)} s, {most}"
+    messages_text, period_s = plural(facts.messages, "message"), facts.period_s
+    if facts.first_ns is None or facts.last_ns is None or period_s is None:
+        return messages_text
+    span_text = f"from {time_text(facts.first_ns, first_ns)} to {time_text(facts.last_ns, first_ns)}"
+    is_pause = period_s.greatest > _LONG_PAUSE * period_s.median and period_s.greatest_ns is not None
+    pause_end = f", until {time_text(period_s.greatest_ns or 0, first_ns)}" if is_pause else ""
+    longest_text = f"at most {number_text(period_s.greatest)} s apart{pause_end}"
+    return f"{messages_text} {span_text}, every {number_text(period_s.median)} s, {longest_text}"
 
 
 def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, str]]:
@@ -60,17 +60,17 @@ def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, st
     yield "signals", listing(facts.signals)
     if not facts.objects:
         return
-    count = plural(len(facts.names), "name")
+    names_text = plural(len(facts.names), "name")
     pattern = f"`{facts.name}`, " if facts.name else ""
-    yield "names", f"{pattern}{count}, up to {facts.most_at_once} at once: {listing(facts.names)}"
-    changes = f"; {plural(facts.class_changes, 'change')} of class" if facts.class_changes else ""
-    yield "classes", listing([name or "none" for name in facts.classes]) + changes
+    yield "names", f"{pattern}{names_text}, up to {facts.most_at_once} at once: {listing(facts.names)}"
+    changes_text = f"; {plural(facts.class_changes, 'change')} of class" if facts.class_changes else ""
+    yield "classes", listing([name or "none" for name in facts.classes]) + changes_text
     if facts.size is not None and facts.shorter_side is not None:
         yield "sizes", f"longer side {_range(facts.size, unit)}; shorter {_range(facts.shorter_side, unit)}"
-    spans = zip(_AXES, facts.low, facts.high, strict=False)
+    axis_ranges = zip(_AXES, facts.low, facts.high, strict=False)
     yield (
         "places",
-        ", ".join(f"{axis} {number_text(low)} to {number_text(high)}" for axis, low, high in spans),
+        ", ".join(f"{axis} {number_text(low)} to {number_text(high)}" for axis, low, high in axis_ranges),
     )
     if facts.speed is not None:
         yield "speed", _motion(facts.speed, f"{unit}/s" if unit else "a second", first_ns)
@@ -85,12 +85,12 @@ def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, st
 
 
 def _range(numbers: Distribution, unit: str) -> str:
-    least, greatest = number_text(numbers.least), with_unit(numbers.greatest, unit)
-    if least == number_text(numbers.greatest):
-        return f"always {greatest}"
-    return f"{least} to {greatest} (median {number_text(numbers.median)})"
+    least_text, greatest_text = number_text(numbers.least), with_unit(numbers.greatest, unit)
+    if least_text == number_text(numbers.greatest):
+        return f"always {greatest_text}"
+    return f"{least_text} to {greatest_text} (median {number_text(numbers.median)})"
 
 
 def _motion(numbers: Distribution, unit: str, first_ns: int) -> str:
-    when = "" if numbers.greatest_ns is None else f" at {time_text(numbers.greatest_ns, first_ns)}"
-    return f"median {with_unit(numbers.median, unit)}, at most {with_unit(numbers.greatest, unit)}{when}"
+    at_text = "" if numbers.greatest_ns is None else f" at {time_text(numbers.greatest_ns, first_ns)}"
+    return f"median {with_unit(numbers.median, unit)}, at most {with_unit(numbers.greatest, unit)}{at_text}"

@@ -117,7 +117,7 @@ def info(
       spatial-replay info annotated.mcap --blueprint -o run.rrd
       spatial-replay info --panel
     """
-    contents = {
+    options = {
         "--suggest-mapping": suggest_mapping,
         "--fit": fit,
         "--decisions": decisions is not None,
@@ -126,11 +126,11 @@ def info(
         "--blueprint": blueprint,
         "--panel": panel,
     }
-    names = [name for name, is_given in contents.items() if is_given]
-    if len(names) > 1:
-        raise UsageError(f"{' and '.join(names)} print different things; give one of them")
-    if as_json and names and decisions is None:
-        raise UsageError(f"{names[0]} prints no JSON; remove --json")
+    given_options = [name for name, is_given in options.items() if is_given]
+    if len(given_options) > 1:
+        raise UsageError(f"{' and '.join(given_options)} print different things; give one of them")
+    if as_json and given_options and decisions is None:
+        raise UsageError(f"{given_options[0]} prints no JSON; remove --json")
     if decisions and not decisions.isdecimal():
         raise UsageError(
             f"--decisions takes the number of a decision, not {decisions!r}; name the log before it"
@@ -152,7 +152,7 @@ def info(
     if blueprint:
         return _write_blueprint(log, output)
     with printing_to(output, input_files(log, reading=reading)):
-        code = _print_data_set(log, as_json, suggest_mapping, names, reading)
+        code = _print_data_set(log, as_json, suggest_mapping, given_options, reading)
         if code is not None:
             return code
         if layout:
@@ -169,7 +169,7 @@ def info(
 
 
 def _print_data_set(
-    log: LogFile, as_json: bool, suggest_mapping: bool, contents: Sequence[str], reading: Reading
+    log: LogFile, as_json: bool, suggest_mapping: bool, given_options: Sequence[str], reading: Reading
 ) -> int | None:
     """Print the contents of a data set, or of an episode without a mapping; None for other logs.
 
@@ -181,7 +181,7 @@ def _print_data_set(
 
     if not isinstance(log, Path):
         return None
-    path, number = data_set_address(log) or (log, None)
+    path, episode_number = data_set_address(log) or (log, None)
     data_set = open_data_set(path)
     if data_set is None:
         return None
@@ -190,15 +190,15 @@ def _print_data_set(
 
         show_file(suggest_feature_mapping(data_set))
         return ExitCode.SATISFIED
-    if number is None:
-        if contents or reading.get("mapping") is not None:
-            first = data_set.episodes[0].number if data_set.episodes else 0
-            option = contents[0] if contents else "--mapping"
-            raise UsageError(f"{option} is about one episode; give its address: {path}#{first}")
+    if episode_number is None:
+        if given_options or reading.get("mapping") is not None:
+            first_number = data_set.episodes[0].number if data_set.episodes else 0
+            option = given_options[0] if given_options else "--mapping"
+            raise UsageError(f"{option} is about one episode; give its address: {path}#{first_number}")
         return show_data_set(data_set, as_json)
-    if contents or reading.get("mapping") is not None or data_set.names_bodies:
+    if given_options or reading.get("mapping") is not None or data_set.names_bodies:
         return None
-    return show_episode(data_set, number, as_json)
+    return show_episode(data_set, episode_number, as_json)
 
 
 def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
@@ -209,7 +209,7 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
     from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
     reader = messages_in(log)
-    surveyed, about, episode = None, {}, {}
+    surveyed, specs, episode_facts = None, {}, {}
     if reader is not None:
         with progress("messages") as advance:
             surveyed = survey(reader, advance)
@@ -220,19 +220,19 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
         with progress("samples") as advance:
             source = open_source(log, **reading)
             overview = overview_of(source, advance)
-        about, episode = _requirements(source), _episode_facts(source)
+        specs, episode_facts = _requirements(source), _episode_facts(source)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
     remarks = (*(surveyed.remarks if surveyed else ()), *overview.remarks)
     faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, remarks))
     warn(*dict.fromkeys((*faults, *remarks)))
 
     def lines() -> Iterator[str]:
-        first, *others = _lines(overview, surveyed, bool(faults), about)
-        yield first
-        yield from (f"{name:<8} {fact}" for name, fact in episode.items() if fact is not None)
-        yield from others
+        heading, *other_lines = _lines(overview, surveyed, bool(faults), specs)
+        yield heading
+        yield from (f"{name:<8} {fact}" for name, fact in episode_facts.items() if fact is not None)
+        yield from other_lines
 
-    show_result(lambda: {**_document(overview, surveyed, faults, about), **episode}, lines, as_json)
+    show_result(lambda: {**_document(overview, surveyed, faults, specs), **episode_facts}, lines, as_json)
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
@@ -269,12 +269,12 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import Regularity, fitness_of
 
-    def rows(found: Mapping[str, Regularity]) -> Iterator[str]:
-        for name, regularity in found.items():
+    def rows(regularities: Mapping[str, Regularity]) -> Iterator[str]:
+        for name, regularity in regularities.items():
             # a message that comes once, such as a map, has no rate
             rate, max_gap = regularity.rate, regularity.max_gap
-            regular = f"rate: {rate:g}, max_gap: {max_gap:g}s" if rate else ""
-            yield f"{name}: {{{regular}}}  # {regularity.count:,}"
+            rate_text = f"rate: {rate:g}, max_gap: {max_gap:g}s" if rate else ""
+            yield f"{name}: {{{rate_text}}}  # {regularity.count:,}"
 
     with progress("messages"):
         fitness = fitness_of(log, open_source(log, **reading))
@@ -314,10 +314,10 @@ def _write_blueprint(log: LogFile, output: Path | None) -> int:
             f"Rerun reads files; download {source.name}, or write a blueprint alone with -o run.rbl"
         )
     rows = blueprint_rows(StandingUpdate.FromString(payload))
-    scenes = (
+    scene_updates = (
         SceneUpdate.FromString(payload) for batch, _ in source.iter_payloads(SCENE) for payload in batch
     )
-    write_blueprint(rows, Path(str(log)), output, scenes)
+    write_blueprint(rows, Path(str(log)), output, scene_updates)
     show(f"wrote {output}")
     return ExitCode.SATISFIED
 
@@ -332,10 +332,10 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
     source = open_source(log)
     for attachment in source.attachments():
         if attachment.name == LAYOUT:
-            text = attachment.data.decode("utf-8", "replace")
+            layout_json = attachment.data.decode("utf-8", "replace")
             if panels:
-                text = layout_text(with_panels(json.loads(text), planned_result(source)))
-            show_file(text)
+                layout_json = layout_text(with_panels(json.loads(layout_json), planned_result(source)))
+            show_file(layout_json)
             return ExitCode.SATISFIED
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
@@ -376,26 +376,26 @@ def _requirements(source: Source) -> dict[str, NamedSpec]:
     """Return the specs with requirements in a log, by the names of their results."""
     from spatial_replay.replay.engine import recorded_texts
 
-    files = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
-    names = [spec.name for _, specs in files for spec in specs]
+    specs_by_file = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
+    spec_names = [spec.name for _, specs in specs_by_file for spec in specs]
     specs_by_result: dict[str, NamedSpec] = {}
-    for stem, specs in files:
+    for stem, specs in specs_by_file:
         for spec in specs:
             if spec.id or spec.title:
-                name = f"{stem}.{spec.name}" if names.count(spec.name) > 1 else spec.name
+                name = f"{stem}.{spec.name}" if spec_names.count(spec.name) > 1 else spec.name
                 # logs of a recorder have the id before the name
                 specs_by_result |= {name: spec, f"{spec.id} {name}": spec}
     return specs_by_result
 
 
-def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
+def _verdicts(container: LogSummary, specs: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
     """Yield the verdicts stored in a log, each with its requirement."""
     from spatial_replay.logs.topics import VERDICTS
 
-    for data in (data for name, data in container.metadata if name == VERDICTS):
-        for result, verdict in data.items():
+    for verdicts in (verdicts for name, verdicts in container.metadata if name == VERDICTS):
+        for result, verdict in verdicts.items():
             # the result of a template has the object in its name: reach(cup)
-            spec = about.get(result) or about.get(result.partition("(")[0])
+            spec = specs.get(result) or specs.get(result.partition("(")[0])
             requirement, title = (None, None) if spec is None else (spec.id, spec.title)
             yield {"name": result, "verdict": verdict, "requirement": requirement, "title": title}
 
@@ -429,7 +429,7 @@ def _print_mapping(log: LogFile) -> int:
 
 
 def _document(
-    overview: Overview, survey: Survey | None, faults: tuple[str, ...], about: Mapping[str, NamedSpec]
+    overview: Overview, survey: Survey | None, faults: tuple[str, ...], specs: Mapping[str, NamedSpec]
 ) -> dict[str, object]:
     container = overview.container
     document: dict[str, object] = {
@@ -467,7 +467,7 @@ def _document(
     if overview.doubts or overview.facts:
         document["doubts"] = [json_doubt(doubt) for doubt in overview.doubts]
     if container is not None:
-        document["verdicts"] = list(_verdicts(container, about))
+        document["verdicts"] = list(_verdicts(container, specs))
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
         document["attachments"] = json_value(container.attachments)
     return document
@@ -480,30 +480,30 @@ def _declarations(axes: dict[str, object]) -> dict[str, object]:
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:
     """Return the numbers of messages of a topic's channels. Each publisher may have its own channel."""
-    counts: dict[tuple[str, str, str], list[int]] = {}
+    message_counts: dict[tuple[str, str, str], list[int]] = {}
     for summary in container.channels:
         channel = summary.channel
         schema = channel.schema.name if channel.schema is not None else ""
-        counts.setdefault((channel.topic, schema, channel.encoding), []).append(summary.messages)
-    return counts
+        message_counts.setdefault((channel.topic, schema, channel.encoding), []).append(summary.messages)
+    return message_counts
 
 
 def _lines(
-    overview: Overview, survey: Survey | None, damaged: bool, about: Mapping[str, NamedSpec]
+    overview: Overview, survey: Survey | None, is_damaged: bool, specs: Mapping[str, NamedSpec]
 ) -> Iterator[str]:
-    counts = plural(overview.samples, "sample")
+    count_text = plural(overview.samples, "sample")
     if survey is not None and not overview.samples:
-        counts = plural(survey.messages, "message")
-    yield f"{overview.name}: {overview.kind}, {counts}{', damaged' if damaged else ''}"
+        count_text = plural(survey.messages, "message")
+    yield f"{overview.name}: {overview.kind}, {count_text}{', damaged' if is_damaged else ''}"
     start_ns, end_ns = overview.start_ns, overview.end_ns
     if survey is not None and start_ns is None:
         start_ns, end_ns = survey.start_ns, survey.end_ns
     if start_ns is not None and end_ns is not None:
         yield f"time     {_clock(start_ns)} to {_clock(end_ns)} ({(end_ns - start_ns) / 1e9:.3f} s)"
-    if period := overview.period_ns / 1e9:
-        ahead = max(round(1.0 / period), 1)
-        looks = f"F[0, {ahead}] looks {ahead * period:.3g} s ahead"
-        yield f"rate     {1.0 / period:.4g} samples a second: {looks}"
+    if period_s := overview.period_ns / 1e9:
+        samples_ahead = max(round(1.0 / period_s), 1)
+        window_text = f"F[0, {samples_ahead}] looks {samples_ahead * period_s:.3g} s ahead"
+        yield f"rate     {1.0 / period_s:.4g} samples a second: {window_text}"
     if overview.samples:
         yield f"axes     {overview.axes}"
     if overview.objects:
@@ -520,36 +520,38 @@ def _lines(
     if overview.signals:
         yield f"signals  {', '.join(overview.signals)}"
     if survey is not None:
-        yield from _survey_lines(survey, mapped=bool(overview.samples))
+        yield from _survey_lines(survey, is_mapped=bool(overview.samples))
     if overview.facts:
         yield "evidence"
         yield from (f"  {line}" for line in evidence_lines(overview))
     if overview.container is not None:
-        yield from _container_lines(overview.container, about, topics=survey is None)
+        yield from _container_lines(overview.container, specs, lists_topics=survey is None)
 
 
-def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
+def _survey_lines(survey: Survey, *, is_mapped: bool) -> Iterator[str]:
     if survey.topics:
         yield "topics"
         yield from align_rows(
             (topic.topic.name, topic.topic.type, topic.topic.encoding, plural(topic.messages, "message"))
             for topic in survey.topics
         )
-    objects = [(f"{topic.topic.name}:", topic.entry) for topic in survey.topics if topic.entry]
-    if objects and not mapped:
+    mapping_entries = [(f"{topic.topic.name}:", topic.entry) for topic in survey.topics if topic.entry]
+    if mapping_entries and not is_mapped:
         yield "could map to objects"
-        yield from align_rows(objects)
+        yield from align_rows(mapping_entries)
         yield f"to write a first mapping: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
 
 
-def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, topics: bool) -> Iterator[str]:
+def _container_lines(
+    container: LogSummary, specs: Mapping[str, NamedSpec], *, lists_topics: bool
+) -> Iterator[str]:
     from spatial_replay.logs.topics import VERDICTS
 
-    if verdicts := list(_verdicts(container, about)):
+    if verdicts := list(_verdicts(container, specs)):
         kinds = [(verdict["verdict"] or "").split(",")[0] for verdict in verdicts]
         is_known = set(kinds) <= set(WORST_FIRST)
         # the log lists violations in the order of time, except logs of earlier versions; the sort keeps it
-        places = sorted(
+        worst_first = sorted(
             range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
         )
         yield f"verdicts: {counts_text(kinds)}" if is_known and len(kinds) > MANY else "verdicts"
@@ -559,25 +561,25 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
                 verdict["verdict"] or "",
                 requirement_text(verdict["requirement"], verdict["title"]),
             )
-            for verdict in (verdicts[place] for place in places)
+            for verdict in (verdicts[place] for place in worst_first)
         )
-    if topics:
+    if lists_topics:
         yield "topics"
         yield from align_rows(
             (
                 *names,
-                plural(sum(counts), "message"),
-                plural(len(counts), "publisher") if len(counts) > 1 else "",
+                plural(sum(message_counts), "message"),
+                plural(len(message_counts), "publisher") if len(message_counts) > 1 else "",
             )
-            for names, counts in _topics(container).items()
+            for names, message_counts in _topics(container).items()
         )
-    for name, data in container.metadata:
+    for name, entries in container.metadata:
         if name != VERDICTS:
             yield f"metadata {name}"
-            pairs = [(key, _shorten(value)) for key, value in list(data.items())[:_MOST_ENTRIES]]
-            yield from align_rows(pairs)
-            if len(data) > _MOST_ENTRIES:
-                yield f"  … and {len(data) - _MOST_ENTRIES:,} more; --json prints all"
+            entry_rows = [(key, _shorten(value)) for key, value in list(entries.items())[:_MOST_ENTRIES]]
+            yield from align_rows(entry_rows)
+            if len(entries) > _MOST_ENTRIES:
+                yield f"  … and {len(entries) - _MOST_ENTRIES:,} more; --json prints all"
     if container.attachments:
         yield "attachments"
         yield from align_rows(

@@ -174,28 +174,30 @@ def judge(
         for episodes in (logs, against)
         if episodes
     ]
-    prepared = [
+    preparations = [
         prepare_judgement(suite, file, result, progress, has_failures=failures is not None)
         for suite, file in zip(suites, (labels, None), strict=False)
     ]
-    cases = [part.case for part in prepared]
+    cases = [preparation.case for preparation in preparations]
     warnings = [warning for file in cases[0].files for warning in file.warnings]
     show_diagnostics({str(warning): warning for warning in warnings}.values())
-    inputs = [*inputs_of(suites[0]), *prepared[0].labels.files]
+    inputs = [*inputs_of(suites[0]), *preparations[0].labels.files]
     data_set = _check_outputs(outputs, inputs, [log.path for log in cases[0].logs])
-    folder = outputs.output or f"{prepared[0].name}.results"
+    folder = outputs.output or f"{preparations[0].name}.results"
     workers = workers_of(jobs or os.cpu_count() or 1)
     batch = evaluated_batch(cases, folder, workers)
-    for part in prepared:
-        batch = part.explain(batch, workers, allow, is_exported=outputs.need_reasons, progress=progress)
-    judgement = judge_batch(prepared, batch, allow, same_start)
-    runs = episode_stages(judgement, cases[0], progress) if stages else {}
+    for preparation in preparations:
+        batch = preparation.explain(
+            batch, workers, allow, is_exported=outputs.need_reasons, progress=progress
+        )
+    judgement = judge_batch(preparations, batch, allow, same_start)
+    stages_by_log = episode_stages(judgement, cases[0], progress) if stages else {}
     if stages:
-        judgement = with_stages(judgement, runs)
-    _write(judgement, outputs, inputs, workers, data_set, runs)
+        judgement = with_stages(judgement, stages_by_log)
+    _write(judgement, outputs, inputs, workers, data_set, stages_by_log)
     if outputs.json_file != "-":
-        files = [str(file) for file in (outputs.write_labels, outputs.annotate) if file is not None]
-        _print(judgement, [folder, *files], conditions)
+        written_files = [str(file) for file in (outputs.write_labels, outputs.annotate) if file is not None]
+        _print(judgement, [folder, *written_files], conditions)
     warn(*judgement.remarks, *judgement.batch.remarks)
     warn_of_names(judgement.batch.table)
     warn_of_damage(judgement.batch.table)
@@ -219,7 +221,7 @@ def _write(
     inputs: Sequence[Path],
     workers: Workers,
     data_set: Path | None,
-    runs: Mapping[str, Stages],
+    stages_by_log: Mapping[str, Stages],
 ) -> None:
     from spatial_replay.batch.pages import write_pages
     from spatial_replay.judging.writers import annotate_data_set, labelled_batch, write_labels
@@ -227,14 +229,14 @@ def _write(
     if outputs.write_labels is not None:
         write_labels(judgement, outputs.write_labels, inputs)
     if outputs.annotate is not None and data_set is not None:
-        annotate_data_set(judgement, data_set, outputs.annotate, runs)
+        annotate_data_set(judgement, data_set, outputs.annotate, stages_by_log)
     if outputs.html is not None:
         write_pages(labelled_batch(judgement), outputs.html, judgement.name, workers, progress=progress)
     if outputs.json_file is not None:
         write_json_lines([judgement.document], outputs.json_file, inputs)
 
 
-def _print(judgement: Judgement, outputs: Sequence[str], conditions: ConditionArguments) -> None:
+def _print(judgement: Judgement, written_files: Sequence[str], conditions: ConditionArguments) -> None:
     from spatial_replay.judging.pairs import comparison_lines
     from spatial_replay.judging.sentences import (
         difference_lines,
@@ -250,24 +252,26 @@ def _print(judgement: Judgement, outputs: Sequence[str], conditions: ConditionAr
         show(*stage_lines(judgement), "")
     if judgement.comparison is not None:
         show(*comparison_lines(judgement.comparison), "")
-    rows = [[row for row in judgement.rows if row.kind == kind] for kind in ("only_theirs", "only_ours")]
-    failed = [row for row in judgement.rows if not row.is_success]
-    example = [*rows[0], *rows[1], *failed, *judgement.rows][0]
-    specs = "".join(f" --spec {spec}" for spec in conditions.specs)
+    disagreements = [
+        [row for row in judgement.rows if row.kind == kind] for kind in ("only_theirs", "only_ours")
+    ]
+    failed_rows = [row for row in judgement.rows if not row.is_success]
+    example_row = [*disagreements[0], *disagreements[1], *failed_rows, *judgement.rows][0]
+    spec_options = "".join(f" --spec {spec}" for spec in conditions.specs)
     mapping = conditions.reading.get("mapping")
-    options = f"{specs} --mapping {mapping}" if mapping else specs
-    show(f"wrote {', '.join(outputs)}; spatial-replay explain {example.log}{options}")
+    options_text = f"{spec_options} --mapping {mapping}" if mapping else spec_options
+    show(f"wrote {', '.join(written_files)}; spatial-replay explain {example_row.log}{options_text}")
 
 
 def _exit_code(judgement: Judgement, at_least: float | None) -> ExitCode:
     if not judgement.rate.episodes:
-        errors = code_of_errors(judgement.batch.table)
-        return ExitCode.UNKNOWN if errors is ExitCode.SATISFIED else errors
+        error_code = code_of_errors(judgement.batch.table)
+        return ExitCode.UNKNOWN if error_code is ExitCode.SATISFIED else error_code
     if at_least is None:
         return ExitCode.SATISFIED
     is_enough = judgement.reaches(at_least)
     if is_enough is None:
-        pending = judgement.agreement.undecided + judgement.agreement.unstored
-        warn(f"--at-least {at_least:g} depends on {plural(pending, 'undecided or unstored episode')}")
+        open_count = judgement.agreement.undecided + judgement.agreement.unstored
+        warn(f"--at-least {at_least:g} depends on {plural(open_count, 'undecided or unstored episode')}")
         return ExitCode.UNKNOWN
     return ExitCode.SATISFIED if is_enough else ExitCode.VIOLATED

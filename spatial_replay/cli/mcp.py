@@ -89,21 +89,21 @@ def work(channel: Connection, call: Call) -> None:
     tempfile.tempdir = call.folder
     # installed before any code of the call runs
     sys.addaudithook(_guard(call.readable, is_online=call.is_online))
-    sent_s = time.monotonic()
+    last_report_s = time.monotonic()
 
     def report(label: str, steps: int, total: int | None) -> None:
-        nonlocal sent_s
-        if (now_s := time.monotonic()) - sent_s > _PROGRESS_S:
-            sent_s = now_s
+        nonlocal last_report_s
+        if (now_s := time.monotonic()) - last_report_s > _PROGRESS_S:
+            last_report_s = now_s
             channel.send(("progress", label, steps, total))
 
     for command in call.commands:
         documents: list[Any] = []
-        out, err = io.StringIO(), io.StringIO()
-        with redirect_stdout(out), redirect_stderr(err), listening(Listener(documents.append, report)):
-            code = _list_logs(command[1:], documents) if command[0] == "list" else run(command)
+        output, errors = io.StringIO(), io.StringIO()
+        with redirect_stdout(output), redirect_stderr(errors), listening(Listener(documents.append, report)):
+            exit_code = _list_logs(command[1:], documents) if command[0] == "list" else run(command)
         document = json.loads(json.dumps(documents[-1])) if documents else None
-        channel.send(("result", int(code), out.getvalue(), err.getvalue(), document))
+        channel.send(("result", int(exit_code), output.getvalue(), errors.getvalue(), document))
     channel.close()
 
 
@@ -121,7 +121,7 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
     from spatial_replay.errors import UsageError
     from spatial_replay.logs.formats.datasets import data_set_address
 
-    episodes: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for folder in folders:
         try:
             logs = find_logs([LogPattern(folder)], Path(folder))
@@ -131,8 +131,8 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
         for log in logs:
             address = data_set_address(log.path)
             path = address[0] if address else log.path
-            episodes[path] = episodes.get(path, 0) + (address is not None)
-    documents.append([{"path": path, "episodes": count or None} for path, count in sorted(episodes.items())])
+            counts[path] = counts.get(path, 0) + (address is not None)
+    documents.append([{"path": path, "episodes": count or None} for path, count in sorted(counts.items())])
     return 0
 
 
@@ -142,15 +142,15 @@ def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[
     The hook also refuses further files that mappings, bags and data sets name. Files that libraries in C open
     by themselves are not seen.
     """
-    places = [*readable, sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *_SYSTEM]
-    places += [str(Path(__file__).parents[1]), *filter(None, map(os.environ.get, _CACHES))]
-    places.append(str(Path.home() / ".cache"))
-    prefixes = tuple(f"{os.path.realpath(place)}/" for place in dict.fromkeys(places))
+    folders = [*readable, sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *_SYSTEM]
+    folders += [str(Path(__file__).parents[1]), *filter(None, map(os.environ.get, _CACHES))]
+    folders.append(str(Path.home() / ".cache"))
+    folder_prefixes = tuple(f"{os.path.realpath(folder)}/" for folder in dict.fromkeys(folders))
 
     def guard(event: str, arguments: tuple[Any, ...]) -> None:
         if event == "open" and isinstance(arguments[0], (str, bytes)):
             path = os.path.realpath(os.fsdecode(arguments[0]))
-            if not f"{path}/".startswith(prefixes):
+            if not f"{path}/".startswith(folder_prefixes):
                 reason = "outside the roots of this server"
                 raise PermissionError(errno.EACCES, reason, os.path.basename(path))  # noqa: PTH119
         elif event == "socket.connect" and not is_online:

@@ -54,12 +54,12 @@ def _seconds(context: click.Context, parameter: click.Parameter, text: str | Non
 
 
 def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int:
-    number, factor = text.strip(), 1
+    size_text, unit_bytes = text.strip(), 1
     for unit, multiple in _UNITS.items():
-        if number.lower().endswith(unit):
-            number, factor = number[: -len(unit)], multiple
+        if size_text.lower().endswith(unit):
+            size_text, unit_bytes = size_text[: -len(unit)], multiple
     with suppress(ValueError, OverflowError):
-        return round(float(number) * factor)
+        return round(float(size_text) * unit_bytes)
     raise UsageError(f"{parameter.opts[0]}: {text!r} is not a size; write it as 256MB or 1.5GB")
 
 
@@ -189,9 +189,9 @@ def monitor(
       spatial-replay monitor ws://robot:8765 --spec safety.spatial --for 60s -o live.mcap
       spatial-replay monitor ws://robot:8765 --spec safety.spatial --trigger violated --clips clips/
     """
-    by_signal = _SignalTrigger()
+    signal_trigger = _SignalTrigger()
     if clips is not None:
-        click.get_current_context().with_resource(by_signal.listening())
+        click.get_current_context().with_resource(signal_trigger.listening())
     # imported here so that --help stays fast
     from spatial_replay.live import LiveSession, open_recorders
     from spatial_replay.live.session import layout_of_run
@@ -225,16 +225,16 @@ def monitor(
     trigger = None if clips is None else _trigger(triggers, before_s, after_s, ring)
     if output is not None:
         refuse_inputs(output, [*specs, *([mapping_file] if mapping_file is not None else [])])
-    with ExitStack() as opened:
-        recorders = opened.enter_context(
+    with ExitStack() as resources:
+        recorders = resources.enter_context(
             open_recorders(files, mapping, output, trigger, clips, overwrite=overwrite)
         )
         writers: list[SampleWriter] = [*recorders]
         fire = next((recorder.trigger for recorder in recorders if trigger and recorder.is_triggered), None)
         if fire is not None:
-            by_signal.attach(fire)
+            signal_trigger.attach(fire)
         if serves:
-            writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
+            writers.append(resources.enter_context(_viewing(files, mapping, serving, fire)))
         session = LiveSession(
             address,
             files,
@@ -249,8 +249,8 @@ def monitor(
         asyncio.run(run.follow())
     run.show_remarks()
     for clip in (clip for recorder in recorders for clip in recorder.clips):
-        lost = f"; {plural(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
-        show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}{lost}")
+        loss_text = f"; {plural(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
+        show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}{loss_text}")
     _show_losses(writers, session.status.dropped)
     if output is not None:
         show(f"wrote {output}")
@@ -262,10 +262,10 @@ def _refuse_endless(files: Sequence[Specification]) -> None:
     from spatial_replay.spec.walks import can_settle
 
     specs = [spec for file in files for spec in file.results]
-    endless = [spec.name for spec in specs if not can_settle(spec.formula, satisfied=True)]
-    if endless:
+    endless_specs = [spec.name for spec in specs if not can_settle(spec.formula, satisfied=True)]
+    if endless_specs:
         raise UsageError(
-            f"--until satisfied: {', '.join(endless)} can be violated as long as the run goes on; give"
+            f"--until satisfied: {', '.join(endless_specs)} can be violated as long as the run goes on; give"
             " --for T, --until violated, or a file without it"
         )
 
@@ -273,10 +273,10 @@ def _refuse_endless(files: Sequence[Specification]) -> None:
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
     """Show the losses of logs, clips and viewers beyond the samples that were not evaluated."""
     for writer in writers:
-        lost = [plural(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
-        lost += [plural(writer.messages_dropped, "message")] if writer.messages_dropped else []
-        if lost:
-            show(f"{writer.name} fell behind and lacks {' and '.join(lost)}")
+        losses = [plural(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
+        losses += [plural(writer.messages_dropped, "message")] if writer.messages_dropped else []
+        if losses:
+            show(f"{writer.name} fell behind and lacks {' and '.join(losses)}")
 
 
 class _SignalTrigger:
@@ -284,13 +284,13 @@ class _SignalTrigger:
 
     def __init__(self) -> None:
         self._fire: Callable[[str], None] | None = None
-        self._is_waiting = False
+        self._has_signal = False
 
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Handle the signal within this context."""
         try:
-            before = signal.signal(signal.SIGUSR1, self._take)
+            previous_handler = signal.signal(signal.SIGUSR1, self._take)
         except ValueError:
             # only the main thread may handle signals
             yield
@@ -298,28 +298,28 @@ class _SignalTrigger:
         try:
             yield
         finally:
-            signal.signal(signal.SIGUSR1, before)
+            signal.signal(signal.SIGUSR1, previous_handler)
 
     def attach(self, fire: Callable[[str], None]) -> None:
         """Set the function that fires the trigger."""
         self._fire = fire
-        if self._is_waiting:
+        if self._has_signal:
             fire("SIGUSR1")
 
     def _take(self, number: int, frame: object) -> None:
         if self._fire is None:
-            self._is_waiting = True
+            self._has_signal = True
         else:
             self._fire("SIGUSR1")
 
 
-def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) -> Trigger:
+def _trigger(conditions: tuple[str, ...], before_s: float, after_s: float, ring_bytes: int) -> Trigger:
     from spatial_replay.recording.clips import Trigger
 
-    if ring < 2**20:
-        raise UsageError(f"--ring is {ring} bytes; a ring takes 1MB or more")
+    if ring_bytes < 2**20:
+        raise UsageError(f"--ring is {ring_bytes} bytes; a ring takes 1MB or more")
     with naming_option("--trigger"):
-        return Trigger(when or "violated", before_s, after_s, ring)
+        return Trigger(conditions or "violated", before_s, after_s, ring_bytes)
 
 
 @contextmanager
@@ -361,8 +361,8 @@ class _Run:
         """Print changes and notes until the run ends, and then the verdicts."""
         loop = asyncio.get_running_loop()
         with self._signals(loop):
-            ticking = asyncio.create_task(self._tick())
-            ending = asyncio.create_task(self._end_in_time())
+            status_task = asyncio.create_task(self._tick())
+            end_task = asyncio.create_task(self._end_in_time())
             try:
                 is_first = True
                 async for update in self._session.updates():
@@ -373,8 +373,8 @@ class _Run:
                         self._session.stop()
                         break
             finally:
-                ticking.cancel()
-                ending.cancel()
+                status_task.cancel()
+                end_task.cancel()
                 self._status.clear()
         self._session.close()
         self._show_end()
@@ -393,22 +393,22 @@ class _Run:
     @contextmanager
     def _signals(self, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
         """End the run at the first Ctrl-C; the second one interrupts the program."""
-        handled: list[signal.Signals] = []
+        handled_signals: list[signal.Signals] = []
 
-        def stop(number: signal.Signals) -> None:
+        def stop(signal_number: signal.Signals) -> None:
             self._session.stop()
-            loop.remove_signal_handler(number)
+            loop.remove_signal_handler(signal_number)
 
         # only the main thread may handle signals
         with suppress(NotImplementedError, RuntimeError, ValueError):
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, stop, number)
-                handled.append(number)
+            for signal_number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(signal_number, stop, signal_number)
+                handled_signals.append(signal_number)
         try:
             yield
         finally:
-            for number in handled:
-                loop.remove_signal_handler(number)
+            for signal_number in handled_signals:
+                loop.remove_signal_handler(signal_number)
 
     async def _end_in_time(self) -> None:
         if self._length_s is not None:
@@ -418,8 +418,8 @@ class _Run:
 
     async def _tick(self) -> None:
         """Update the status line, and print notes that come without a sample."""
-        before, then_s = self._session.status, time.monotonic()
-        rate, connected_s = 0.0, math.inf
+        last_status, last_s = self._session.status, time.monotonic()
+        rate_hz, last_connected_s = 0.0, math.inf
         while True:
             await asyncio.sleep(_STATUS_S)
             status, now_s = self._session.status, time.monotonic()
@@ -427,17 +427,17 @@ class _Run:
                 self._print(f"  {note}")
             self.show_remarks()
             # smoothed, so that the shown rate is readable
-            rate += 0.5 * ((status.samples - before.samples) / (now_s - then_s) - rate)
-            before, then_s = status, now_s
-            self._status.show(self._status_text(rate))
-            connected_s = now_s if status.is_connected else connected_s
-            if self._until is not None and now_s - connected_s > _GONE_S:
+            rate_hz += 0.5 * ((status.samples - last_status.samples) / (now_s - last_s) - rate_hz)
+            last_status, last_s = status, now_s
+            self._status.show(self._status_text(rate_hz))
+            last_connected_s = now_s if status.is_connected else last_connected_s
+            if self._until is not None and now_s - last_connected_s > _GONE_S:
                 self._print(
                     f"  the server has been away for {_GONE_S:g} s: the run ends before `{self._until}`"
                 )
                 self._session.stop()
 
-    def _status_text(self, rate: float) -> str:
+    def _status_text(self, rate_hz: float) -> str:
         status = self._session.status
         if not status.is_connected:
             return "not connected"
@@ -445,16 +445,16 @@ class _Run:
             return f"waiting for {', '.join(status.waits_for)}"
         if status.time_ns is None:
             return f"connected, no sample yet ({plural(status.messages, 'message')})"
-        parts = [time_text(status.time_ns, self.first_ns), f"{rate:.0f} samples/s"]
-        parts.append(f"delay {status.delay_s * 1e3:.1f} ms")
-        parts.append(f"dropped {status.dropped}")
+        status_texts = [time_text(status.time_ns, self.first_ns), f"{rate_hz:.0f} samples/s"]
+        status_texts.append(f"delay {status.delay_s * 1e3:.1f} ms")
+        status_texts.append(f"dropped {status.dropped}")
         if status.messages_dropped:
-            parts.append(f"messages dropped {status.messages_dropped}")
+            status_texts.append(f"messages dropped {status.messages_dropped}")
         if status.late:
-            parts.append(f"late {status.late}")
+            status_texts.append(f"late {status.late}")
         if status.overdue:
-            parts.append(f"without transforms {status.overdue}")
-        return "   ".join(parts)
+            status_texts.append(f"without transforms {status.overdue}")
+        return "   ".join(status_texts)
 
     def _show(self, update: LiveUpdate) -> None:
         for note in update.notes:
@@ -466,9 +466,11 @@ class _Run:
         verdicts = {str(spec.verdict) for spec in update.specs}
         elapsed_ns = update.time_ns - self.first_ns
         specs = zip(update.specs, self._horizons_ns, strict=True)
-        pending = [elapsed_ns <= horizon for spec, horizon in specs if str(spec.verdict) == "pending"]
-        is_open = any(pending)
-        if not all(pending):
+        within_horizon = [
+            elapsed_ns <= horizon_ns for spec, horizon_ns in specs if str(spec.verdict) == "pending"
+        ]
+        is_open = any(within_horizon)
+        if not all(within_horizon):
             verdicts.add("unknown")
         match self._until:
             case "violated":
@@ -489,12 +491,12 @@ class _Run:
         endings = self._session.endings()
         self._verdicts = [str(ending.verdict) for ending in endings]
         self._verdicts += ["unknown" for ending in endings if ending.doubts]
-        span = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
-        lost = ""
+        span_text = "no time" if status.time_ns is None else time_text(status.time_ns, self.first_ns)
+        loss_text = ""
         if status.dropped or status.messages_dropped:
-            lost = f"; dropped {plural(status.dropped, 'sample')} and"
-            lost += f" {plural(status.messages_dropped, 'message')}: verdicts are over the others"
-        show(f"{plural(status.samples, 'sample')} over {span}{lost}")
+            loss_text = f"; dropped {plural(status.dropped, 'sample')} and"
+            loss_text += f" {plural(status.messages_dropped, 'message')}: verdicts are over the others"
+        show(f"{plural(status.samples, 'sample')} over {span_text}{loss_text}")
         show(*ending_lines(endings))
 
     def _print(self, line: Line) -> None:

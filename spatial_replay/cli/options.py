@@ -98,7 +98,9 @@ class JsonCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         pairs = pairwise(["", *args])
-        return super().parse_args(ctx, [last for first, last in pairs if (first, last) != ("--json", "-")])
+        return super().parse_args(
+            ctx, [word for previous, word in pairs if (previous, word) != ("--json", "-")]
+        )
 
 
 class LogPath(click.Path):
@@ -201,10 +203,10 @@ semantics_option = click.option(
 
 
 def _read_kinds(
-    known: Sequence[str], context: click.Context, parameter: click.Parameter, text: str
+    allowed_kinds: Sequence[str], context: click.Context, parameter: click.Parameter, text: str
 ) -> frozenset[str]:
     kinds = [kind.strip() for kind in text.split(",") if kind.strip()]
-    return checked_kinds(parameter.opts[0], kinds, known)
+    return checked_kinds(parameter.opts[0], kinds, allowed_kinds)
 
 
 fail_on_option = click.option(
@@ -224,17 +226,17 @@ allow_option = click.option(
 )
 
 
-def _allow_plugins(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> None:
+def _allow_plugins(context: click.Context, parameter: click.Parameter, plugins: tuple[str, ...]) -> None:
     """Allow plug-ins until the command ends, also in the processes that it starts."""
-    if not names:
+    if not plugins:
         return
     # imported here so that --help stays fast
     from spatial_replay.spec.relations import PLUGINS_VARIABLE
 
-    before = os.environ.get(PLUGINS_VARIABLE, "")
-    places = [str(Path(name).absolute()) if name.endswith(".py") else name for name in names]
-    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(filter(None, [before, *places]))
-    context.call_on_close(partial(os.environ.__setitem__, PLUGINS_VARIABLE, before))
+    earlier_plugins = os.environ.get(PLUGINS_VARIABLE, "")
+    plugin_paths = [str(Path(name).absolute()) if name.endswith(".py") else name for name in plugins]
+    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(filter(None, [earlier_plugins, *plugin_paths]))
+    context.call_on_close(partial(os.environ.__setitem__, PLUGINS_VARIABLE, earlier_plugins))
 
 
 plugin_option = click.option(
@@ -286,18 +288,18 @@ READING_KEYS = {
 def _read_pairs(
     context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, object]:
-    pairs: dict[str, object] = {}
+    options: dict[str, object] = {}
     for text in texts:
         key, _, value = text.partition("=")
         if key not in READING_KEYS or not value:
             raise UsageError(f"--read {text!r:.100}: give KEY=VALUE with one of {', '.join(READING_KEYS)}")
         try:
-            pairs[key] = {"true": True, "false": False}.get(value) if key == "y_down" else float(value)
+            options[key] = {"true": True, "false": False}.get(value) if key == "y_down" else float(value)
         except ValueError:
-            pairs[key] = value
-        if pairs[key] is None:
+            options[key] = value
+        if options[key] is None:
             raise UsageError(f"--read {text!r:.100}: give y_down=true or y_down=false")
-    return pairs
+    return options
 
 
 _READING = (
@@ -448,10 +450,10 @@ def open_inputs(
 
     source = open_source(request.log, **request.reading)
     files = list(known)
-    is_bare = can_do_without and not (request.specs or request.constants or recorded_texts(source))
-    if not files and not is_bare:
-        specs = [local_copy(spec) for spec in request.specs]
-        files = load_files(specs, source, constants=request.constants)
+    needs_no_specs = can_do_without and not (request.specs or request.constants or recorded_texts(source))
+    if not files and not needs_no_specs:
+        spec_paths = [local_copy(spec) for spec in request.specs]
+        files = load_files(spec_paths, source, constants=request.constants)
         show_diagnostics(warning for file in files for warning in file.warnings)
     window, objects = _window(source, request), objects_by_parameter(request.choices)
     return EvaluationInputs(source, files, window, objects, request.strict_names)
@@ -480,14 +482,14 @@ def _window(source: Source, request: EvaluationArguments) -> Window:
     from spatial_replay.replay.selection import window_from_points
 
     with naming_option("--from"):
-        start = None if request.start is None else time_point_from_text(request.start)
+        start_point = None if request.start is None else time_point_from_text(request.start)
     with naming_option("--to"):
-        end = None if request.end is None else time_point_from_text(request.end)
+        end_point = None if request.end is None else time_point_from_text(request.end)
     try:
-        return window_from_points(source, start, end, request.every)
+        return window_from_points(source, start_point, end_point, request.every)
     except UsageError:
-        named = (("--from", request.start), ("--to", request.end))
-        window = " ".join(f"{name} {text}" for name, text in named if text)
+        bound_options = (("--from", request.start), ("--to", request.end))
+        window = " ".join(f"{name} {text}" for name, text in bound_options if text)
         raise UsageError(f"the window {window} is empty; --to is the time after its last sample") from None
 
 
@@ -541,8 +543,8 @@ def refuse_options(context: click.Context, names: Collection[str], why: str) -> 
         UsageError: an option is given.
     """
     for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name in names and source is not ParameterSource.DEFAULT:
+        value_source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and value_source is not ParameterSource.DEFAULT:
             raise UsageError(f"{parameter.opts[0]} {why}")
 
 
@@ -560,9 +562,11 @@ def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Pat
     files = {name: Path(file) for name, file in outputs.items() if file is not None and file != "-"}
     for file in files.values():
         refuse_inputs(file, inputs)
-        same = [name for name, path in files.items() if path.resolve() == file.resolve()]
-        if len(same) > 1:
-            raise UsageError(f"{' and '.join(same)} both name {outputs[same[-1]]}; give them different names")
+        names = [name for name, path in files.items() if path.resolve() == file.resolve()]
+        if len(names) > 1:
+            raise UsageError(
+                f"{' and '.join(names)} both name {outputs[names[-1]]}; give them different names"
+            )
 
 
 def require_choice(specification: Specification, of: str | None) -> None:

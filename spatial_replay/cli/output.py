@@ -51,43 +51,43 @@ def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
 
 def _ending_numbers(ending: Ending) -> str:
     robustness, lower, upper = ending.robustness, ending.lower, ending.upper
-    low, high = with_unit(lower, ending.unit), with_unit(upper, ending.unit)
+    lower_text, upper_text = with_unit(lower, ending.unit), with_unit(upper, ending.unit)
     doubtful = "doubtful, " if ending.doubts else ""
     if math.isnan(robustness):
-        return f"{doubtful}robustness not determined, between {low} and {high}"
-    between = "" if lower == upper == robustness else f", between {low} and {high}"
-    return f"{doubtful}robustness {with_unit(robustness, ending.unit)}{between}"
+        return f"{doubtful}robustness not determined, between {lower_text} and {upper_text}"
+    bounds_text = "" if lower == upper == robustness else f", between {lower_text} and {upper_text}"
+    return f"{doubtful}robustness {with_unit(robustness, ending.unit)}{bounds_text}"
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
     """Print one line for each result, and another one for a sliding window."""
-    span = time_text(replayed.end_ns, replayed.start_ns)
-    damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
+    span_text = time_text(replayed.end_ns, replayed.start_ns)
+    notes = ", damaged: verdicts are over what could be read" if replayed.faults else ""
     verdicts = [result.verdict for result in replayed.results]
-    counts = f": {counts_text(verdicts)}" if len(verdicts) > MANY else ""
-    damaged += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
-    show(f"{replayed.log}: {plural(replayed.samples, 'sample')} over {span}{damaged}{counts}")
-    results, others = worst_of(replayed.results)
+    count_text = f": {counts_text(verdicts)}" if len(verdicts) > MANY else ""
+    notes += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
+    show(f"{replayed.log}: {plural(replayed.samples, 'sample')} over {span_text}{notes}{count_text}")
+    results, other_results = worst_of(replayed.results)
     # escaped before the widths are measured, because escapes are wider
     titles = [
         escape_text(f"{result.title} [{result.spec.id}]" if result.spec.id else result.title)
         for result in results
     ]
-    width = max(map(len, titles), default=0)
-    titled: set[str] = set()
+    title_width = max(map(len, titles), default=0)
+    titled_specs: set[str] = set()
     for title, result in zip(titles, results, strict=True):
         verdict = Coloured(f"{result.verdict:<9}", VERDICT_COLOURS[result.verdict])
-        show((f"  {title:<{width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
+        show((f"  {title:<{title_width}}  ", verdict, f"  {_numbers(result, replayed.first_ns)}"))
         # results of one template share its title
-        if result.spec.title and result.name not in titled:
-            show(f"  {'':<{width}}  {result.spec.title}")
-            titled.add(result.name)
+        if result.spec.title and result.name not in titled_specs:
+            show(f"  {'':<{title_width}}  {result.spec.title}")
+            titled_specs.add(result.name)
         for line in _below(result, replayed.first_ns):
-            show(f"  {'':<{width}}  {line}")
+            show(f"  {'':<{title_width}}  {line}")
         if window_ns is not None:
-            show(f"  {'':<{width}}  {_over_window(result, replayed.first_ns, window_ns)}")
-    if others:
-        show(f"  {others_text(others)}")
+            show(f"  {'':<{title_width}}  {_over_window(result, replayed.first_ns, window_ns)}")
+    if other_results:
+        show(f"  {others_text(other_results)}")
     for part in replayed.vacuous:
         show(f"  vacuous: {part.message}")
     if output is not None:
@@ -116,8 +116,8 @@ def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Seque
     from spatial_replay.monitor.result import worst_first
 
     results = [results[place] for place in worst_first(results)]
-    count = _SHOWN if len(results) > _MOST_SHOWN else len(results)
-    return results[:count], results[count:]
+    printed_count = _SHOWN if len(results) > _MOST_SHOWN else len(results)
+    return results[:printed_count], results[printed_count:]
 
 
 def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = None) -> str:
@@ -127,31 +127,31 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
         verdicts: verdicts of these results; by default the final ones.
     """
     hint = ", --each VAR=OBJECT shows one" if any(result.object is not None for result in others) else ""
-    counts = counts_text([result.verdict for result in others] if verdicts is None else verdicts)
-    return f"… and {len(others):,} more: {counts}; --json has all{hint}"
+    count_text = counts_text([result.verdict for result in others] if verdicts is None else verdicts)
+    return f"… and {len(others):,} more: {count_text}; --json has all{hint}"
 
 
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
-    parts = ["doubtful"] if result.doubts else []
-    parts += ["tested by nothing"] if result.tested == "nothing" else []
-    parts.append(f"robustness {_number_text(robustness, result.unit)}")
+    facts = ["doubtful"] if result.doubts else []
+    facts += ["tested by nothing"] if result.tested == "nothing" else []
+    facts.append(f"robustness {_number_text(robustness, result.unit)}")
     if not (lower == upper == robustness or math.isnan(lower)):
-        parts.append(f"between {_number_text(lower, result.unit)} and {_number_text(upper, result.unit)}")
+        facts.append(f"between {_number_text(lower, result.unit)} and {_number_text(upper, result.unit)}")
     if robustness == 0.0:
-        parts.append("marginal")
+        facts.append("marginal")
     certain_ns = result.certain_ns()
     if result.verdict != "violated" and result.first_satisfied_ns not in (None, certain_ns):
-        how = "held so far" if result.verdict == "unknown" else "first satisfied"
-        parts.append(f"{how} at {time_text(result.first_satisfied_ns or 0, first_ns)}")
+        state_text = "held so far" if result.verdict == "unknown" else "first satisfied"
+        facts.append(f"{state_text} at {time_text(result.first_satisfied_ns or 0, first_ns)}")
     if certain_ns is not None:
-        parts.append(f"certain since {time_text(certain_ns, first_ns)}")
+        facts.append(f"certain since {time_text(certain_ns, first_ns)}")
     if result.least is not None and result.verdict == "violated":
-        parts.append(f"the least robustness is that of `{result.least.name}`")
+        facts.append(f"the least robustness is that of `{result.least.name}`")
     elif result.least_at_ns is not None:
-        least_at = time_text(result.least_at_ns, first_ns)
-        parts += [f"least at {least_at}"] if f"certain since {least_at}" not in parts else []
-    return ", ".join(parts)
+        least_time = time_text(result.least_at_ns, first_ns)
+        facts += [f"least at {least_time}"] if f"certain since {least_time}" not in facts else []
+    return ", ".join(facts)
 
 
 def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
@@ -160,13 +160,13 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
     from spatial_replay.monitor.sentences import cause_reason, gap_sentence
 
     for cause in result.causes:
-        is_own = cause.spec == result.name
-        when = (
+        is_own_spec = cause.spec == result.name
+        at_text = (
             "" if cause.settled_ns is None or cause.least else f" at {time_text(cause.settled_ns, first_ns)}"
         )
-        about = "" if is_own else requirement_text(cause.requirement, cause.title)
-        about = f" [{about}]" if about else ""
-        label = f"{cause.spec}{about}{when}: " if len(result.causes) > 1 or not is_own else ""
+        requirement = "" if is_own_spec else requirement_text(cause.requirement, cause.title)
+        requirement = f" [{requirement}]" if requirement else ""
+        label = f"{cause.spec}{requirement}{at_text}: " if len(result.causes) > 1 or not is_own_spec else ""
         if cause.witness is not None:
             yield f"{label}{cause_reason(cause, first_ns)}"
         elif label:
@@ -175,8 +175,8 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
     for gap in () if witness is None else witness.gaps:
         if gap.missing < gap.samples:
             yield gap_sentence(gap, first_ns)
-    cut = result.untested if result.tested == "cut" else ()
-    for label, parts in (("vacuous", result.vacuous), ("cut", cut)):
+    cut_parts = result.untested if result.tested == "cut" else ()
+    for label, parts in (("vacuous", result.vacuous), ("cut", cut_parts)):
         for message in counted_from((part.message for part in parts), first_ns):
             yield f"{label}: {message}"
     yield from result.goals_at_the_start
@@ -186,15 +186,15 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     """Return a text on the violations of a spec over the sliding window: their number, and the first."""
     if result.leaves is None:
         return ""
-    values, times_ns = result.window_signal(window_ns)[0], result.times_ns
-    over = f"over the last {time_text(window_ns)}"
-    failing = (values < 0.0).nonzero()[0]
-    at_end = _number_text(float(values[-1]), result.unit)
-    if not len(failing):
-        return f"{over} never violated; robustness at the end {at_end}"
-    first = time_text(int(times_ns[failing[0]]), first_ns)
-    count = f"{len(failing):,} of {plural(len(values), 'sample')}"
-    return f"{over} violated at {count}, first at {first}; robustness at the end {at_end}"
+    robustness, times_ns = result.window_signal(window_ns)[0], result.times_ns
+    window_text = f"over the last {time_text(window_ns)}"
+    violated_indices = (robustness < 0.0).nonzero()[0]
+    end_text = _number_text(float(robustness[-1]), result.unit)
+    if not len(violated_indices):
+        return f"{window_text} never violated; robustness at the end {end_text}"
+    first_violated = time_text(int(times_ns[violated_indices[0]]), first_ns)
+    violated_text = f"{len(violated_indices):,} of {plural(len(robustness), 'sample')}"
+    return f"{window_text} violated at {violated_text}, first at {first_violated}; robustness at the end {end_text}"
 
 
 def _number_text(number: float, unit: str = "") -> str:
@@ -204,7 +204,7 @@ def _number_text(number: float, unit: str = "") -> str:
 def align_rows(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
     """Yield rows as lines with aligned columns."""
     # escaped before the widths are measured, because escapes are wider
-    cells = [tuple(map(escape_text, row)) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
+    escaped_rows = [tuple(map(escape_text, row)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*escaped_rows, strict=True)]
+    for row in escaped_rows:
         yield "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -93,7 +93,7 @@ def _redo(
     log: LogFile,
     output: Path | None,
     spec: LogFile | None,
-    of: str | None,
+    result_name: str | None,
     constants: Mapping[str, float | str],
     changes: Mapping[str, Any],
     as_json: bool,
@@ -106,40 +106,40 @@ def _redo(
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
-    named = [] if spec is None else [spec]
-    files = load_spec_options(named, constants, lambda: planner_of(source).specification)
-    file = next(iter(files), None)
-    if file is not None:
-        require_choice(file, of)
+    specs = [] if spec is None else [spec]
+    files = load_spec_options(specs, constants, lambda: planner_of(source).specification)
+    specification = next(iter(files), None)
+    if specification is not None:
+        require_choice(specification, result_name)
     with progress("samples") as advance:
-        redone = redo_decisions(source, file, changes, name=of, advance=advance)
-    warn(*counted_from(redone.faults, known_zero_ns(source) if redone.faults else 0))
+        replanning = redo_decisions(source, specification, changes, name=result_name, advance=advance)
+    warn(*counted_from(replanning.faults, known_zero_ns(source) if replanning.faults else 0))
     if output is not None:
-        files = load_files((), source) if file is None else [file]
-        beside = ReplannedSource(source, redone.messages)
-        run_replay(beside, files, ReplayOptions(), output=output, inputs=local_files([log, *named]))
+        files = load_files((), source) if specification is None else [specification]
+        replanned_source = ReplannedSource(source, replanning.messages)
+        run_replay(replanned_source, files, ReplayOptions(), output=output, inputs=local_files([log, *specs]))
     if as_json:
-        show_json(redone.document)
+        show_json(replanning.document)
     else:
-        show(*redone.lines(terminal_width()))
+        show(*replanning.lines(terminal_width()))
         if output is not None:
             show(f"wrote {output}: {shlex.join(['spatial-replay', 'report', str(output)])} shows both")
-    code = ExitCode.VIOLATED if redone.is_different else ExitCode.SATISFIED
-    return most_severe([code, ExitCode.DAMAGED]) if redone.faults else code
+    exit_code = ExitCode.VIOLATED if replanning.is_different else ExitCode.SATISFIED
+    return most_severe([exit_code, ExitCode.DAMAGED]) if replanning.faults else exit_code
 
 
-def _why(log: LogFile, number: int | None, name: str | None, place: str | None) -> int:
+def _why(log: LogFile, decision_number: int | None, object_name: str | None, place: str | None) -> int:
     """Print why a decision did not bring an object to a place."""
     # imported here so that --help stays fast
     from spatial_replay.planning.read import why_not_there
 
-    if number is None or name is None or place is None:
+    if decision_number is None or object_name is None or place is None:
         raise UsageError("--why LOG asks about one place; give --step N, --object NAME and --at X,Y")
     try:
         x, y = map(float, place.split(","))
     except ValueError:
         raise UsageError(f"--at {place!r} is no place; give two numbers, as in --at 0.5,0.1") from None
-    show(*why_not_there(log, number, name, (x, y)))
+    show(*why_not_there(log, decision_number, object_name, (x, y)))
     return ExitCode.SATISFIED
 
 
@@ -245,7 +245,7 @@ def _plan(
     scenario: str,
     output: Path,
     spec: LogFile | None,
-    of: str | None,
+    result_name: str | None,
     constants: Mapping[str, float | str],
     changes: Mapping[str, Any],
     *,
@@ -262,15 +262,15 @@ def _plan(
     inputs = [*([] if spec is None else [spec]), *also]
     files = load_spec_options(inputs, constants, lambda: default_specification(scenario))
     # constants alone are values of the scenario's own specification
-    file = files.pop(0) if files and (spec is not None or not also) else None
-    if file is not None:
-        require_choice(file, of)
+    specification = files.pop(0) if files and (spec is not None or not also) else None
+    if specification is not None:
+        require_choice(specification, result_name)
     with progress("samples") as advance:
-        planned = record_plan(
+        planned_run = record_plan(
             scenario,
             output,
-            file,
-            name=of,
+            specification,
+            name=result_name,
             inputs=local_files(inputs),
             advance=advance,
             durability=durability,
@@ -280,19 +280,19 @@ def _plan(
             **simulation,
         )
     show(
-        f"wrote {output}: {plural(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
-        f"{plural(planned.steps, 'motion')}"
+        f"wrote {output}: {plural(planned_run.samples, 'sample')} over {planned_run.seconds:.3f} s; "
+        f"{plural(planned_run.steps, 'motion')}"
     )
-    for note in filter(None, (planned.bounds, planned.yaws)):
+    for note in filter(None, (planned_run.bounds, planned_run.yaws)):
         show(note)
     show_film(simulation["cameras"])
-    show(f"planning took {planned.planning_s:.2f} s", err=True)
-    show(f"the planner: {planned.reason}")
-    if planned.ended == "no path":
+    show(f"planning took {planned_run.planning_s:.2f} s", err=True)
+    show(f"the planner: {planned_run.reason}")
+    if planned_run.ended == "no path":
         command_line = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
         show(f"  {command_line} shows what was tried, and why it was given up")
-    show(f"the log: {planned.name} is {planned.verdict}")
-    for name, verdict in planned.others.items():
+    show(f"the log: {planned_run.name} is {planned_run.verdict}")
+    for name, verdict in planned_run.others.items():
         show(f"  {name}, of which the planner knew nothing, is {verdict}")
     # a planner that timed out ended the run: an unreached goal is then no violation
-    return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
+    return exit_code_from_verdicts(["unknown" if planned_run.ended == "wait" else planned_run.verdict])

@@ -156,18 +156,20 @@ def video(
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)
     names = [tagged.name for tagged in tags.objects]
-    unknown = [diagnosis for file in files for diagnosis in check_names(file, names, (), where="tags file")]
-    show_diagnostics(replace(diagnosis, severity="warning") for diagnosis in unknown)
+    unknown_names = [
+        diagnosis for file in files for diagnosis in check_names(file, names, (), where="tags file")
+    ]
+    show_diagnostics(replace(diagnosis, severity="warning") for diagnosis in unknown_names)
     cameras = _open_cameras(sources, camera, topics, rate, length_ns)
     offsets_ns = _offsets_ns(offsets, camera_names(cameras))
-    first_ns: list[int] = []
+    first_times_ns: list[int] = []
 
     def show_change(change: VerdictChange) -> None:
-        show(change_line(change, first_ns[0] if first_ns else change.time_ns))
+        show(change_line(change, first_times_ns[0] if first_times_ns else change.time_ns))
 
     inputs = [*sources, tags_file, *specs]
     with progress("frames") as advance:
-        seen = record_cameras(
+        recording = record_cameras(
             cameras,
             tags,
             output,
@@ -176,22 +178,22 @@ def video(
             hold_ns=hold_ns,
             keep=keep,
             inputs=local_files(inputs),
-            begin=first_ns.append,
+            begin=first_times_ns.append,
             show=show_change,
             advance=advance,
             durability=durability,
         )
-    warn(*seen.remarks, *seen.faults)
-    show(f"wrote {output}: {plural(seen.samples, 'sample')} over {seen.seconds:.3f} s")
-    for name, fit in seen.fits:
+    warn(*recording.remarks, *recording.faults)
+    show(f"wrote {output}: {plural(recording.samples, 'sample')} over {recording.seconds:.3f} s")
+    for name, fit in recording.fits:
         if fit is not None:
-            number, off = fit.worst
-            where = f" in {name}" if len(seen.fits) > 1 else ""
-            fits = f"reference tags fit within {fit.rms:.2f} pixels{where}"
-            show(f"{fits}; tag {number} is off most, by {off:.2f}")
-    show(*ending_lines(seen.endings))
-    verdicts = [str(ending.verdict) for ending in seen.endings]
-    return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(seen.faults))
+            tag_number, error_px = fit.worst
+            camera_text = f" in {name}" if len(recording.fits) > 1 else ""
+            fit_text = f"reference tags fit within {fit.rms:.2f} pixels{camera_text}"
+            show(f"{fit_text}; tag {tag_number} is off most, by {error_px:.2f}")
+    show(*ending_lines(recording.endings))
+    verdicts = [str(ending.verdict) for ending in recording.endings]
+    return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(recording.faults))
 
 
 def _open_cameras(
@@ -211,10 +213,10 @@ def _open_cameras(
         if len(set(topics)) < len(topics) or len({str(source) for source in sources}) < len(sources):
             raise UsageError("a video or topic is given twice; each camera counts once")
         topic_names: list[str | None] = [*topics] or [None] * len(sources)
-        each_source = [*sources] * len(topics) if topics else sources
+        topic_sources = [*sources] * len(topics) if topics else sources
         return [
             open_frames(source, topic=topic, rate=rate)
-            for source, topic in zip(each_source, topic_names, strict=True)
+            for source, topic in zip(topic_sources, topic_names, strict=True)
         ]
     refuse_values({"--topic": topics, "--rate": rate is not None}, "does not apply to a camera; leave it out")
     return [CameraFrames(camera, length_ns=length_ns)]
@@ -222,20 +224,22 @@ def _open_cameras(
 
 def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
     """Return the shift of each camera's stamps; none is negative."""
-    offsets = [0] * len(names)
+    offsets_ns = [0] * len(names)
     for text in texts:
-        name, _, value = text.rpartition("=")
-        places = [place for place, camera_name in enumerate(names, 1) if name in (camera_name, str(place))]
-        if len(places) != 1:
-            numbered = ", ".join(f"{place} ({camera_name})" for place, camera_name in enumerate(names, 1))
-            what = "is no camera" if not places else "is the name of several cameras"
+        name, _, duration_text = text.rpartition("=")
+        numbers = [
+            number for number, camera_name in enumerate(names, 1) if name in (camera_name, str(number))
+        ]
+        if len(numbers) != 1:
+            cameras = ", ".join(f"{number} ({camera_name})" for number, camera_name in enumerate(names, 1))
+            fault = "is no camera" if not numbers else "is the name of several cameras"
             raise UsageError(
-                f"--offset {text}: {name or text!r} {what}; write the number and a time: {numbered}"
+                f"--offset {text}: {name or text!r} {fault}; write the number and a time: {cameras}"
             )
         with naming_option("--offset"):
-            duration_ns = duration_ns_from_text(value.removeprefix("-"))
-        offsets[places[0] - 1] = -duration_ns if value.startswith("-") else duration_ns
-    return [offset - min(0, *offsets) for offset in offsets]
+            shift_ns = duration_ns_from_text(duration_text.removeprefix("-"))
+        offsets_ns[numbers[0] - 1] = -shift_ns if duration_text.startswith("-") else shift_ns
+    return [offset_ns - min(0, *offsets_ns) for offset_ns in offsets_ns]
 
 
 SCENARIOS: Final = ("push", "pick-place", "table-setting")
@@ -329,8 +333,8 @@ def show_film(videos: Sequence[Path]) -> None:
         from spatial_replay.runs.virtual_camera import tags_of_film
 
         names = " ".join(str(video) for video in videos)
-        tags = tags_of_film(videos)
-        show(f"filmed {names}: spatial-replay record video {names} --tags {tags} -o seen.mcap")
+        tags_file = tags_of_film(videos)
+        show(f"filmed {names}: spatial-replay record video {names} --tags {tags_file} -o seen.mcap")
 
 
 class RecordGroup(click.Group):
@@ -371,8 +375,8 @@ def scenario_argument(*, required: bool, others: Sequence[str] = ()) -> Callable
         others: names of commands that may replace it, for completion.
     """
 
-    def complete(context: click.Context, parameter: click.Parameter, begin: str) -> list[str]:
-        return [name for name in (*SCENARIOS, *others) if name.startswith(begin)]
+    def complete(context: click.Context, parameter: click.Parameter, prefix: str) -> list[str]:
+        return [name for name in (*SCENARIOS, *others) if name.startswith(prefix)]
 
     return click.argument(
         "scenario",
@@ -491,9 +495,9 @@ def tracks(
             source, output, files, inputs=inputs, unit=unit, advance=advance, durability=durability
         )
     warn_of_input(recorded)
-    seconds = (recorded.end_ns - recorded.start_ns) / 1e9
+    length_s = (recorded.end_ns - recorded.start_ns) / 1e9
     show(
-        f"wrote {output}: {plural(recorded.samples, 'sample')} over {seconds:.3f} s of "
+        f"wrote {output}: {plural(recorded.samples, 'sample')} over {length_s:.3f} s of "
         f"{plural(len(recorded.objects), 'object')}: {listing(recorded.objects)}"
     )
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED

@@ -95,8 +95,8 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     # imported here so that --help stays fast
     from spatial_replay.replay.specification_files import SpecificationFiles
 
-    specs = [local_copy(spec) for spec in request.specs]
-    files = SpecificationFiles(specs, constants=request.constants)
+    spec_paths = [local_copy(spec) for spec in request.specs]
+    files = SpecificationFiles(spec_paths, constants=request.constants)
     try:
         files.load()
     except (SpecificationError, MissingFileError) as error:
@@ -146,16 +146,16 @@ def watch_log(request: EvaluationArguments, semantics: Semantics) -> ExitCode:
     inputs = open_inputs(request)
     # no messages of the log are needed
     loaded = load_log(inputs, replace(inputs.options(semantics), keep=()), files)
-    evaluated = loaded.evaluate()
-    warn_of_input(evaluated.replayed)
-    print_verdicts(evaluated.replayed, None)
+    evaluation = loaded.evaluate()
+    warn_of_input(evaluation.replayed)
+    print_verdicts(evaluation.replayed, None)
 
     def evaluate(saved: Sequence[Specification]) -> Evaluated:
         nonlocal loaded
         next_log = loaded.with_files(saved)
-        evaluated = next_log.evaluate()
+        evaluation = next_log.evaluate()
         loaded = next_log
-        return evaluated
+        return evaluation
 
     return follow_saves(files, evaluate, files.write)
 
@@ -176,22 +176,22 @@ def follow_saves(
         refuse: receives the error of an unreadable file.
         check: called about ten times a second; an error that it raises ends the loop.
     """
-    names = _names(files)
+    file_names = _names(files)
     try:
         with pressed_keys() as keys:
             hint = "; w writes constants into it" if sys.stdin.isatty() else ""
-            show(f"watching {names}{hint}; stop with Ctrl-C")
+            show(f"watching {file_names}{hint}; stop with Ctrl-C")
             sys.stdout.flush()
             for saved in files.iter_saves():
                 check()
                 try:
                     if "w" in keys():
-                        _show_constants(write(), names)
+                        _show_constants(write(), file_names)
                     if isinstance(saved, SpatialReplayError):
                         refuse(saved)
                         raise saved
                     if saved is not None:
-                        _print_evaluation(saved, evaluate(saved), names)
+                        _print_evaluation(saved, evaluate(saved), file_names)
                 except SpatialReplayError as error:
                     report_error(error)
                     show("the evaluation before stays", err=True)
@@ -201,22 +201,22 @@ def follow_saves(
     return ExitCode.SATISFIED
 
 
-def _print_evaluation(saved: Sequence[Specification], evaluated: Evaluated, names: str) -> None:
+def _print_evaluation(saved: Sequence[Specification], evaluation: Evaluated, file_names: str) -> None:
     if sys.stdout.isatty():
         click.clear()
     show_diagnostics(warning for file in saved for warning in file.warnings)
-    show_diagnostics(evaluated.replayed.missing)
-    show(f"{names} saved")
-    print_verdicts(evaluated.replayed, None)
+    show_diagnostics(evaluation.replayed.missing)
+    show(f"{file_names} saved")
+    print_verdicts(evaluation.replayed, None)
     sys.stdout.flush()
 
 
-def _show_constants(written: Mapping[str, Any], names: str) -> None:
-    values = ", ".join(
+def _show_constants(changes: Mapping[str, Any], file_names: str) -> None:
+    values_text = ", ".join(
         f"{name} = {value:.12g}" if isinstance(value, float) else f"{name} = {value}"
-        for name, value in written.items()
+        for name, value in changes.items()
     )
-    show(f"{values} written into {names}" if written else f"{names} has all values already")
+    show(f"{values_text} written into {file_names}" if changes else f"{file_names} has all values already")
 
 
 @contextmanager
@@ -229,18 +229,18 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     import tty
 
     terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
+    terminal_settings = termios.tcgetattr(terminal)
 
     def keys() -> str:
         # read past Python's buffer, which `select` does not see
-        waiting = select.select([terminal], [], [], 0.0)[0]
-        return os.read(terminal, _MOST_KEYS).decode(errors="replace") if waiting else ""
+        readable_files = select.select([terminal], [], [], 0.0)[0]
+        return os.read(terminal, _MOST_KEYS).decode(errors="replace") if readable_files else ""
 
     try:
         tty.setcbreak(terminal)
         yield keys
     finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        termios.tcsetattr(terminal, termios.TCSADRAIN, terminal_settings)
 
 
 @click.command()
@@ -279,28 +279,28 @@ def serve(
     """
     files = files_to_watch(request) if watch else None
     inputs = open_inputs(request)
-    evaluated = load_log(inputs, inputs.options(semantics, keep), files).evaluate()
+    evaluation = load_log(inputs, inputs.options(semantics, keep), files).evaluate()
     if layout:
-        show_file(evaluated.layout.data.decode())
+        show_file(evaluation.layout.data.decode())
         return None
-    warn_of_input(evaluated.replayed)
+    warn_of_input(evaluation.replayed)
     try:
-        return _serve(evaluated, files, serving, play)
+        return _serve(evaluation, files, serving, play)
     except KeyboardInterrupt:
         # the regular way to stop the server
         return ExitCode.INTERRUPTED
 
 
 def _serve(
-    evaluated: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
+    evaluation: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
 ) -> ExitCode | None:
     # imported here so that --help stays fast
     with importing("serving takes foxglove-sdk", extra="live"):
         from spatial_replay.serve.server import open_server
 
     host, port, origins = serving.host, serving.port, serving.origins
-    with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:
-        print_verdicts(evaluated.replayed, None)
+    with open_server(evaluation, host=host, port=port, play=play, origins=origins) as server:
+        print_verdicts(evaluation.replayed, None)
         serving.warn_of_access("read this log and change its constants")
         show(f"serving at {server.address}; stop with Ctrl-C")
         show(f"  in Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {server.address}")
@@ -400,8 +400,8 @@ def replay(
         refuse_values({"--to-end": signal, "--window": width}, why)
     outputs = {"-o": output, "--json": json_file}
     if watch:
-        others = {**outputs, "--window": width, "--fail-on": fail_on, "--allow": allow}
-        refuse_values(others, "is not for --watch, which prints verdicts only; remove it")
+        refused_options = {**outputs, "--window": width, "--fail-on": fail_on, "--allow": allow}
+        refuse_values(refused_options, "is not for --watch, which prints verdicts only; remove it")
         return watch_log(request, semantics)
     check_outputs(outputs, request.inputs)
     inputs = open_inputs(request)
@@ -431,10 +431,10 @@ def replay(
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"
         show_message("note", hint, "cyan")
     if output is not None and json_file != "-" and sys.stderr.isatty():
-        files = f"`spatial-replay info {output} --layout` and `spatial-replay info --panel`"
-        show_message("note", f"for a viewer: {files}", "cyan")
-    failures = _failures(replayed, fail_on, allow)
-    return exit_code_from_verdicts([*verdicts, *failures], damaged=bool(replayed.faults))
+        viewer_commands = f"`spatial-replay info {output} --layout` and `spatial-replay info --panel`"
+        show_message("note", f"for a viewer: {viewer_commands}", "cyan")
+    failure_verdicts = _failures(replayed, fail_on, allow)
+    return exit_code_from_verdicts([*verdicts, *failure_verdicts], damaged=bool(replayed.faults))
 
 
 def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) -> Iterator[str]:
@@ -547,12 +547,12 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
             log = Path(folder, "annotated.mcap")
             faults = _evaluate(request, log)
         with progress("rows") as advance:
-            rows, columns, lost = export_table(
+            row_count, column_count, losses = export_table(
                 open_source(log), output, quantity=quantity, inputs=request.inputs, advance=advance
             )
-    warn(*lost)
-    show(f"wrote {output}: {plural(rows, 'row')}, {plural(columns, 'node')}")
-    return ExitCode.DAMAGED if faults or lost else ExitCode.SATISFIED
+    warn(*losses)
+    show(f"wrote {output}: {plural(row_count, 'row')}, {plural(column_count, 'node')}")
+    return ExitCode.DAMAGED if faults or losses else ExitCode.SATISFIED
 
 
 def _is_evaluated(request: EvaluationArguments) -> bool:
@@ -605,8 +605,8 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     from spatial_replay.replay.engine import run_replay
     from spatial_replay.replay.selection import has_samples_from
 
-    name, _, object_of = result.partition("@")
-    node, object_name = name or None, object_of or None
+    spec_name, _, object_text = result.partition("@")
+    node_name, object_name = spec_name or None, object_text or None
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both set the last sample; give only one")
     inputs = _until(open_inputs(request), at)
@@ -621,41 +621,43 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
             advance=advance,
         )
     warn_of_input(replayed)
-    goes_on = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
-    if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
+    continues = at is not None and has_samples_from(inputs.source, inputs.window.end_ns)
+    if at is not None and not continues and replayed.end_ns < inputs.window.end_ns - 1:
         warn(f"--at {at} is after the last sample, at {time_text(replayed.end_ns, replayed.first_ns)}")
-    others: Sequence[SpecResult] = ()
-    counts = ""
+    other_results: Sequence[SpecResult] = ()
+    count_line = ""
     if not as_json and object_name is None:
-        fitting = [
-            result for result in replayed.results if verdict_of(result, node, goes_on=goes_on) is not None
+        matches = [
+            result
+            for result in replayed.results
+            if verdict_of(result, node_name, goes_on=continues) is not None
         ]
         # if none fits, the error suggests the nearest name among all
-        worst, others = worst_of(fitting) if fitting else (replayed.results, ())
-        if len(fitting) > MANY:
-            verdicts_of_all = [verdict_of(result, node, goes_on=goes_on) for result in fitting]
-            counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"
+        worst, other_results = worst_of(matches) if matches else (replayed.results, ())
+        if len(matches) > MANY:
+            all_verdicts = [verdict_of(result, node_name, goes_on=continues) for result in matches]
+            count_line = f"{len(matches):,} results: {counts_text(map(str, all_verdicts))}"
         replayed = replace(replayed, results=tuple(worst))
-    verdicts_of_others = [str(verdict_of(result, node, goes_on=goes_on)) for result in others]
-    results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
-    idle = replayed.vacuous if node is None and object_name is None else ()
+    other_verdicts = [str(verdict_of(result, node_name, goes_on=continues)) for result in other_results]
+    explanations = explain_results(replayed, node=node_name, object=object_name, goes_on=continues)
+    vacuous_parts = replayed.vacuous if node_name is None and object_name is None else ()
 
     def documents() -> list[Any]:
-        return [*(explanation.document for explanation in results), *map(idle_document, idle)]
+        return [*(explanation.document for explanation in explanations), *map(idle_document, vacuous_parts)]
 
     def lines() -> Iterator[Line]:
-        texts = [*([[counts]] if counts else []), *_texts(results)]
-        if idle:
-            texts.append([part.message for part in idle])
-        if others:
-            texts.append([others_text(others, verdicts_of_others)])
-        for number, sentences in enumerate(texts):
-            yield from ([""] if number else [])
+        paragraphs = [*([[count_line]] if count_line else []), *_texts(explanations)]
+        if vacuous_parts:
+            paragraphs.append([part.message for part in vacuous_parts])
+        if other_results:
+            paragraphs.append([others_text(other_results, other_verdicts)])
+        for index, sentences in enumerate(paragraphs):
+            yield from ([""] if index else [])
             yield from map(_colour_verdicts, sentences)
 
     show_result(documents, lines, as_json)
-    verdicts = [*(explanation.verdict for explanation in results), *verdicts_of_others]
-    verdicts += _doubtful((*replayed.results, *others))
+    verdicts = [*(explanation.verdict for explanation in explanations), *other_verdicts]
+    verdicts += _doubtful((*replayed.results, *other_results))
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 
@@ -670,13 +672,13 @@ _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")
 
 def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
     """Yield each explanation, below its requirement. Consecutive explanations of a node share the heading."""
-    before = None
+    previous_spec = None
     for explanation in explanations:
-        spec = explanation.document["specification"], explanation.document["node"]
+        spec_and_node = explanation.document["specification"], explanation.document["node"]
         requirement = requirement_text(explanation.document["requirement"], explanation.document["title"])
-        heading = [requirement] if requirement and spec != before else []
+        heading = [requirement] if requirement and spec_and_node != previous_spec else []
         yield [*heading, *explanation.sentences]
-        before = spec
+        previous_spec = spec_and_node
 
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:

@@ -28,16 +28,16 @@ def _ids(context: click.Context, parameter: click.Parameter, text: str | None) -
     """Return the numbers in a text such as 0-7,12."""
     if text is None:
         return None
-    numbers: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        last = last if dash else first
-        if not (first.isdecimal() and last.isdecimal()) or len(first + last) > 12:
-            raise UsageError(f"--ids: {part!r} is neither a number nor a range; write 0-7 or 0,3,5-9")
-        if int(last) - int(first) >= _MOST:
-            raise UsageError(f"--ids: {part!r} names more than {_MOST} tags; print fewer at once")
-        numbers += range(int(first), int(last) + 1)
-    return tuple(numbers)
+    tag_numbers: list[int] = []
+    for range_text in text.split(","):
+        first_number, dash, last_number = range_text.strip().partition("-")
+        last_number = last_number if dash else first_number
+        if not (first_number.isdecimal() and last_number.isdecimal()) or len(first_number + last_number) > 12:
+            raise UsageError(f"--ids: {range_text!r} is neither a number nor a range; write 0-7 or 0,3,5-9")
+        if int(last_number) - int(first_number) >= _MOST:
+            raise UsageError(f"--ids: {range_text!r} names more than {_MOST} tags; print fewer at once")
+        tag_numbers += range(int(first_number), int(last_number) + 1)
+    return tuple(tag_numbers)
 
 
 def _size(context: click.Context, parameter: click.Parameter, text: str | None) -> float | None:
@@ -98,8 +98,8 @@ def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, outpu
 
     if output.suffix.lower() != ".pdf":
         raise UsageError(f"-o {output.name}: sheets are written as PDF; give a name that ends in .pdf")
-    pages = TagSheet(family, ids, size, paper).write(output)
-    show(f"wrote {output}: {plural(len(ids), 'tag')} of {size * 1e3:g} mm on {plural(pages, 'page')}")
+    page_count = TagSheet(family, ids, size, paper).write(output)
+    show(f"wrote {output}: {plural(len(ids), 'tag')} of {size * 1e3:g} mm on {plural(page_count, 'page')}")
     return ExitCode.SATISFIED
 
 
@@ -148,19 +148,19 @@ def calibrate(
     if output is not None:
         refuse_inputs(output, local_files([source, *([tags_file] if tags_file is not None else [])]))
     if tags_file is not None:
-        loaded = load_tags(tags_file)
-        family, references = loaded.family, loaded.references
+        layout = load_tags(tags_file)
+        family, references = layout.family, layout.references
         if not references:
-            raise UsageError(f"{loaded.name} has no reference tags; give --ids and --size of a printed sheet")
+            raise UsageError(f"{layout.name} has no reference tags; give --ids and --size of a printed sheet")
     elif ids is None or size is None:
         raise UsageError("give --ids and --size of the printed sheet, or --tags TAGS")
     else:
         references = TagSheet(family, ids, size, paper).references()
     frames = open_frames(source, topic=topic)
     with progress("frames") as advance:
-        result = calibrate_camera(source.name, _counting(frames, advance), family, references)
-    warn(*result.remarks, *frames.faults)
-    text = camera_text(result.calibration.camera)
+        calibration = calibrate_camera(source.name, _counting(frames, advance), family, references)
+    warn(*calibration.remarks, *frames.faults)
+    text = camera_text(calibration.calibration.camera)
     if output is None:
         show_file(text)
     else:
@@ -168,11 +168,11 @@ def calibrate(
             output.write_text(text, encoding="utf-8")
         except OSError as error:
             raise OutputError(f"{output}: {(error.strerror or str(error)).lower()}") from None
-    fx, fy, *_ = result.calibration.deviations
-    rms = result.calibration.rms
+    fx_deviation, fy_deviation, *_ = calibration.calibration.deviations
+    rms = calibration.calibration.rms
     show(
-        f"{plural(result.views, 'view')}, corners within {rms:.2f} pixels; focal lengths to"
-        f" {2 * fx:.1f} and {2 * fy:.1f} pixels",
+        f"{plural(calibration.views, 'view')}, corners within {rms:.2f} pixels; focal lengths to"
+        f" {2 * fx_deviation:.1f} and {2 * fy_deviation:.1f} pixels",
         err=output is None,
     )
     return ExitCode.SATISFIED

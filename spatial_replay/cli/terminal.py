@@ -66,23 +66,23 @@ def show(*lines: Line, err: bool = False) -> None:
     """
     for line in lines:
         pieces = (line,) if isinstance(line, (str, Coloured)) else line
-        whole = "".join(escape_text(piece.text if isinstance(piece, Coloured) else piece) for piece in pieces)
-        first, *rest = [whole]
+        text = "".join(escape_text(piece.text if isinstance(piece, Coloured) else piece) for piece in pieces)
+        first_line, *other_lines = [text]
         if (sys.stderr if err else sys.stdout).isatty():
-            first, *rest = _fit_lines(whole)
-        styled = "\n".join([_style(pieces, len(first)), *rest])
+            first_line, *other_lines = _fit_lines(text)
+        styled = "\n".join([_style(pieces, len(first_line)), *other_lines])
         click.echo(styled, err=err, color=False if os.environ.get("NO_COLOR") else None)
 
 
-def _style(pieces: Iterable[str | Coloured], most: int) -> str:
+def _style(pieces: Iterable[str | Coloured], max_length: int) -> str:
     """Return the first characters of a line, in colours."""
-    styled = ""
+    styled_text = ""
     for piece in pieces:
-        text = escape_text(piece.text if isinstance(piece, Coloured) else piece)[:most]
-        most -= len(text)
+        text = escape_text(piece.text if isinstance(piece, Coloured) else piece)[:max_length]
+        max_length -= len(text)
         colour = _HUES[piece.colour] if isinstance(piece, Coloured) else None
-        styled += text if colour is None else click.style(text, fg=colour, bold=True)
-    return styled
+        styled_text += text if colour is None else click.style(text, fg=colour, bold=True)
+    return styled_text
 
 
 class StatusLine:
@@ -116,16 +116,19 @@ def _fit_lines(line: str) -> list[str]:
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     width = max(terminal_width(), _LEAST_WIDTH)
     # a no-break space keeps a number with its unit
-    joined = _BEFORE_UNIT.sub(_NO_BREAK, line)
-    pieces = wrap(joined, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-    return [piece.replace(_NO_BREAK, " ") for piece in pieces] or [line]
+    text = _BEFORE_UNIT.sub(_NO_BREAK, line)
+    lines = wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [piece.replace(_NO_BREAK, " ") for piece in lines] or [line]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:
     """Print a value as JSON, with JSON's escapes for unprintable characters."""
     text = json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False)
     click.echo(
-        "".join(sign if sign == "\n" or sign.isprintable() else json.dumps(sign)[1:-1] for sign in text)
+        "".join(
+            character if character == "\n" or character.isprintable() else json.dumps(character)[1:-1]
+            for character in text
+        )
     )
 
 
@@ -185,10 +188,10 @@ def printing_to(output: Path | None, inputs: Iterable[Path] = ()) -> Iterator[No
     from spatial_replay.logs.output_file import replacing
 
     with replacing(output, inputs) as stream:
-        printed = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
-        with redirect_stdout(printed):
+        printed_text = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
+        with redirect_stdout(printed_text):
             yield
-        stream.write(printed.buffer.getvalue())
+        stream.write(printed_text.buffer.getvalue())
 
 
 def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:
@@ -199,11 +202,11 @@ def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:
 
 def show_message(severity: str, message: str, colour: str) -> None:
     """Print "spatial-replay: SEVERITY: MESSAGE" to standard error; further lines are indented."""
-    first, *others = message.split("\n")
+    first_line, *other_lines = message.split("\n")
     label = Coloured(f"{severity}:", colour)
     # indented lines stay as they are, because carets point into the line above
-    indented = (line if line.startswith("  ") else f"  {line}" for line in others)
-    show((f"{PROGRAM}: ", label, f" {first}"), *indented, err=True)
+    indented_lines = (line if line.startswith("  ") else f"  {line}" for line in other_lines)
+    show((f"{PROGRAM}: ", label, f" {first_line}"), *indented_lines, err=True)
 
 
 def warn(*messages: str) -> None:
@@ -253,12 +256,12 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
 
 def _counting(listener: Listener, label: str, total: int | None) -> Advance:
     """Return a function that gives a listener the number of all steps so far."""
-    count = 0
+    step_count = 0
 
     def advance(steps: int) -> None:
-        nonlocal count
-        count += steps
-        listener.progress(label, count, total)
+        nonlocal step_count
+        step_count += steps
+        listener.progress(label, step_count, total)
 
     listener.progress(label, 0, total)
     return advance
@@ -273,14 +276,14 @@ class _Bar:
     def __init__(self, label: str, total: int | None) -> None:
         self._label = self._description = label
         self._total = total
-        self._done = 0
-        self._shown: Progress | None = None
+        self._step_count = 0
+        self._progress: Progress | None = None
         self._timer = Timer(PATIENCE_S, self._appear)
         self._timer.daemon = True
         self._timer.start()
 
     def advance(self, steps: int) -> None:
-        self._done += steps
+        self._step_count += steps
         self._description = self._label
         self._update()
 
@@ -290,12 +293,14 @@ class _Bar:
         self._update()
 
     def _update(self) -> None:
-        if self._shown is not None:
-            self._shown.update(self._shown.task_ids[0], description=self._description, completed=self._done)
+        if self._progress is not None:
+            self._progress.update(
+                self._progress.task_ids[0], description=self._description, completed=self._step_count
+            )
 
     def _appear(self) -> None:
         # None inside other work, which already has a bar
-        self._shown = _start_bar(self._description, self._total, self._done)
+        self._progress = _start_bar(self._description, self._total, self._step_count)
         # steps may have been done while the bar was made
         self._update()
 
@@ -303,11 +308,11 @@ class _Bar:
         self._timer.cancel()
         # the timer may be about to show the bar
         self._timer.join()
-        if self._shown is not None:
-            self._shown.stop()
+        if self._progress is not None:
+            self._progress.stop()
 
 
-def _start_bar(label: str, total: int | None, done: int) -> Progress | None:
+def _start_bar(label: str, total: int | None, step_count: int) -> Progress | None:
     # importing rich would take a quarter of the time of `--help`
     from rich.console import Console
     from rich.errors import LiveError
@@ -321,7 +326,7 @@ def _start_bar(label: str, total: int | None, done: int) -> Progress | None:
         TimeRemainingColumn(),
     )
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    bar.add_task(label, total=total, completed=done)
+    bar.add_task(label, total=total, completed=step_count)
     try:
         bar.start()
     except LiveError:

@@ -53,20 +53,20 @@ class ManyLogs(JsonCommand):
 
 
 def _one_by_one(arguments: list[str]) -> Iterator[str]:
-    repeated: str | None = None
-    is_first = False
+    repeated_option: str | None = None
+    is_first_value = False
     for argument in arguments:
         if argument in _MANY:
-            repeated, is_first = argument, True
+            repeated_option, is_first_value = argument, True
             yield argument
         elif argument.startswith("-") and argument != "-":
-            repeated = None
+            repeated_option = None
             yield argument
         else:
             # an option of click takes one value, so its name is repeated before each further value
-            if repeated is not None and not is_first:
-                yield repeated
-            is_first = False
+            if repeated_option is not None and not is_first_value:
+                yield repeated_option
+            is_first_value = False
             yield argument
 
 
@@ -164,9 +164,9 @@ def tune(
         runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
         tuning = tune_runs(file, runs, ranges, each=objects_by_parameter(choices), seed=seed, advance=advance)
     _warn_of_doubts(runs)
-    changed: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
     if write and tuning.is_found:
-        changed = write_constants(local_copy(spec), plain_values(tuning.specification))
+        changes = write_constants(local_copy(spec), plain_values(tuning.specification))
     if output is not None:
         from spatial_replay.notebook.study_view import write_surface
 
@@ -174,7 +174,7 @@ def tune(
     show_result(lambda: tuning.document, lambda: _lines(tuning), as_json)
     if not as_json:
         if write and tuning.is_found:
-            show(f"{spec}: {', '.join(changed)} written" if changed else f"{spec} has these values already")
+            show(f"{spec}: {', '.join(changes)} written" if changes else f"{spec} has these values already")
         if output is not None:
             show(f"wrote {output}")
     return ExitCode.SATISFIED if tuning.is_found else ExitCode.VIOLATED
@@ -186,19 +186,23 @@ def _warn_of_doubts(runs: Sequence[LabelledRun]) -> None:
 
 
 def _lines(tuning: Tuning) -> Iterator[str]:
-    count = {is_good: sum(run.is_good == is_good for run in tuning.runs) for is_good in (True, False)}
-    runs = plural(count[True], "good run") + (
-        f" and {plural(count[False], 'bad run')}" if count[False] else ""
+    counts = {is_good: sum(run.is_good == is_good for run in tuning.runs) for is_good in (True, False)}
+    runs_text = plural(counts[True], "good run") + (
+        f" and {plural(counts[False], 'bad run')}" if counts[False] else ""
     )
     if tuning.conflict is not None:
         names = ", ".join(constant.name for constant in tuning.constants)
-        start = f"no values of {names} exist" if tuning.conflict.is_proven else f"found no values of {names}"
-        for number, (what, needs) in enumerate(tuning.conflict.sections):
-            yield f"and {what}:" if number else f"{start} that fit {runs}; {what}:"
-            yield from (f"  {part}" for part in needs)
+        beginning = (
+            f"no values of {names} exist" if tuning.conflict.is_proven else f"found no values of {names}"
+        )
+        for number, (heading, lines) in enumerate(tuning.conflict.sections):
+            yield f"and {heading}:" if number else f"{beginning} that fit {runs_text}; {heading}:"
+            yield from (f"  {line}" for line in lines)
         return
-    kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
-    yield f"{kind} for {runs}: {tuning.margin + 0.0:.6g}" if count[False] else f"{kind} for {runs}"
+    label = ("widest margin" if tuning.is_widest else "margin") if counts[False] else "tightest values"
+    yield (
+        f"{label} for {runs_text}: {tuning.margin + 0.0:.6g}" if counts[False] else f"{label} for {runs_text}"
+    )
     undecided = [constant.name for constant in tuning.constants if not constant.is_decided]
     if undecided:
         names = ", ".join(undecided)
@@ -209,22 +213,22 @@ def _lines(tuning: Tuning) -> Iterator[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-    closest = sorted(tuning.runs, key=lambda run: run.margin)
-    yield "closest runs:" if len(closest) > _MOST_LISTED else "runs, the closest first:"
-    width = max(len(run.name) for run in closest[:_MOST_LISTED])
-    for run in closest[:_MOST_LISTED]:
-        kind = "good" if run.is_good else "bad "
-        yield f"  {run.name:<{width}}  {kind}  {run.verdict:<9}  robustness {run.robustness + 0.0:.6g}"
-    if len(closest) > _MOST_LISTED:
-        yield f"  … and {plural(len(closest) - _MOST_LISTED, 'more run')}"
+    closest_runs = sorted(tuning.runs, key=lambda run: run.margin)
+    yield "closest runs:" if len(closest_runs) > _MOST_LISTED else "runs, the closest first:"
+    width = max(len(run.name) for run in closest_runs[:_MOST_LISTED])
+    for run in closest_runs[:_MOST_LISTED]:
+        label = "good" if run.is_good else "bad "
+        yield f"  {run.name:<{width}}  {label}  {run.verdict:<9}  robustness {run.robustness + 0.0:.6g}"
+    if len(closest_runs) > _MOST_LISTED:
+        yield f"  … and {plural(len(closest_runs) - _MOST_LISTED, 'more run')}"
 
 
 def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
     def text(value: Any) -> str:
         return value if isinstance(value, str) else f"{value:.12g}"
 
-    span = f"every value from {text(constant.low)} to {text(constant.high)} fits"
-    return constant.name, text(constant.value), f"({text(constant.written)} as written)", span
+    range_text = f"every value from {text(constant.low)} to {text(constant.high)} fits"
+    return constant.name, text(constant.value), f"({text(constant.written)} as written)", range_text
 
 
 @click.command(cls=ManyLogs)
@@ -268,17 +272,17 @@ def learn(
         refuse_inputs(output, inputs)
     with progress("logs", 2 * len(good + bad)) as advance:
         runs = load_runs(good, bad, lambda path: read_trace(path, **reading), advance)
-        learned = learn_runs(runs, lines=lines or DEFAULT_LINES, advance=advance)
+        learning = learn_runs(runs, lines=lines or DEFAULT_LINES, advance=advance)
     _warn_of_doubts(runs)
-    if output is not None and learned.text:
+    if output is not None and learning.text:
         with replacing(output, inputs) as stream:
-            stream.write(learned.text.encode())
+            stream.write(learning.text.encode())
     if as_json:
-        show_json(learned.document)
-    elif output is not None or not learned.text:
-        show(*learned.lines())
-        if learned.text:
+        show_json(learning.document)
+    elif output is not None or not learning.text:
+        show(*learning.lines())
+        if learning.text:
             show(f"wrote {output}")
     else:
-        show_file(learned.text)
-    return ExitCode.SATISFIED if learned.is_found else ExitCode.VIOLATED
+        show_file(learning.text)
+    return ExitCode.SATISFIED if learning.is_found else ExitCode.VIOLATED

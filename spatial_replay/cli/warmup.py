@@ -79,8 +79,8 @@ def _samples() -> list[Sample]:
         Sample(
             second * 10**9,
             {
-                name: TrackedObject(shapes[(second + place) % 3], "thing", 0.1 * second, (0.0, 1.0), 0.01)
-                for place, name in enumerate(("cup", "jug"))
+                name: TrackedObject(shapes[(second + index) % 3], "thing", 0.1 * second, (0.0, 1.0), 0.01)
+                for index, name in enumerate(("cup", "jug"))
             },
             {"load": float(second)},
         )
@@ -121,8 +121,8 @@ def _evaluate_as_the_paper() -> None:
 
 def _compare() -> None:
     samples = _samples()
-    runs = [MemorySource(Trace.from_samples(run)) for run in (samples, samples[1:])]
-    diff_sources((runs[0], runs[1]))
+    sources = [MemorySource(Trace.from_samples(run_samples)) for run_samples in (samples, samples[1:])]
+    diff_sources((sources[0], sources[1]))
 
 
 def _read_bag() -> None:
