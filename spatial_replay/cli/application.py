@@ -180,7 +180,7 @@ def _end_waiting_threads(exit_code: int) -> None:
     """End the process if a thread still waits, for example for data of a pipe."""
     deadline_s = time.monotonic() + _PATIENCE_S
     main_thread = threading.main_thread()
-    # an interruption may come before a new thread starts, and such a thread cannot be joined
+    # an interruption may precede the start of a new thread, and such a thread cannot be joined
     threads = [
         thread
         for thread in threading.enumerate()
@@ -240,7 +240,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.BROKEN_PIPE
     except (Exception, KeyboardInterrupt) as error:
-        # click turns every EOFError into an Abort, which stands for an interruption otherwise
+        # click raises Abort for an interruption and for every EOFError; their causes differ
         is_end_of_file = isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError)
         reported_error = error.__cause__ or error if is_end_of_file else error
         report_error(reported_error)
@@ -263,7 +263,7 @@ class ExitCode(IntEnum):
     """An internal error, or a failure of the machine."""
     INTERRUPTED = 130
     BROKEN_PIPE = 141
-    """The reader of standard output closed it. Shells give this code for SIGPIPE."""
+    """The reader of the pipe closed it. Shells report SIGPIPE with this code."""
 
 
 _VERDICTS = {
@@ -293,7 +293,7 @@ def exit_code_from_verdicts(verdicts: Iterable[str], damaged: bool = False) -> E
     """Return the code for the verdicts of an evaluation; "pending" counts as "unknown".
 
     Args:
-        damaged: whether parts of the log were lost, so that the verdicts cover only the rest.
+        damaged: whether parts of the log are missing; the verdicts cover the readable parts.
     """
     codes = [_VERDICTS[verdict] for verdict in verdicts]
     return most_severe([*codes, ExitCode.DAMAGED] if damaged else codes)
@@ -317,7 +317,7 @@ def message_from_error(error: BaseException) -> str:
     """Return the message of an error for the user, in a few lines."""
     match error:
         case click.Abort() | KeyboardInterrupt():
-            # click raises its Abort in place of the interruption, which carries the notes
+            # click replaces the interruption by an Abort; the interruption is its cause, and has the notes
             notes = getattr(error.__cause__ or error, "__notes__", ())
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
@@ -330,7 +330,10 @@ def message_from_error(error: BaseException) -> str:
                 message = f"no option {error.option_name}; {remedy}" if remedy else message
             parameters = context.command.params
             if "unexpected extra" in message and any("--spec" in parameter.opts for parameter in parameters):
-                message += f"; specifications come after --spec: {command_path} LOG --spec FILE; batch takes many logs"
+                message += (
+                    f"; specifications come after --spec: {command_path} LOG --spec FILE; "
+                    "batch takes many logs"
+                )
             if "'--spec'" in message and any(parameter.name == "specification" for parameter in parameters):
                 message += f" {command_path} FILE takes the specification without it."
             return f"{message}\n  see '{command_path} --help'"

@@ -65,9 +65,9 @@ _BATCH: Final = 10_000
 
 
 def print_totals(table: pa.Table, by: By) -> None:
-    """Print the numbers of results by verdict, for each spec or for each log.
+    """Print the number of results with each verdict, by spec or by log.
 
-    After a comparison with a baseline, it also prints the numbers of worse and missing results.
+    After a comparison with a baseline, the table also has the numbers of worse and missing results.
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.run_table import EDITED_SINCE, counts_of, totals
@@ -82,7 +82,7 @@ def print_totals(table: pa.Table, by: By) -> None:
         line: list[str | Coloured] = [f"  {title:<{width}}"]
         for name, counts in counts_by_heading.items():
             count = counts[index]
-            # if all verdicts are as expected, none is coloured as bad
+            # only satisfied results are coloured if all verdicts are as expected
             colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
             cell = f"{count:>9,}" if count else f"{'-':>9}"
             line += ["  ", Coloured(cell, colour) if count and colour else cell]
@@ -125,7 +125,7 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
 def write_json_lines(
     table: pa.Table | Sequence[Mapping[str, Any]], file: str, inputs: Sequence[Path]
 ) -> None:
-    """Write each row as a JSON object on a line, to a file, or to standard output for "-"."""
+    """Write each row as one line of JSON to a file; "-" is standard output."""
     from spatial_replay.logs.output_file import replacing
 
     if isinstance(table, Sequence):
@@ -146,7 +146,10 @@ def write_json_lines(
 
 
 def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
-    """Return the exit code of a run, as of a replay; expected results count as satisfied."""
+    """Return the exit code of a batch, with the meanings of a replay's codes.
+
+    Expected results count as satisfied.
+    """
     columns = ("failure", "error_kind", "verdict", "faults")
     codes = set()
     for failure, error_kind, verdict, faults in zip(
@@ -170,7 +173,7 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
 
 
 def code_of_errors(table: pa.Table) -> ExitCode:
-    """Return the exit code of damaged logs and of errors."""
+    """Return the exit code for damaged logs and errors."""
     error_rows = _columns(table, "faults", "error_kind")
     codes = [_KIND_CODES[kind] for _, kind in error_rows if kind is not None]
     return most_severe([*codes, *(ExitCode.DAMAGED for faults, _ in error_rows if faults)])
@@ -228,7 +231,7 @@ _OUTPUTS = (
     click.option(
         "--tolerance",
         metavar="T",
-        help="With --baseline: how much worse may pass: 0.02m, or '5%, at least 0.002m'.",
+        help="With --baseline: tolerated loss of robustness: 0.02m, or '5%, at least 0.002m'.",
     ),
     click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
 )
@@ -325,7 +328,7 @@ def batch(
 
 @contextmanager
 def resumable(folder: str) -> Iterator[None]:
-    """Add a note to an interruption, which names the folder of the results so far."""
+    """Add a note to an interruption: the folder of the results so far."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -359,7 +362,7 @@ def _write_outputs(
 
 
 def _suite(logs: tuple[str, ...], arguments: ConditionArguments, semantics: Semantics) -> Suite:
-    """Return the named suite, or the suite of given logs and options.
+    """Return the suite of a suite file, or of logs with options.
 
     Raises:
         UsageError: both are given, there is no specification, or the suite is invalid.
@@ -380,7 +383,7 @@ def _suite(logs: tuple[str, ...], arguments: ConditionArguments, semantics: Sema
 
 
 def suite_of_logs(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantics) -> Suite:
-    """Return the suite of given logs and options.
+    """Return the suite of logs with options.
 
     Raises:
         UsageError: there is no specification, or a time is invalid.
@@ -406,7 +409,7 @@ def _conditions(options: ConditionArguments, semantics: Semantics) -> Conditions
 
 
 def inputs_of(suite: Suite) -> list[Path]:
-    """Return the input files of a suite, except its logs, which may be very many."""
+    """Return the input files of a suite without its logs. A suite may have very many logs."""
     mappings = [case.conditions.mapping for case in suite.cases if case.conditions.mapping is not None]
     specs = [spec for case in suite.cases for spec in case.specs]
     suites = [] if suite.path is None else [suite.path]
@@ -443,7 +446,7 @@ def evaluated_batch(cases: Sequence[PreparedCase], folder: str, workers: Workers
 
 
 def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
-    """Print the results of a run, with the comparison that all outputs show.
+    """Print the results of a run, compared with the baseline if there is one.
 
     Args:
         evaluated: the results without the comparison.
@@ -462,7 +465,8 @@ def _print(result: BatchResult, evaluated: BatchResult, folder: str) -> None:
     cut_count = pc.sum(pc.equal(result.table["tested"], "cut")).as_py()
     if cut_count:
         show(
-            f"{plural(cut_count, 'result')} decided by a window that the end of the log cut: see --fail-on cut"
+            f"{plural(cut_count, 'result')} decided by a window that the end of the log cut: "
+            "see --fail-on cut"
         )
     failure_count = len(result.failures)
     if failure_count:
@@ -552,7 +556,7 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
 @click.option(
     "--tolerance",
     metavar="T",
-    help="With LATER: how much less is no change: 0.02m, or '5%, at least 0.002m'.",
+    help="With LATER: loss of robustness that is no change: 0.02m, or '5%, at least 0.002m'.",
 )
 @click.pass_context
 def results(
@@ -609,11 +613,11 @@ def results(
 
 
 _MOST_HERE = 64
-"""Largest number of results that this process explains alone."""
+"""Largest number of results that are explained without further processes."""
 
 
 def explain_table_rows(table: pa.Table, places: Collection[int]) -> pa.Table:
-    """Explain the rows of a run's table at some places from their logs, and return the table."""
+    """Explain the rows `places` of a run's table from their logs, and return the table."""
     from spatial_replay.batch.explanations import explain_rows
     from spatial_replay.batch.run import workers_of
 

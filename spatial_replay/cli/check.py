@@ -81,7 +81,9 @@ def findings_of(specification: str, form: Form) -> Iterator[None]:
 
 
 def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None:
-    """Print errors and warnings as workflow commands of GitHub, or as one SARIF object; not as text.
+    """Print errors and warnings as GitHub workflow commands, or as one SARIF object.
+
+    The form "text" prints nothing here.
 
     Args:
         path: path or address of the specification, as given.
@@ -158,7 +160,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option(
     "--dfa", metavar="FILE|-", help="File for the automaton: .dot, .hoa or .svg; '-' prints it as text."
 )
-@click.option("--result", "of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
+@click.option("--result", "of", metavar="NAME", help="With --dfa: the result, if SPEC has several.")
 @click.option(
     "--hz",
     metavar="N",
@@ -301,7 +303,10 @@ def _compare_with_log(
     count_texts += (
         [plural(other_count, "other warning" if missing_count else "warning")] if other_count else []
     )
-    summary = f"compared with {plural(log_numbers.samples, 'sample')} of {source.name} over {log_numbers.seconds:.3f} s: "
+    summary = (
+        f"compared with {plural(log_numbers.samples, 'sample')} of {source.name} over "
+        f"{log_numbers.seconds:.3f} s: "
+    )
     return _Compared(
         (*unknown_names, *log_warnings),
         window_lines(specification, log_numbers),
@@ -311,7 +316,7 @@ def _compare_with_log(
 
 
 class _CutResults:
-    """Finds results that are decided by a window cut by the end of the log. Templates are left out."""
+    """Finds results whose deciding window is cut by the end of the log. Templates are left out."""
 
     def __init__(self, specification: Specification) -> None:
         # only needed with --log: the monitor loads the numerical libraries
@@ -331,7 +336,7 @@ class _CutResults:
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
     def warnings(self, source: Source, ends: RunEnds, zero_ns: int) -> Iterator[Diagnostic]:
-        """Yield a warning for each result, at its window; times count from `zero_ns`."""
+        """Yield a warning for each such result, at its window. Printed times count from `zero_ns`."""
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence
@@ -419,7 +424,7 @@ def _check_automaton_options(
     """Check the options of `_write_automata` before anything is printed.
 
     Raises:
-        UsageError: the file type is unknown, the file is an input, the spec is missing, or there are several.
+        UsageError: the file type is unknown, the file is an input, or the spec is missing or ambiguous.
     """
     from spatial_replay.automata.compile import chosen_spec
     from spatial_replay.logs.output_file import refuse_inputs
@@ -447,7 +452,7 @@ def _write_automata(
     """Write the automaton of one spec to a file, or print the automata of all results.
 
     Args:
-        quiet: keep the message about the file off standard output.
+        quiet: whether the message about the file goes to standard error.
 
     Raises:
         NoAutomatonError: a spec has no automaton; raised after the others are printed.
@@ -520,9 +525,9 @@ def doctor(
     """Find faults of a specification before any run.
 
     Faults are specs that no run can satisfy, that every run satisfies, or that follow from another spec or
-    contradict it. Implications whose antecedent never holds are faults, too. The automaton and laws of
-    geometry decide. For each result, the command prints the shortest run that satisfies it and the shortest
-    run that violates it. Exits with 1 if there is a fault, otherwise with 0.
+    contradict it. Implications whose antecedent never holds are faults, too. Automata and laws of geometry
+    prove the faults. For each result, the command prints the shortest satisfying run and the shortest
+    violating run. Exits with 1 if there is a fault, otherwise with 0.
 
     \b
     Examples:
@@ -549,7 +554,7 @@ def doctor(
 
 
 def _write(examination: Examination, output: Path, inputs: list[Path]) -> dict[tuple[str, str], Path]:
-    """Write the samples of all examples; return the files."""
+    """Write the samples of all examples; return the files by spec and verdict."""
     from spatial_replay.logs.output_file import replacing
 
     try:

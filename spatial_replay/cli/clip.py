@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     "of",
     metavar="NAME",
     multiple=True,
-    help="Spec to keep the verdict of; repeat for several.  [default: the violated ones, or all]",
+    help="Spec whose verdict is kept; repeat for several.  [default: violated specs, or all]",
 )
 @click.option(
-    "--around", metavar="T", default="0s", help="Keep at least T before and after the samples that decide."
+    "--around", metavar="T", default="0s", help="Keep at least T before and after the deciding samples."
 )
 @click.option(
     "--topics",
@@ -56,10 +56,10 @@ def clip(
 ) -> int:
     """Copy the smallest part of a log that shows a verdict, for a bug report.
 
-    The clip has the same verdicts, robustness and witnesses as the log for the violated results; if none is
-    violated, for all results. It is an annotated log: every viewer plays it, and `replay` evaluates it
-    without other files. The clip has the messages of all topics in its time. The last earlier message of each
-    topic and the last earlier transform of each frame are in the clip, too, with their own times.
+    Violated results have the same verdicts, robustness and witnesses in the clip as in the log. Without a
+    violation, this holds for all results. The clip is an annotated log: every viewer plays it, and `replay`
+    evaluates it without other files. The clip has the messages of all topics in its time. The last earlier
+    message of each topic and the last earlier transform of each frame are in the clip, too, with their times.
 
     T is 5s or 500ms. Exits with 0 if the clip was written, 3 if the log is damaged.
 
@@ -188,10 +188,10 @@ def _gap(gap: SampleGap, first_ns: int) -> str:
     "--source",
     metavar="SOURCE",
     type=LogPath(),
-    help="Evaluate the log that LOG was made from instead of LOG.",
+    help="Evaluate SOURCE, the log from which LOG was made, instead of LOG.",
 )
 @click.option("--decisions", is_flag=True, help="Also recompute the decisions of a planned run.")
-@click.option("--explain", is_flag=True, help="Say which part differs, and where first.")
+@click.option("--explain", is_flag=True, help="Show the different part, and its first difference.")
 @click.option(
     "--sign",
     metavar="KEY",
@@ -224,9 +224,9 @@ def verify(
     """Recompute a log's certificate and compare it with the recorded one.
 
     The log is evaluated with its own specifications and options. With --decisions, every planner decision is
-    recomputed from the recorded samples, with all its maps, and compared bit for bit. With --source, these
-    are the decisions in the source. With --sign, a correct certificate is signed with your SSH key, into
-    LOG.sig. With --signer, this signature is checked. Exits with 0 if all is equal, otherwise with 1.
+    recomputed from the recorded samples, with all its maps, and compared bit for bit. With --source, the
+    decisions of the source are recomputed. With --sign, a correct certificate is signed with your SSH key,
+    into LOG.sig. With --signer, this signature is checked. Exits with 0 if all is equal, otherwise with 1.
 
     \b
     Examples:

@@ -22,9 +22,9 @@ _MOST_LABELS: Final = 1_000
 """Maximum number of episodes whose labels are counted."""
 _MOST_TASKS: Final = 5
 _MOST_NAMED: Final = 5
-"""Episodes that a warning names."""
+"""Maximum number of episodes in a warning."""
 _MOST_PLACES: Final = 60
-"""Places of a feature that the text of an episode lists."""
+"""Maximum number of printed places of a feature."""
 
 
 def show_data_set(data_set: DataSet, as_json: bool) -> int:
@@ -109,7 +109,7 @@ def _seconds(columns: EpisodeColumns) -> float:
 
 
 def _any_rate(data_set: DataSet) -> EpisodeReading:
-    """Return options of reading for values that do not depend on times."""
+    """Return reading options for values that are independent of times."""
     from spatial_replay.logs.formats.episodes import AS_STORED
 
     return AS_STORED._replace(fps=data_set.fps or 1.0)
@@ -139,7 +139,7 @@ def _read_labels(data_set: DataSet) -> list[bool | None]:
 
 
 def _bodies(data_set: DataSet) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the bodies of the first episode, and remarks, or the reason why it cannot be read."""
+    """Return the bodies of the first episode, and remarks. An unreadable episode gives only a remark."""
     if not data_set.names_bodies or not data_set.episodes:
         return [], []
     try:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _MOST_CAUSES = 3
-"""Specs whose edits are traced to a flipped verdict."""
+"""Maximum number of specs whose flipped verdict is traced to an edit."""
 
 
 @click.command(cls=JsonCommand)
@@ -48,9 +48,9 @@ _MOST_CAUSES = 3
     metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="How to align two logs. time: by time since the first sample. progress:NAME: by states of the"
-    " automaton of NAME. progress: the same, with the spec that has most states in common. NAME: by the"
-    " moment when that spec's robustness first changes its sign.",
+    help="Alignment of two logs. time: the time since the first sample. progress:NAME: states of NAME's"
+    " automaton. progress: states of the automaton with most common states. NAME: the first change of sign"
+    " of NAME's robustness.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("HTML page to write: both sides under one time cursor.")
@@ -66,13 +66,13 @@ def diff(
     """Compare two versions of a specification over one log or many, or two logs.
 
     With two specifications (--spec OLD --spec NEW), it shows the changed verdicts and numbers, the first
-    sample that differs, and the edit that is the cause. With one --spec, OLD is the specification in the log.
-    The cause is checked: OLD with this edit alone, and NEW without it, are evaluated.
+    different sample, and the edit that is the cause. With one --spec, OLD is the specification in the log.
+    The edit is tested: OLD with only this edit, and NEW without this edit, are evaluated.
 
     Over several logs, a folder or a pattern, it lists flipped verdicts and lower robustness.
 
-    With two logs and one specification, it shows the objects that moved differently and since when, the
-    effect on each spec, and the planner's first different decision.
+    With two logs and one specification, it shows the objects with different motions, the start of each
+    difference, the effects on specs, and the planner's first different decision.
 
     Exits with 0 if nothing differs except names of specs, and otherwise with 1. Over several logs, it exits
     with 1 if a verdict flipped. If a log is damaged, it exits with 3.
@@ -186,7 +186,10 @@ def _causes(
     specifications: Sequence[Specification],
     semantics: Semantics,
 ) -> Iterator[tuple[str, int, SpecDiff]]:
-    """Yield the first flipped result of the first few specs, with its log and the log's first time.
+    """Yield the first flipped result of each spec, for at most `_MOST_CAUSES` specs.
+
+    Yields:
+        The log, its first time in nanoseconds, and the difference of the result.
 
     Args:
         paths: paths of logs, by name.
@@ -258,5 +261,4 @@ def _of_logs(
 
 
 def _inputs(request: EvaluationArguments, second_log: LogFile | None) -> Sequence[Path]:
-    """Return the input files."""
     return request.inputs if second_log is None else (*request.inputs, *local_files([second_log]))

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 def distinguish(first: LogFile, second: LogFile, hz: float | None, as_json: bool) -> int:
     """Find the shortest run that one of two specifications accepts and the other one rejects.
 
-    Both directions are searched. A specification accepts a run if it satisfies all its results. Exits with 0
-    if both accept the same runs, with 1 if they differ, and with 4 if that is not decided.
+    Both directions are searched. A specification accepts a run if the run satisfies all its results. Exits
+    with 0 if both accept the same runs, with 1 if they differ, and with 4 if the search is undecided.
 
     \b
     Examples:

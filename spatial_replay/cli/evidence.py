@@ -1,4 +1,4 @@
-"""Evidence of how each topic of a log was read, as lines for a check at a glance."""
+"""Evidence about the reading of each topic of a log, as lines for a check at a glance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _AXES: Final = ("x", "y", "z")
 _LONG_PAUSE: Final = 2.0
-"""Length of a pause that is shown with its time, in median periods."""
+"""Least length of a pause that is shown with its time, in median periods."""
 
 
 def evidence_lines(overview: Overview) -> Iterator[str]:
@@ -29,7 +29,7 @@ def evidence_lines(overview: Overview) -> Iterator[str]:
 
 
 def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]:
-    """Yield the doubts about a topic, and the remarks on it, each with a mark."""
+    """Yield the doubts and the remarks about a topic, each with a mark."""
     for doubt in overview.doubts:
         if doubt.topic == topic:
             mark = "accepted" if doubt.is_accepted else "DOUBTFUL"
@@ -52,7 +52,7 @@ def _arrivals(facts: TopicFacts, first_ns: int) -> str:
 
 
 def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, str]]:
-    """Yield a label and a text for each kind of facts; the text is "" without any."""
+    """Yield a label and a text for each kind of facts. The text of a missing kind is ""."""
     if facts.lateness_s is not None:
         yield "lateness", f"{_range(facts.lateness_s, 's')} after the stamps"
     yield "publishers", plural(facts.publishers, "channel") if facts.publishers > 1 else ""

@@ -29,7 +29,7 @@ from spatial_replay.logs.remote import LogFile
     metavar="DIR",
     type=click.Path(path_type=Path),
     required=True,
-    help="Folder for the runs, logs and clips; a search that ended early goes on there.",
+    help="Folder for the runs, logs and clips; an interrupted search continues there.",
 )
 @click.option(
     "--vary",
@@ -47,7 +47,9 @@ from spatial_replay.logs.remote import LogFile
     help="Maximum number of runs of the search; reducing failures takes further runs.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
-@click.option("--planned", is_flag=True, help="Let the planner act for the scenario's task, not the script.")
+@click.option(
+    "--planned", is_flag=True, help="Let the planner act for the scenario's task, instead of the script."
+)
 @click.option(
     "--jobs",
     metavar="N",

@@ -1,4 +1,4 @@
-"""`spatial-replay info`: what a log contains."""
+"""`spatial-replay info`: the contents of a log."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 _EXTENSION = "spatial-replay.foxe"
 """File name of the extension for Foxglove and Lichtblick."""
 _EPOCH_LIKELY_NS = 10**18
-"""Least time (in 2001) that counts from 1970. Smaller times count from the start of the run."""
+"""Least time that counts from 1970; it is in 2001. Smaller times count from the start of the run."""
 
 
 _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
-"""Options of reading for external logs."""
+"""Reading options of external logs."""
 
 
 @click.command(cls=JsonCommand)
@@ -48,35 +48,35 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.option(
     "--fit",
     is_flag=True,
-    help="Print rates, gaps and known objects instead, as the section `requires` of a suite file for batch.",
+    help="Print the section `requires` of a suite file instead: rates, gaps and known objects.",
 )
 @click.option(
     "--decisions",
     metavar="[NUMBER]",
     is_flag=False,
     flag_value="",
-    help="Print the decisions of a planned run instead; with NUMBER, that decision in five lines.",
+    help="Print the decisions of a planned run instead; NUMBER selects one decision, in five lines.",
 )
 @click.option(
     "--specification",
     metavar="[NAME]",
     is_flag=False,
     flag_value="",
-    help="Print the text of the recorded specification instead; NAME chooses a file or a spec.",
+    help="Print the recorded specification instead; NAME selects a file or a spec.",
 )
-@click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
-@click.option("--panels", is_flag=True, help="With --layout: one with the panels of the extension.")
+@click.option("--layout", is_flag=True, help="Print the layout for a viewer instead.")
+@click.option("--panels", is_flag=True, help="With --layout: add the panels of the extension.")
 @click.option(
     "--blueprint",
     is_flag=True,
-    help="Write a blueprint for Rerun instead, to the file of -o; as .rrd with the log and its scene.",
+    help="Write a Rerun blueprint to the file of -o instead; an .rrd file also has the log and its scene.",
 )
 @click.option(
     "--panel",
     is_flag=True,
-    help="Write the extension for viewers instead; it is the same for every log, so give no LOG.",
+    help="Write the viewer extension instead, without a LOG: all logs have the same extension.",
 )
-@output_option("File to write instead of standard output; with --panel, instead of spatial-replay.foxe.")
+@output_option("Output file.  [default: standard output; spatial-replay.foxe for --panel]")
 @reading_options
 def info(
     log: LogFile | None,
@@ -92,13 +92,13 @@ def info(
     output: Path | None,
     reading: Reading,
 ) -> int:
-    """Show what a log contains: samples, objects, signals, topics, attachments.
+    """Show the contents of a log: samples, objects, signals, topics, attachments.
 
-    For an external log, it lists the topics that could map to objects; with a mapping, the mapped objects.
-    For a data set of episodes, it lists tasks, labels and features; push_v3#2 is one episode.
+    An external log is shown with its topics and their possible mapping; with a mapping, the objects are
+    shown. A data set is shown with its tasks, labels and features. push_v3#2 is the address of one episode.
 
-    Reads the whole log. Exits with 0, or with 3 if the log is damaged; the damage is reported on standard
-    error.
+    The command reads the whole log. The exit code is 0, or 3 for a damaged log. Damage is reported on
+    standard error.
 
     \b
     Examples:
@@ -202,7 +202,6 @@ def _print_data_set(
 
 
 def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
-    """Print the contents of a log."""
     # imported here so that --help stays fast
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.sources.open_log import open_source
@@ -237,7 +236,7 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
 
 
 def _episode_facts(source: Source) -> dict[str, str | None]:
-    """Return the task and the label of an episode of a data set; nothing for other logs."""
+    """Return the task and the label of a data set's episode. Other logs have neither."""
     from spatial_replay.mapping.episode_source import EpisodeSource
 
     if not isinstance(source, EpisodeSource):
@@ -248,7 +247,7 @@ def _episode_facts(source: Source) -> dict[str, str | None]:
 
 
 def _print_decisions(log: LogFile, number: str, as_json: bool) -> int:
-    """Print the decisions of a planned run, or the decision with a given number."""
+    """Print all decisions of a planned run; a number selects one decision."""
     from spatial_replay.planning.read import read_decisions
     from spatial_replay.replay.selection import known_zero_ns
     from spatial_replay.sources.open_log import open_source
@@ -323,7 +322,7 @@ def _write_blueprint(log: LogFile, output: Path | None) -> int:
 
 
 def _print_layout(log: LogFile, *, panels: bool) -> int:
-    """Print the layout in a log, or its form for viewers that have the extension."""
+    """Print the layout in a log. With `panels`, print its variant for viewers with the extension."""
     from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
     from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.replay.engine import planned_result
@@ -343,7 +342,7 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
 
 
 def _print_specification(log: LogFile, name: str) -> int:
-    """Print the texts of the specifications in a log, or the text with a given name."""
+    """Print the texts of the recorded specifications; a name selects one text."""
     from spatial_replay.replay.engine import recorded_texts
     from spatial_replay.sources.open_log import open_source
 
@@ -368,12 +367,11 @@ def _print_specification(log: LogFile, name: str) -> int:
 
 
 def _names_of(text: SpecificationText) -> list[str]:
-    """Return the names of the specs in a recorded text."""
     return [spec.name for spec in _specs_of(text)]
 
 
 def _requirements(source: Source) -> dict[str, NamedSpec]:
-    """Return the specs with requirements in a log, by the names of their results."""
+    """Return a log's specs with requirements, by result name."""
     from spatial_replay.replay.engine import recorded_texts
 
     specs_by_file = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
@@ -401,7 +399,6 @@ def _verdicts(container: LogSummary, specs: Mapping[str, NamedSpec]) -> Iterator
 
 
 def _specs_of(text: SpecificationText) -> Sequence[NamedSpec]:
-    """Return the specs in a recorded text."""
     from spatial_replay.errors import SpecificationError
     from spatial_replay.spec import parse_specification
 
@@ -479,7 +476,10 @@ def _declarations(axes: dict[str, object]) -> dict[str, object]:
 
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:
-    """Return the numbers of messages of a topic's channels. Each publisher may have its own channel."""
+    """Return the message count of each channel, by topic, schema and encoding.
+
+    Each publisher of a topic may have its own channel.
+    """
     message_counts: dict[tuple[str, str, str], list[int]] = {}
     for summary in container.channels:
         channel = summary.channel
@@ -550,7 +550,7 @@ def _container_lines(
     if verdicts := list(_verdicts(container, specs)):
         kinds = [(verdict["verdict"] or "").split(",")[0] for verdict in verdicts]
         is_known = set(kinds) <= set(WORST_FIRST)
-        # the log lists violations in the order of time, except logs of earlier versions; the sort keeps it
+        # the sort is stable: violations keep the log's order, by time except in logs of earlier versions
         worst_first = sorted(
             range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
         )
@@ -589,12 +589,12 @@ def _container_lines(
 
 
 _MOST_ENTRIES: Final = 20
-"""Entries of a metadata record that texts list."""
+"""Maximum number of printed entries of a metadata record."""
 _LONGEST_ENTRY: Final = 120
 
 
 def _shorten(text: str) -> str:
-    """Return a metadata value; a long one is cut, and its length is added."""
+    """Return a metadata value. A long value is cut, and its length is added."""
     if len(text) <= _LONGEST_ENTRY:
         return text
     return f"{text[:_LONGEST_ENTRY]}… ({len(text):,} characters; --json prints all)"

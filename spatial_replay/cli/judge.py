@@ -81,7 +81,7 @@ _OUTPUTS = (
         "--annotate",
         metavar="NEW",
         type=click.Path(path_type=Path),
-        help="Copy of a LeRobot data set with verdicts, and with --stages stages.",
+        help="Copy of a LeRobot data set with verdicts; --stages adds the stages.",
     ),
 )
 
@@ -95,7 +95,7 @@ _OUTPUTS = (
     help="Success labels: JSON, CSV, or a field of the data set.  [default: labels next to the logs]",
 )
 @click.option(
-    "--result", metavar="NAME", help="Spec that judges.  [default: the last one that no other spec uses]"
+    "--result", metavar="NAME", help="Spec that judges.  [default: the last spec that no other spec uses]"
 )
 @plugin_option
 @semantics_option
@@ -110,13 +110,13 @@ _OUTPUTS = (
     "--same-start",
     metavar="DISTANCE",
     type=click.FloatRange(min=0.0),
-    help="With --against: how far objects of a pair may start apart, in units of length.  [default: 0.001]",
+    help="With --against: largest distance between an object's starts in a pair.  [default: 0.001]",
 )
 @click.option(
     "--failures",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Specification of failures: names the first in each failed episode.",
+    help="Specification of failures, to name the first failure of each failed episode.",
 )
 @click.option("--stages", is_flag=True, help="Count the stages at the end of the episodes.")
 @click.option(
@@ -149,8 +149,8 @@ def judge(
     LOG is an episode, a folder of them, or a pattern, as for batch. Labels come from labels.json or
     labels.csv next to the logs, or from the data set. An entry has `log` or `episode`, and `success`.
 
-    The exit code is 0 for every rate. With --at-least it is 1 if the rate is too low, and 4 if undecided
-    episodes leave that open, or if no episode can be judged.
+    The exit code is 0 for every rate. With --at-least, it is 1 if the rate is too low, and 4 if the answer
+    depends on undecided episodes. It is also 4 if no episode can be judged.
 
     \b
     Examples:
@@ -165,7 +165,7 @@ def judge(
     from spatial_replay.judging.stages import episode_stages, with_stages
 
     if same_start is not None and not against:
-        raise UsageError("--same-start is about pairs; add --against LOG")
+        raise UsageError("--same-start applies to pairs; add --against LOG")
     if failures is not None and (not conditions.specs or failures in conditions.specs):
         raise UsageError("--failures has no spec that judges; give that with --spec")
     specs = conditions.specs if failures is None else (failures, *conditions.specs)

@@ -82,10 +82,10 @@ def work(channel: Connection, call: Call) -> None:
     output, lines of standard error, document)`.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # plug-ins that the user allows elsewhere stay off: a specification of an agent runs no code
+    # plug-ins stay off, even if the user allows them elsewhere: an agent's specification runs no code
     os.environ.pop(PLUGINS_VARIABLE, None)
     os.chdir(call.folder)
-    # temporary files have to lie in a folder that the guard allows
+    # temporary files need a folder that the guard allows
     tempfile.tempdir = call.folder
     # installed before any code of the call runs
     sys.addaudithook(_guard(call.readable, is_online=call.is_online))
@@ -115,7 +115,7 @@ def _end_with_parent() -> None:
 
 
 def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
-    """Find the logs and data sets in some folders, each once; data sets with their numbers of episodes."""
+    """Append the logs and data sets in the folders to `documents`; a data set has a number of episodes."""
     from spatial_replay.batch.run import find_logs
     from spatial_replay.batch.suite import LogPattern
     from spatial_replay.errors import UsageError
@@ -139,8 +139,8 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
 def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[Any, ...]], None]:
     """Return an audit hook (PEP 578) that refuses files outside some folders, and connections.
 
-    The hook also refuses further files that mappings, bags and data sets name. Files that libraries in C open
-    by themselves are not seen.
+    The hook also refuses further files that mappings, bags and data sets name. Libraries in C that open files
+    themselves bypass the hook.
     """
     folders = [*readable, sys.prefix, sys.base_prefix, *sysconfig.get_paths().values(), *_SYSTEM]
     folders += [str(Path(__file__).parents[1]), *filter(None, map(os.environ.get, _CACHES))]

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _STATUS_S: Final = 0.5
 _GONE_S: Final = 30.0
-"""Absence of the server after which a run with --until ends, seconds."""
+"""Longest absence of the server in a run with --until, seconds."""
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
 
@@ -82,14 +82,12 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     multiple=True,
     help="Messages to write, such as '/camera/*'; repeat.  [default: mapped]",
 )
-@click.option(
-    "--for", "length_s", metavar="T", callback=_seconds, help="End after so much time, such as 60s."
-)
+@click.option("--for", "length_s", metavar="T", callback=_seconds, help="Duration of the run, such as 60s.")
 @click.option(
     "--until",
     metavar="WHEN",
     type=click.Choice(["violated", "satisfied", "settled"]),
-    help="End when: violated (any), satisfied (all), settled (each); or none can be.",
+    help="End when any result is violated, all are satisfied, or all are settled; also when none can be.",
 )
 @click.option(
     "--topic-timeout",
@@ -103,7 +101,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     "start_within_s",
     metavar="T",
     callback=_seconds,
-    help="How long the run waits for needed topics to begin.  [default: their max_age]",
+    help="Longest wait for the first messages of needed topics.  [default: their max_age]",
 )
 @click.option(
     "--max-delay",
@@ -112,7 +110,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     callback=_seconds,
     default="200ms",
     show_default=True,
-    help="How long a sample waits for late messages.",
+    help="Longest wait of a sample for late messages.",
 )
 @click.option(
     "--trigger",
@@ -149,7 +147,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     show_default=True,
     help="With --clips: memory for messages.",
 )
-@click.option("--serve", "serves", is_flag=True, help="Show what is monitored to viewers over WebSocket.")
+@click.option("--serve", "serves", is_flag=True, help="Show the monitored run to viewers over WebSocket.")
 @serving_options(8766, "With --serve: ")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
 def monitor(
@@ -181,7 +179,7 @@ def monitor(
     or doubtful, 3 if the server does not answer or its time jumps back.
 
     With --clips, nothing is written until a trigger fires. Each trigger writes a log of the time before and
-    after it. SIGUSR1 and the service `trigger` of --serve fire it, too.
+    after it. SIGUSR1 and the service `trigger` of --serve also fire the trigger.
 
     \b
     Examples:
@@ -271,7 +269,7 @@ def _refuse_endless(files: Sequence[Specification]) -> None:
 
 
 def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
-    """Show the losses of logs, clips and viewers beyond the samples that were not evaluated."""
+    """Show the losses of logs, clips and viewers beyond `dropped`, the number of unevaluated samples."""
     for writer in writers:
         losses = [plural(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
         losses += [plural(writer.messages_dropped, "message")] if writer.messages_dropped else []
@@ -280,7 +278,7 @@ def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
 
 
 class _SignalTrigger:
-    """Fires the trigger at SIGUSR1. A signal before the recorder exists is kept until then."""
+    """Fires the trigger at SIGUSR1. An earlier signal waits until the recorder exists."""
 
     def __init__(self) -> None:
         self._fire: Callable[[str], None] | None = None

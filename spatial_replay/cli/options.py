@@ -55,7 +55,7 @@ class ServingArguments:
 
 
 def serving_options(port: int, only_with: str = "") -> _Option:
-    """Add the options of a server for viewers, which the command receives as `serving`.
+    """Add the options of a server for viewers. The command receives them as `serving`.
 
     Args:
         port: default port.
@@ -122,7 +122,7 @@ def _output_file(context: click.Context, parameter: click.Parameter, path: Path 
 
 
 def _log_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
-    """Return the path of a log to write, and refuse endings of other kinds of files."""
+    """Return the path of an output log, and refuse endings of other file types."""
     from spatial_replay.logs.output_file import refuse_ending
 
     if path is not None:
@@ -255,7 +255,7 @@ def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -
 
     Args:
         name: name of the argument.
-        values: class of the argument; its annotated fields are the options' names.
+        values: class of the argument; its fields have the names of the options.
     """
 
     @wraps(command)
@@ -314,7 +314,7 @@ _READING = (
         metavar="KEY=VALUE",
         multiple=True,
         callback=_read_pairs,
-        help="How to read the log: max_gap=1s, max_lateness=5s, on_time_jump=split, rate=29.97, lost=keep,"
+        help="Reading option: max_gap=1s, max_lateness=5s, on_time_jump=split, rate=29.97, lost=keep,"
         " y_down=true, concave=hull; repeat for several.",
     ),
 )
@@ -365,7 +365,7 @@ def input_files(*files: LogFile, reading: Reading) -> tuple[Path, ...]:
 strict_names_option = click.option(
     "--strict-names",
     is_flag=True,
-    help="Refuse names that the log never has, instead of a warning.",
+    help="Refuse names that are missing in the log, instead of a warning.",
 )
 
 choices_option = click.option(
@@ -400,15 +400,15 @@ _CONDITIONS = (
 
 
 def evaluation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add LOG and the options of an evaluation, which the command receives as `request`."""
+    """Add LOG and the options of an evaluation. The command receives them as `request`."""
     log = click.argument("log", type=LogPath())
-    specs = specs_option("Specification; repeat for several.  [default: those in the log]")
+    specs = specs_option("Specification; repeat for several.  [default: the log's own]")
     gathering = reading_options(gather("request", EvaluationArguments, command))
     return add_options((log, specs, *_CONDITIONS), gathering)
 
 
 def condition_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of an evaluation of many logs, which the command receives as `conditions`."""
+    """Add the options of a batch evaluation. The command receives them as `conditions`."""
     specs = specs_option("Specification file; repeat for several.")
     gathering = reading_options(gather("conditions", ConditionArguments, command))
     return add_options((specs, *_CONDITIONS), gathering)
@@ -425,7 +425,11 @@ class EvaluationInputs:
     strict_names: bool
 
     def options(self, semantics: Semantics = "ltlf", keep: tuple[str, ...] = ()) -> ReplayOptions:
-        """Return the options of the evaluation, with the messages that a copy of the log keeps."""
+        """Return the options of the evaluation.
+
+        Args:
+            keep: patterns of topics whose messages a copy of the log has.
+        """
         from spatial_replay.replay.selection import ReplayOptions
 
         return ReplayOptions(self.window, self.each, semantics, self.strict_names, keep or None)
@@ -501,7 +505,7 @@ def load_spec_options(
     """Return the specifications of a command line, with its values of constants.
 
     Args:
-        default: function that returns a specification, for a command line with constants only; or None.
+        default: function that returns the specification of a command line with constants only.
 
     Raises:
         UsageError: no specification has a given constant.
@@ -552,7 +556,7 @@ def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Pat
     """Refuse outputs that cannot be written, before the work starts.
 
     Args:
-        outputs: files by the names of options; None and "-" for none.
+        outputs: files by option name; None and "-" are no files.
 
     Raises:
         UsageError: an output is an input or a folder, its folder is missing, or two options name one file.

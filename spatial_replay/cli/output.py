@@ -23,7 +23,7 @@ WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
 """Number of results above which results are also counted by verdict."""
 _MOST_SHOWN: Final = 20
-"""Results that are all printed, at most. If there are more, only the worst `_SHOWN` are printed."""
+"""Largest number of results that are all printed. Otherwise the worst `_SHOWN` results are printed."""
 _SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 _CHANGE_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "holds": "blue", "pending": "yellow"})
@@ -111,7 +111,7 @@ def write_document(
 
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
-    """Return the results to print, the worst first, and the others if there are too many."""
+    """Return the results to print, the worst first, and the results that are only counted."""
     # imported here since it loads numerical libraries
     from spatial_replay.monitor.result import worst_first
 
@@ -124,7 +124,7 @@ def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = N
     """Return the line about results that are not printed.
 
     Args:
-        verdicts: verdicts of these results; by default the final ones.
+        verdicts: verdicts of these results; by default the final verdicts.
     """
     hint = ", --each VAR=OBJECT shows one" if any(result.object is not None for result in others) else ""
     count_text = counts_text([result.verdict for result in others] if verdicts is None else verdicts)
@@ -155,7 +155,7 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
 
 
 def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
-    """Yield a line for each cause of the verdict, and for each part that decided nothing."""
+    """Yield lines about the verdict's causes, its gaps, and its vacuous and cut parts."""
     # imported here so that --help stays fast
     from spatial_replay.monitor.sentences import cause_reason, gap_sentence
 
@@ -183,7 +183,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
-    """Return a text on the violations of a spec over the sliding window: their number, and the first."""
+    """Return the number of violations over the sliding window and the time of the first one, as text."""
     if result.leaves is None:
         return ""
     robustness, times_ns = result.window_signal(window_ns)[0], result.times_ns
@@ -194,7 +194,10 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
         return f"{window_text} never violated; robustness at the end {end_text}"
     first_violated = time_text(int(times_ns[violated_indices[0]]), first_ns)
     violated_text = f"{len(violated_indices):,} of {plural(len(robustness), 'sample')}"
-    return f"{window_text} violated at {violated_text}, first at {first_violated}; robustness at the end {end_text}"
+    return (
+        f"{window_text} violated at {violated_text}, first at {first_violated}; "
+        f"robustness at the end {end_text}"
+    )
 
 
 def _number_text(number: float, unit: str = "") -> str:

@@ -162,7 +162,7 @@ _NOT_WHY = (*_OF_RUNS, "scenario", "log", "as_json", "output", "spec", "of", "co
     "why_log",
     metavar="LOG",
     type=LogPath(),
-    help="Say which relations fail at a place, by how much, and what stands there.",
+    help="Show the demands on a place with their robustness, and obstacles.",
 )
 @click.option("--step", "number", metavar="N", type=int, help="With --why: number of the decision.")
 @click.option("--object", "name", metavar="NAME", help="With --why: the object.")
@@ -187,7 +187,7 @@ _NOT_WHY = (*_OF_RUNS, "scenario", "log", "as_json", "output", "spec", "of", "co
 @click.option(
     "--timings",
     is_flag=True,
-    help="Log how long decisions took; logs of equal options then differ.",
+    help="Log the planning time of decisions; logs of equal options then differ.",
 )
 @click.pass_context
 def plan(
@@ -209,13 +209,14 @@ def plan(
 ) -> int:
     """Plan a run in a simulated world, and record it with every decision.
 
-    The planner decides what the robot moves, step by step, until the specification is satisfied or no path to
-    acceptance is left. Equal options give an equal log, byte for byte. Needs the extra `sim`. Exits with 0 if
+    The planner chooses motions of the robot until the specification is satisfied or no path to acceptance is
+    left. Equal options give an equal log, byte for byte. Needs the extra `sim`. Exits with 0 if
     the planned specification is satisfied, 1 if it is violated, 4 if it is unknown or if the planner timed
     out.
 
-    With --redo, it decides on recorded samples with another specification or other settings. It shows how
-    many decisions are equal, and the first one that differs. Exits with 0 if all are equal, otherwise with 1.
+    With --redo, the planner decides on recorded samples with another specification or other settings. The
+    command shows the number of equal decisions, and the first different one. Exits with 0 if all are equal,
+    otherwise with 1.
 
     \b
     Examples:
@@ -254,7 +255,6 @@ def _plan(
     timings: bool,
     simulation: SimulationArguments,
 ) -> int:
-    """Plan and record a run."""
     # imported here so that --help stays fast
     from spatial_replay.runs.planned import record_plan
     from spatial_replay.simulation.tabletop import default_specification

@@ -45,7 +45,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def duration_ns(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
-    """Return the value of an option that is a duration, in nanoseconds."""
+    """Return the duration in an option's text, in nanoseconds."""
     if text is None:
         return None
     with naming_option(parameter.opts[0]):
@@ -68,7 +68,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "offsets",
     metavar="NAME=T",
     multiple=True,
-    help="With several cameras: shift the stamps of one, by name (right.mp4=0.12s) or number (2=-40ms).",
+    help="With several cameras: shift of one camera's stamps, by name (right.mp4=0.12s) or number (2=-40ms).",
 )
 @click.option(
     "--tags",
@@ -76,7 +76,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     metavar="TAGS",
     type=LogPath(),
     required=True,
-    help="Tags file (YAML): which tag is on which object, and where the plane is.",
+    help="Tags file (YAML): the tags of each object, and the plane.",
 )
 @log_output_option("Log to write (MCAP).")
 @overwrite_option
@@ -87,7 +87,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "--keep-video",
     "keep",
     type=click.Choice(["copy", "h264", "none"]),
-    help="Keep the picture as it came, encode it as H.264, or leave it out."
+    help="Copy the pictures, encode them as H.264, or leave them out."
     "  [default: copy where possible, else h264]",
 )
 @click.option(
@@ -102,7 +102,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "--rate",
     metavar="HZ",
     type=float,
-    help="Frame rate that gives a video's frames their times, instead of its own stamps.",
+    help="Frame rate for the times of a video, instead of its stamps.",
 )
 @click.option(
     "--for", "length_ns", metavar="T", callback=duration_ns, help="Duration of a recording from a camera."
@@ -126,12 +126,12 @@ def video(
     """Record the tagged objects that a camera saw, with verdicts as they change.
 
     Reads a video file, a topic of a log with images or AprilTag detections, or a camera of this machine.
-    Objects carry AprilTags; the tags file says which. Every footprint comes with its uncertainty, so that
-    a verdict near a threshold is unknown rather than guessed. Several videos or topics count as
-    several cameras of the same scene: frames of equal time make one sample. Needs the extra `vision`.
+    The tags file lists the AprilTags on the objects. Every footprint has an uncertainty. A verdict near a
+    threshold is therefore unknown. Several videos or topics are several cameras of the same scene: frames
+    of equal time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
-    unknown. It exits with 3 if the video is damaged; the recording up to there is complete.
+    unknown. It exits with 3 if the video is damaged; the recording before the damage is complete.
 
     \b
     Examples:
@@ -223,7 +223,7 @@ def _open_cameras(
 
 
 def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the shift of each camera's stamps; none is negative."""
+    """Return the shift of each camera's stamps, ns. A common shift makes all of them 0 or more."""
     offsets_ns = [0] * len(names)
     for text in texts:
         name, _, duration_text = text.rpartition("=")
@@ -296,7 +296,7 @@ _SIMULATION = (
         metavar="NAME=X,Y[,TURN]",
         multiple=True,
         callback=_starts,
-        help="First place of an object, in metres and radians; repeat for several.",
+        help="Initial place of an object, in metres and radians; repeat for several.",
     ),
     click.option("--gui", is_flag=True, help="Show the world in a window, no faster than real time."),
     click.option(
@@ -305,8 +305,8 @@ _SIMULATION = (
         metavar="VIDEO",
         multiple=True,
         type=click.Path(path_type=Path),
-        help="Film the run with AprilTags on the objects, and write a tags file beside the video. Given"
-        " twice, from two sides. Needs the extra `vision`.",
+        help="Film the run with AprilTags on the objects, and write a tags file next to the video. A second"
+        " video is from the other side. Needs the extra `vision`.",
     ),
 )
 
@@ -323,7 +323,7 @@ class SimulationArguments(TypedDict):
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a simulated world, which the command receives as `simulation`."""
+    """Add the options of a simulated world. The command receives them as `simulation`."""
     return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
 
 
@@ -371,8 +371,8 @@ def scenario_argument(*, required: bool, others: Sequence[str] = ()) -> Callable
     """Return the argument SCENARIO.
 
     Args:
-        required: whether the command needs one.
-        others: names of commands that may replace it, for completion.
+        required: whether the command needs a scenario.
+        others: commands that completion offers instead of a scenario.
     """
 
     def complete(context: click.Context, parameter: click.Parameter, prefix: str) -> list[str]:

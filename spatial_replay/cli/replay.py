@@ -86,7 +86,7 @@ watch_option = click.option(
 
 
 def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
-    """Return the files to watch as soon as they can be read. Errors are shown until then.
+    """Wait until all files can be read, and return them. Errors are shown until then.
 
     Raises:
         UsageError: there is no file, a constant is unknown, or a folder does not exist.
@@ -102,7 +102,7 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     except (SpecificationError, MissingFileError) as error:
         if not all(path.parent.is_dir() and not path.is_dir() for path in files.paths):
             raise
-        # raises for an unreadable log, because no save would help then
+        # an unreadable log raises here, because no saved specification would help
         open_inputs(replace(request, specs=(), constants={}), can_do_without=True)
         _wait_for_files(files, error)
     return files
@@ -172,9 +172,9 @@ def follow_saves(
 
     Args:
         evaluate: evaluates the saved files.
-        write: writes constants into the files, and returns the changed ones; for the key w.
+        write: function of the key w; writes constants into the files, and returns the changed constants.
         refuse: receives the error of an unreadable file.
-        check: called about ten times a second; an error that it raises ends the loop.
+        check: called about ten times a second; its errors end the loop.
     """
     file_names = _names(files)
     try:
@@ -322,7 +322,7 @@ def _serve(
 @evaluation_options
 @plugin_option
 @log_output_option("Annotated log to write (MCAP).", required=False)
-@click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
+@click.option("--layer", is_flag=True, help="Write only derived messages, without the messages of the log.")
 @keep_option("Messages of the log to copy with -o", "all; none of a ROS 2 bag")
 @click.option(
     "--arrow",
@@ -336,7 +336,7 @@ def _serve(
     "--to-end",
     "signal",
     is_flag=True,
-    help="With --json: as --series, with the robustness to the end, too.",
+    help="With --json: like --series, with the robustness to the end of the log, too.",
 )
 @click.option(
     "--window",
@@ -519,12 +519,12 @@ def report(request: EvaluationArguments, output: Path | None, semantics: Semanti
     type=click.Choice(["value", "now", "lower", "upper"]),
     default="value",
     show_default=True,
-    help="Which number of each node to export.",
+    help="Number of each node to export.",
 )
 def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> int:
     """Export the robustness in an annotated log as a table: one row per sample, one column per node.
 
-    With --spec, or any option about the evaluation, LOG is evaluated first, and may be of any format.
+    With --spec or another option of the evaluation, LOG is evaluated first. It may then have any format.
 
     A column title lists the named specs on the path to its node, such as task/deliver, and the text of an
     unnamed node. Other columns hold the seconds since the first row and the states of the automata. Empty
@@ -562,7 +562,7 @@ def _is_evaluated(request: EvaluationArguments) -> bool:
 
 
 def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:
-    """Evaluate specifications over a log, write the results, and return the losses."""
+    """Write an annotated log, and return the faults of its input."""
     from spatial_replay.replay.engine import run_replay
 
     inputs = open_inputs(request)
@@ -580,19 +580,19 @@ def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:
     "--result",
     metavar="NAME[@OBJECT]",
     default="",
-    help="Named spec to explain; NAME@OBJECT for one object of a template.  [default: all results]",
+    help="Spec to explain; NAME@OBJECT for one object of a template.  [default: all results]",
 )
-@click.option("--at", metavar="T", help="Explain the verdict at time T, on the samples up to it.")
+@click.option("--at", metavar="T", help="Explain the verdict at time T, from the samples up to T.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 def explain(request: EvaluationArguments, result: str, at: str | None, as_json: bool) -> int:
     """Explain a verdict in plain sentences.
 
-    For each result: which sample, objects and relation decided it, by how much, since when, and which change
-    of a constant would flip it. For an unknown verdict: the missing parts.
+    Each explanation names the deciding sample, objects and relation, the robustness, the time of the verdict,
+    and a change of a constant that flips the verdict. For an unknown verdict, it names the missing parts.
 
-    Write a time T as 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
-    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does. A verdict
-    that is still pending at the time --at counts as unknown (4).
+    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    2026-01-31T12:00:00Z. The exit codes have the meanings of `replay`. A verdict that is still pending at the
+    time --at counts as unknown (4).
 
     \b
     Examples:
@@ -632,7 +632,7 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
             for result in replayed.results
             if verdict_of(result, node_name, goes_on=continues) is not None
         ]
-        # if none fits, the error suggests the nearest name among all
+        # without a match, all results stay, and the error suggests the nearest name
         worst, other_results = worst_of(matches) if matches else (replayed.results, ())
         if len(matches) > MANY:
             all_verdicts = [verdict_of(result, node_name, goes_on=continues) for result in matches]
@@ -662,7 +662,6 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
 
 
 def _colour_verdicts(line: str) -> Line:
-    """Return a line with verdicts in their colours."""
     pieces = enumerate(re.split(_VERDICT, line))
     return tuple(Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece for number, piece in pieces)
 
@@ -671,7 +670,7 @@ _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")
 
 
 def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
-    """Yield each explanation, below its requirement. Consecutive explanations of a node share the heading."""
+    """Yield the sentences of each explanation. Consecutive explanations of a node share the requirement."""
     previous_spec = None
     for explanation in explanations:
         spec_and_node = explanation.document["specification"], explanation.document["node"]
@@ -682,7 +681,7 @@ def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
 
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:
-    """Return the inputs with a window that ends with the sample at a time."""
+    """Return the inputs with a window that ends after the time `at`."""
     from spatial_replay.replay.selection import absolute_ns
 
     if at is None:

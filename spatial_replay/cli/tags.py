@@ -83,7 +83,7 @@ def tags() -> None:
 @_paper
 @output_option("Sheets to write (PDF).", required=True)
 def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, output: Path) -> ExitCode:
-    """Write sheets of tags in true size, with a ruler to check what the printer did.
+    """Write sheets of tags in true size, with a ruler to check the printed size.
 
     Print at 100 %, not fitted to the page. Leave a white rim around each tag, at least an eighth of its
     width.

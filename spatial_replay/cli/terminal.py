@@ -75,7 +75,7 @@ def show(*lines: Line, err: bool = False) -> None:
 
 
 def _style(pieces: Iterable[str | Coloured], max_length: int) -> str:
-    """Return the first characters of a line, in colours."""
+    """Return the first `max_length` characters of a line, in colours."""
     styled_text = ""
     for piece in pieces:
         text = escape_text(piece.text if isinstance(piece, Coloured) else piece)[:max_length]
@@ -86,7 +86,7 @@ def _style(pieces: Iterable[str | Coloured], max_length: int) -> str:
 
 
 class StatusLine:
-    """A line at the bottom of a terminal that is updated in place; nothing without a terminal."""
+    """A line at the bottom of a terminal that is updated in place. Without a terminal, nothing is printed."""
 
     def __init__(self) -> None:
         self._is_shown = False
@@ -100,7 +100,7 @@ class StatusLine:
             self._is_shown = True
 
     def clear(self) -> None:
-        """Remove the line, so that others can be printed."""
+        """Remove the line before other output."""
         if self._is_shown:
             click.echo("\r\x1b[K", nl=False, err=True)
             self._is_shown = False
@@ -112,7 +112,7 @@ def terminal_width() -> int:
 
 
 def _fit_lines(line: str) -> list[str]:
-    """Return a line cut at spaces, so that it fits into the terminal; the rest is indented."""
+    """Cut a line at spaces to the width of the terminal. Lines after the first are indented."""
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     width = max(terminal_width(), _LEAST_WIDTH)
     # a no-break space keeps a number with its unit
@@ -158,7 +158,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def show_result(document: Callable[[], Any], lines: Callable[[], Iterable[Line]], as_json: bool) -> None:
-    """Print a result as JSON or as text; a listener gets it as values in any case."""
+    """Print a result as JSON or as text. A listener always receives the document, too."""
     if (listener := _LISTENER.get()) is not None:
         listener.document(document())
     if as_json:
@@ -188,10 +188,10 @@ def printing_to(output: Path | None, inputs: Iterable[Path] = ()) -> Iterator[No
     from spatial_replay.logs.output_file import replacing
 
     with replacing(output, inputs) as stream:
-        printed_text = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
-        with redirect_stdout(printed_text):
+        text_stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
+        with redirect_stdout(text_stream):
             yield
-        stream.write(printed_text.buffer.getvalue())
+        stream.write(text_stream.buffer.getvalue())
 
 
 def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:
@@ -210,13 +210,13 @@ def show_message(severity: str, message: str, colour: str) -> None:
 
 
 def warn(*messages: str) -> None:
-    """Print warnings to standard error as "spatial-replay: warning: …", one of several similar ones."""
+    """Print warnings to standard error as "spatial-replay: warning: …". Similar warnings are printed once."""
     for message in without_repetition(messages):
         show_message("warning", message, "yellow")
 
 
 PATIENCE_S = 1.0
-"""Time of work after which a bar appears, seconds."""
+"""Delay before a progress bar appears, seconds."""
 COMPILING = "compiling, once on this machine"
 """Label of a bar while kernels are compiled."""
 
@@ -255,7 +255,7 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
 
 
 def _counting(listener: Listener, label: str, total: int | None) -> Advance:
-    """Return a function that gives a listener the number of all steps so far."""
+    """Return a function that reports the number of all steps so far to a listener."""
     step_count = 0
 
     def advance(steps: int) -> None:
@@ -268,7 +268,7 @@ def _counting(listener: Listener, label: str, total: int | None) -> Advance:
 
 
 class _Bar:
-    """A bar that appears after `PATIENCE_S`, even if no step has been done by then.
+    """A bar that appears after `PATIENCE_S`, even before the first step.
 
     A timer shows the bar, because the first step may take long while kernels are compiled.
     """
@@ -288,7 +288,7 @@ class _Bar:
         self._update()
 
     def show_compiling(self) -> None:
-        """Change the label until the next step is done."""
+        """Change the label until the next step."""
         self._description = COMPILING
         self._update()
 

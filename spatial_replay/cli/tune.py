@@ -128,8 +128,8 @@ def tune(
 ) -> ExitCode:
     """Find the constants with which good runs satisfy a specification and bad runs violate it.
 
-    With good and bad runs, the values have the widest margin between both. With good runs only, the values
-    are the tightest ones. Constants to tune have a range in the text, such as const near = 70 in [40, 100],
+    With good and bad runs, the values have the widest margin between good and bad. With good runs only, the
+    values are the tightest. Constants to tune have a range in the text, such as const near = 70 in [40, 100],
     or are named by --vary. Bounds of windows, such as F[0s, hold], are tuned like thresholds.
 
     Exits with 0 if there are such values. Otherwise it lists the runs that contradict each other, and exits

@@ -47,7 +47,7 @@ _PAPER = "region goal = box(0, 0, 4, 4)\nspec reach = (F (cup enclosedin goal)) 
 
 
 def warm_up_kernels(workers: int, advance: Callable[[int], None] = lambda steps: None) -> Path | None:
-    """Compile every kernel into the cache and return the cache's folder; None if none can be written.
+    """Compile every kernel into the cache, and return the cache's folder; None if no folder is writable.
 
     Args:
         workers: number of processes.
@@ -67,7 +67,7 @@ def _run(name: str) -> None:
 
 
 def compile_task(name: str) -> None:
-    """Compile the kernels of one of `TASKS` at low priority, while another program uses them."""
+    """Compile the kernels of a task at low priority, for another program that runs at the same time."""
     os.nice(10)
     _run(name)
 
