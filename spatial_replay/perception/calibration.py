@@ -69,72 +69,79 @@ def calibrate_camera(
     """
     detector = TagDetector(family)
     references_by_id = {tag.id: tag.corners for tag in references}
-    points: list[Floats] = []
-    pixels: list[Floats] = []
+    plane_points: list[Floats] = []
+    view_pixels: list[Floats] = []
     views: list[dict[int, Floats]] = []
-    size: tuple[int, int] | None = None
-    seen = 0
+    size_px: tuple[int, int] | None = None
+    tagged_frame_count = 0
     for frame in frames:
         if frame.detections is not None:
             raise UsageError(f"{name} has detections without images; a camera is calibrated from its images")
-        size = frame.image.shape[1], frame.image.shape[0]
+        size_px = frame.image.shape[1], frame.image.shape[0]
         view = {
             detection.id: detection.corners
             for detection in detector.detect(frame.image)
             if detection.id in references_by_id
         }
-        seen += len(view) >= _LEAST_TAGS
-        if len(view) < _LEAST_TAGS or not _is_new(view, views, _APART * size[0]):
+        tagged_frame_count += len(view) >= _LEAST_TAGS
+        if len(view) < _LEAST_TAGS or not _is_new(view, views, _APART * size_px[0]):
             continue
         views.append(view)
-        flat = np.concatenate([references_by_id[number] for number in view])
-        points.append(np.concatenate([flat, np.zeros((len(flat), 1))], axis=1))
-        pixels.append(np.concatenate(list(view.values())))
+        reference_corners = np.concatenate([references_by_id[tag_id] for tag_id in view])
+        plane_points.append(
+            np.concatenate([reference_corners, np.zeros((len(reference_corners), 1))], axis=1)
+        )
+        view_pixels.append(np.concatenate(list(view.values())))
         if len(views) == _MOST_VIEWS:
             break
-    if size is None:
+    if size_px is None:
         raise LogError(f"{name} has no frame that can be read")
     if len(views) < _LEAST_VIEWS:
         raise UsageError(
-            f"{name}: {plural(seen, 'frame')} with {_LEAST_TAGS} or more of the tags, in"
+            f"{name}: {plural(tagged_frame_count, 'frame')} with {_LEAST_TAGS} or more of the tags, in"
             f" {plural(len(views), 'different view')}; {_LEAST_VIEWS} views are needed: tilt the sheet, or"
             " move the camera around the table, near and far"
         )
-    found_calibration = calibrate(points, pixels, size)
-    if not found_calibration.rms < _WRONG or not np.isfinite(found_calibration.deviations).all():
+    calibration = calibrate(plane_points, view_pixels, size_px)
+    if not calibration.rms < _WRONG or not np.isfinite(calibration.deviations).all():
         raise UsageError(
             f"{name}: no camera sees the tags like that: with the best one, corners are off by"
-            f" {found_calibration.rms:.1f} pixels; give --family, --ids, --size and --paper as the sheet was"
+            f" {calibration.rms:.1f} pixels; give --family, --ids, --size and --paper as the sheet was"
             " printed, or check the places of the reference tags"
         )
-    return Calibrated(found_calibration, len(views), tuple(_remarks(found_calibration, pixels, size)))
+    return Calibrated(calibration, len(views), tuple(_remarks(calibration, view_pixels, size_px)))
 
 
-def _is_new(found: dict[int, Floats], views: Sequence[dict[int, Floats]], least: float) -> bool:
+def _is_new(
+    corners_by_id: dict[int, Floats], views: Sequence[dict[int, Floats]], least_shift_px: float
+) -> bool:
     """Return whether no earlier view has the tags at the same places."""
-    for view in views:
-        shared = [number for number in found if number in view]
-        off = [float(np.linalg.norm(found[number] - view[number], axis=1).mean()) for number in shared]
-        if off and max(off) < least:
+    for earlier_view in views:
+        shared_ids = [tag_id for tag_id in corners_by_id if tag_id in earlier_view]
+        shifts_px = [
+            float(np.linalg.norm(corners_by_id[tag_id] - earlier_view[tag_id], axis=1).mean())
+            for tag_id in shared_ids
+        ]
+        if shifts_px and max(shifts_px) < least_shift_px:
             return False
     return True
 
 
-def _remarks(found: Calibration, pixels: Sequence[Floats], size: tuple[int, int]) -> list[str]:
+def _remarks(calibration: Calibration, view_pixels: Sequence[Floats], size_px: tuple[int, int]) -> list[str]:
     remarks = []
-    (fx, fy), spread = found.camera.focal, found.deviations
-    if max(spread[0] / fx, spread[1] / fy) > _LOOSE:
+    (fx, fy), deviations = calibration.camera.focal, calibration.deviations
+    if max(deviations[0] / fx, deviations[1] / fy) > _LOOSE:
         remarks.append("the views are too much alike to measure the focal length: tilt the sheet more")
-    every = np.concatenate(pixels)
-    reach = (every.max(axis=0) - every.min(axis=0)) / np.array(size)
-    if reach.min() < _WIDE:
+    all_pixels = np.concatenate(view_pixels)
+    covered_shares = (all_pixels.max(axis=0) - all_pixels.min(axis=0)) / np.array(size_px)
+    if covered_shares.min() < _WIDE:
         remarks.append(
-            f"tags were seen in {reach[0]:.0%} of the image's width and {reach[1]:.0%} of its height: bring"
-            " them to its corners, where a lens bends most"
+            f"tags were seen in {covered_shares[0]:.0%} of the image's width and {covered_shares[1]:.0%} of"
+            " its height: bring them to its corners, where a lens bends most"
         )
-    if found.rms > 1.0:
+    if calibration.rms > 1.0:
         remarks.append(
-            f"corners are off by {found.rms:.1f} pixels: is the sheet flat, printed at 100 %, the"
+            f"corners are off by {calibration.rms:.1f} pixels: is the sheet flat, printed at 100 %, the"
             " picture sharp?"
         )
     return remarks
@@ -193,9 +200,9 @@ class TagSheet:
     def __post_init__(self) -> None:
         if not 0 < len(self.ids) <= MOST_TAGS:
             raise UsageError(f"give 1 to {MOST_TAGS} tags; these are {len(self.ids)}")
-        twice = [number for number, count in Counter(self.ids).items() if count > 1]
-        if twice:
-            raise UsageError(f"tag {twice[0]} is given more than once; name each tag once")
+        repeated_ids = [tag_id for tag_id, count in Counter(self.ids).items() if count > 1]
+        if repeated_ids:
+            raise UsageError(f"tag {repeated_ids[0]} is given more than once; name each tag once")
         if self.paper not in PAPERS:
             raise UsageError(f"there is no paper {self.paper!r}; known are {', '.join(PAPERS)}")
         if not (math.isfinite(self.size) and self.size > 0) or not self._columns or not self._rows:
@@ -210,10 +217,10 @@ class TagSheet:
 
     def references(self) -> tuple[MountedTag, ...]:
         """Return the tags of the first page at their places, in metres from its lower left corner, y up."""
-        _, height = PAPERS[self.paper]
+        _, page_height_mm = PAPERS[self.paper]
         return tuple(
-            MountedTag(number, self.size, x / 1e3, (height - y) / 1e3)
-            for number, (x, y) in zip(self.ids[: self.per_page], self._centres(), strict=False)
+            MountedTag(tag_id, self.size, x_mm / 1e3, (page_height_mm - y_mm) / 1e3)
+            for tag_id, (x_mm, y_mm) in zip(self.ids[: self.per_page], self._centres(), strict=False)
         )
 
     def write(self, output: Path) -> int:
@@ -225,30 +232,35 @@ class TagSheet:
         """
         with importing("sheets of tags need fpdf2", extra="vision"):
             from fpdf import FPDF
-        width, height = PAPERS[self.paper]
-        pdf = FPDF(unit="mm", format=(width, height))
+        width_mm, height_mm = PAPERS[self.paper]
+        pdf = FPDF(unit="mm", format=(width_mm, height_mm))
         pdf.set_auto_page_break(False)
         # a fixed date, so that equal sheets give equal bytes
         pdf.set_creation_date(datetime(2000, 1, 1, tzinfo=UTC))
         pdf.set_title(f"AprilTags {self.family}, {self._millimetres:g} mm")
         pdf.set_font("helvetica", size=8)
-        pages = [self.ids[at : at + self.per_page] for at in range(0, len(self.ids), self.per_page)]
+        pages = [
+            self.ids[first_index : first_index + self.per_page]
+            for first_index in range(0, len(self.ids), self.per_page)
+        ]
         for page in pages:
             pdf.add_page()
-            for number, (x, y) in zip(page, self._centres(), strict=False):
-                left, top, edge = x - self._millimetres / 2, y - self._millimetres / 2, self._millimetres
-                cells = tag_cells(self.family, number)
-                cell = edge / len(cells)
-                for row, values in enumerate(cells):
-                    for begin, end in _runs(values.tolist()):
-                        pdf.rect(left + begin * cell, top + row * cell, (end - begin) * cell, cell, "F")
-                caption = f"{self.family}   {number}   {edge:g} mm"
-                pdf.text(left, top + edge + edge / len(cells) + _CAPTION - 1.5, caption)
-            y = height - _MARGIN
-            pdf.line(_MARGIN, y, _MARGIN + _RULER, y)
+            for tag_id, (x_mm, y_mm) in zip(page, self._centres(), strict=False):
+                edge_mm = self._millimetres
+                left_mm, top_mm = x_mm - edge_mm / 2, y_mm - edge_mm / 2
+                cells = tag_cells(self.family, tag_id)
+                cell_mm = edge_mm / len(cells)
+                for row, row_cells in enumerate(cells):
+                    for begin_column, end_column in _runs(row_cells.tolist()):
+                        run_left_mm, run_mm = begin_column * cell_mm, (end_column - begin_column) * cell_mm
+                        pdf.rect(left_mm + run_left_mm, top_mm + row * cell_mm, run_mm, cell_mm, "F")
+                caption = f"{self.family}   {tag_id}   {edge_mm:g} mm"
+                pdf.text(left_mm, top_mm + edge_mm + cell_mm + _CAPTION - 1.5, caption)
+            y_mm = height_mm - _MARGIN
+            pdf.line(_MARGIN, y_mm, _MARGIN + _RULER, y_mm)
             for tick in range(11):
-                pdf.line(_MARGIN + 10 * tick, y, _MARGIN + 10 * tick, y - (4 if tick % 5 == 0 else 2))
-            pdf.text(_MARGIN + _RULER + 3, y, "100 mm: print at 100 %, and measure")
+                pdf.line(_MARGIN + 10 * tick, y_mm, _MARGIN + 10 * tick, y_mm - (4 if tick % 5 == 0 else 2))
+            pdf.text(_MARGIN + _RULER + 3, y_mm, "100 mm: print at 100 %, and measure")
         try:
             output.write_bytes(bytes(pdf.output()))
         except OSError as error:
@@ -275,22 +287,22 @@ class TagSheet:
 
     def _centres(self) -> Sequence[tuple[float, float]]:
         """Return the centres of all tags of a page, in millimetres from its upper left corner."""
-        across, down = self._pitch
+        pitch_x, pitch_y = self._pitch
         return [
-            (_MARGIN + (column + 0.5) * across, _MARGIN + row * down + across / 2)
+            (_MARGIN + (column + 0.5) * pitch_x, _MARGIN + row * pitch_y + pitch_x / 2)
             for row in range(self._rows)
             for column in range(self._columns)
         ]
 
 
-def _runs(values: Sequence[int]) -> list[tuple[int, int]]:
+def _runs(row_cells: Sequence[int]) -> list[tuple[int, int]]:
     """Return the begin and end of each run of black cells in a row."""
     runs: list[tuple[int, int]] = []
-    for place, value in enumerate(values):
-        if value:
+    for column, brightness in enumerate(row_cells):
+        if brightness:
             continue
-        if runs and runs[-1][1] == place:
-            runs[-1] = runs[-1][0], place + 1
+        if runs and runs[-1][1] == column:
+            runs[-1] = runs[-1][0], column + 1
         else:
-            runs.append((place, place + 1))
+            runs.append((column, column + 1))
     return runs

@@ -100,21 +100,21 @@ class ImageTopic:
         self.faults: list[str] = []
 
     def __iter__(self) -> Iterator[Frame]:
-        last_ns = first_ns = -1
+        last_stamp_ns = first_log_ns = -1
         untrue = Untrue()
         for log_ns, frame, is_true in self._frames():
-            first_ns = log_ns if first_ns < 0 else first_ns
+            first_log_ns = log_ns if first_log_ns < 0 else first_log_ns
             fault = f"{frame}; left out" if isinstance(frame, LogError) else None
             if not isinstance(frame, LogError):
-                untrue.add(log_ns - first_ns, is_true)
-                if frame.time_ns > last_ns:
-                    last_ns = frame.time_ns
+                untrue.add(log_ns - first_log_ns, is_true)
+                if frame.time_ns > last_stamp_ns:
+                    last_stamp_ns = frame.time_ns
                     yield frame
                 else:
                     fault = "its stamp is not after that of the frame before; left out"
             if fault is not None:
-                place = time_text(log_ns, first_ns)
-                self.faults.append(f"{self.name}: {self.topic} after {place}: {fault}")
+                time_in_log = time_text(log_ns, first_log_ns)
+                self.faults.append(f"{self.name}: {self.topic} after {time_in_log}: {fault}")
         self.faults += untrue.faults(f"{self.name}: {self.topic}")
         self.faults += self._reader.take_faults()
 
@@ -125,15 +125,15 @@ class ImageTopic:
         for message in self._reader.iter_messages({self.topic}):
             log_ns, payload = message.log_time_ns, message.payload
             try:
-                value: Any = self._decode(payload)
-                time_ns = _stamp_ns(value) or log_ns
+                content: Any = self._decode(payload)
+                stamp_ns = _stamp_ns(content) or log_ns
                 if decoder is not None:
-                    yield from map(_frame, decoder.decode(_h264(value), (log_ns, time_ns, payload)))
+                    yield from map(_frame, decoder.decode(_h264(content), (log_ns, stamp_ns, payload)))
                 elif detections_field is not None:
-                    detections = _detections(getattr(value, detections_field))
-                    yield log_ns, Frame(time_ns, NO_IMAGE, payload, detections=detections), True
+                    detections = _detections(getattr(content, detections_field))
+                    yield log_ns, Frame(stamp_ns, NO_IMAGE, payload, detections=detections), True
                 else:
-                    yield log_ns, Frame(time_ns, _image(value, self._type), payload), True
+                    yield log_ns, Frame(stamp_ns, _image(content, self._type), payload), True
             except LogError as error:
                 yield log_ns, error, False
         if decoder is not None:
@@ -147,50 +147,54 @@ class ImageTopic:
         Raises:
             UsageError: PyAV is not installed.
         """
-        frames = self._times_of_frames()
-        places = np.searchsorted(frames.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
-        decoder, read_ns = H264Decoder() if self._is_video else None, 0
-        for place in np.unique(places[places >= 0]).tolist():
-            stamp_ns, last_ns = int(frames.stamps_ns[place]), int(frames.log_times_ns[place])
+        frame_times = self._times_of_frames()
+        frame_indices = (
+            np.searchsorted(frame_times.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
+        )
+        decoder, read_until_ns = H264Decoder() if self._is_video else None, 0
+        for frame_index in np.unique(frame_indices[frame_indices >= 0]).tolist():
+            stamp_ns = int(frame_times.stamps_ns[frame_index])
+            frame_log_ns = int(frame_times.log_times_ns[frame_index])
             # a video is read from its key frame on, unless the decoder is past it already
-            first_ns = last_ns if decoder is None else max(int(frames.key_times_ns[place]), read_ns)
-            read_ns = last_ns + 1
-            shows: list[Shown] = []
-            for message in self._reader.iter_messages({self.topic}, first_ns, read_ns):
+            key_log_ns = int(frame_times.key_times_ns[frame_index])
+            first_log_ns = frame_log_ns if decoder is None else max(key_log_ns, read_until_ns)
+            read_until_ns = frame_log_ns + 1
+            shown_images: list[Shown] = []
+            for message in self._reader.iter_messages({self.topic}, first_log_ns, read_until_ns):
                 with suppress(LogError):
-                    value: Any = self._decode(message.payload)
-                    time_ns = _stamp_ns(value) or message.log_time_ns
+                    content: Any = self._decode(message.payload)
+                    message_stamp_ns = _stamp_ns(content) or message.log_time_ns
                     if decoder is not None:
-                        shows += _of_stamp(stamp_ns, decoder.decode(_h264(value), time_ns))
-                    elif time_ns == stamp_ns:
-                        shows.append(Shown(time_ns, _image(value, self._type), True))
-            if decoder is not None and not shows:
+                        shown_images += _of_stamp(stamp_ns, decoder.decode(_h264(content), message_stamp_ns))
+                    elif message_stamp_ns == stamp_ns:
+                        shown_images.append(Shown(message_stamp_ns, _image(content, self._type), True))
+            if decoder is not None and not shown_images:
                 # held back because data are missing: the next frame is decoded from its key frame again
-                shows += _of_stamp(stamp_ns, decoder.rest())
-                decoder, read_ns = H264Decoder(), 0
-            image = next((show.image for show in reversed(shows) if show.is_true), None)
+                shown_images += _of_stamp(stamp_ns, decoder.rest())
+                decoder, read_until_ns = H264Decoder(), 0
+            image = next((image.image for image in reversed(shown_images) if image.is_true), None)
             if image is not None:
                 yield Frame(stamp_ns, image)
 
-    def _times_of_frames(self) -> _Shown:
+    def _times_of_frames(self) -> _FrameTimes:
         """Return the times of all frames, without decoding them."""
-        rows: list[tuple[int, int, int]] = []
-        key_ns = last_ns = -1
+        frame_times: list[tuple[int, int, int]] = []
+        key_log_ns = last_stamp_ns = -1
         for message in self._reader.iter_messages({self.topic}):
             try:
-                value: Any = self._decode(message.payload)
+                content: Any = self._decode(message.payload)
             except LogError:
                 continue
-            if not self._is_video or has_key(bytes(value.data)):
-                key_ns = message.log_time_ns
-            stamp_ns = _stamp_ns(value) or message.log_time_ns
-            if stamp_ns > last_ns and key_ns >= 0:
-                last_ns = stamp_ns
-                rows.append((stamp_ns, message.log_time_ns, key_ns))
-        return _Shown(*np.array(rows, np.int64).reshape(-1, 3).T)
+            if not self._is_video or has_key(bytes(content.data)):
+                key_log_ns = message.log_time_ns
+            stamp_ns = _stamp_ns(content) or message.log_time_ns
+            if stamp_ns > last_stamp_ns and key_log_ns >= 0:
+                last_stamp_ns = stamp_ns
+                frame_times.append((stamp_ns, message.log_time_ns, key_log_ns))
+        return _FrameTimes(*np.array(frame_times, np.int64).reshape(-1, 3).T)
 
 
-class _Shown(NamedTuple):
+class _FrameTimes(NamedTuple):
     """Frames by their increasing stamps: log times, and log times of the key frames before them."""
 
     stamps_ns: Integers
@@ -198,39 +202,42 @@ class _Shown(NamedTuple):
     key_times_ns: Integers
 
 
-def _choose_topic(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
-    images = {candidate.name: candidate for candidate in topics if is_image_type(candidate.type)}
-    detections = {
+def _choose_topic(name: str, topics: tuple[Topic, ...], topic_name: str | None) -> Topic:
+    image_topics = {candidate.name: candidate for candidate in topics if is_image_type(candidate.type)}
+    detection_topics = {
         candidate.name: candidate for candidate in topics if short_type(candidate.type) in _DETECTIONS
     }
-    if wanted is None and not images and len(detections) == 1:
-        return next(iter(detections.values()))
-    if wanted is None:
-        if len(images) == 1:
-            return next(iter(images.values()))
-        what = f"several image topics: {', '.join(images)}" if images else "no topic with images"
-        raise UsageError(f"{name} has {what}; choose one with --topic" if images else f"{name} has {what}")
-    if wanted in images or wanted in detections:
-        return {**images, **detections}[wanted]
-    every = [candidate.name for candidate in topics]
-    if wanted in every:
-        candidate = next(candidate for candidate in topics if candidate.name == wanted)
+    if topic_name is None and not image_topics and len(detection_topics) == 1:
+        return next(iter(detection_topics.values()))
+    if topic_name is None:
+        if len(image_topics) == 1:
+            return next(iter(image_topics.values()))
+        if not image_topics:
+            raise UsageError(f"{name} has no topic with images")
         raise UsageError(
-            f"{name}: {wanted} has messages of {candidate.type}, neither images nor AprilTag detections"
+            f"{name} has several image topics: {', '.join(image_topics)}; choose one with --topic"
         )
-    hint = nearest_hint(wanted, every) or f"image topics are {', '.join(images) or 'none'}"
-    raise UsageError(f"{name} has no topic {wanted!r}; {hint}")
+    if topic_name in image_topics or topic_name in detection_topics:
+        return {**image_topics, **detection_topics}[topic_name]
+    topic_names = [candidate.name for candidate in topics]
+    if topic_name in topic_names:
+        candidate = next(candidate for candidate in topics if candidate.name == topic_name)
+        raise UsageError(
+            f"{name}: {topic_name} has messages of {candidate.type}, neither images nor AprilTag detections"
+        )
+    hint = nearest_hint(topic_name, topic_names) or f"image topics are {', '.join(image_topics) or 'none'}"
+    raise UsageError(f"{name} has no topic {topic_name!r}; {hint}")
 
 
-def _h264(value: Any) -> bytes:
+def _h264(message: Any) -> bytes:
     """Return the data of a video message.
 
     Raises:
         LogError: the video is not H.264.
     """
-    if str(value.format).lower() not in ("h264", ""):
-        raise LogError(f"the video is {value.format!r:.40}; H.264 is read")
-    return bytes(value.data)
+    if str(message.format).lower() not in ("h264", ""):
+        raise LogError(f"the video is {message.format!r:.40}; H.264 is read")
+    return bytes(message.data)
 
 
 def _frame(shown: Shown) -> tuple[int, Frame, bool]:
@@ -239,47 +246,53 @@ def _frame(shown: Shown) -> tuple[int, Frame, bool]:
     return log_ns, Frame(time_ns, shown.image, payload), shown.is_true
 
 
-def _of_stamp(stamp_ns: int, shown: Iterable[Shown]) -> list[Shown]:
+def _of_stamp(stamp_ns: int, images: Iterable[Shown]) -> list[Shown]:
     """Return the images with a stamp."""
-    return [show for show in shown if show.of == stamp_ns]
+    return [image for image in images if image.of == stamp_ns]
 
 
-def _image(value: Any, type_name: str) -> Image:
+def _image(message: Any, type_name: str) -> Image:
     """Return the image in a message.
 
     Raises:
         LogError: the image is damaged, or its encoding is unknown.
     """
-    data = bytes(value.data)
+    data = bytes(message.data)
     if "Compressed" in type_name:
         return decode_image(data)
-    encoding, width, height = str(value.encoding).lower(), int(value.width), int(value.height)
+    encoding, width, height = str(message.encoding).lower(), int(message.width), int(message.height)
     if encoding not in _ENCODINGS:
         raise LogError(f"the encoding {encoding!r:.40} is not known; known are {', '.join(_ENCODINGS)}")
-    size = _CHANNELS[encoding][0] if encoding in _CHANNELS else _CONVERTED.get(encoding, (2, ""))[0]
-    step = int(value.step) or width * size
-    if not (0 < width * height <= LARGEST_PICTURE and width * size <= step and step * height <= len(data)):
+    pixel_bytes = _CHANNELS[encoding][0] if encoding in _CHANNELS else _CONVERTED.get(encoding, (2, ""))[0]
+    row_bytes = int(message.step) or width * pixel_bytes
+    if not (
+        0 < width * height <= LARGEST_PICTURE
+        and width * pixel_bytes <= row_bytes
+        and row_bytes * height <= len(data)
+    ):
         raise LogError(f"an image of {width} x {height} ({encoding}) does not fit its {len(data)} bytes")
-    rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size]
-    pixels = rows.reshape(height, width, size)
+    row_values = np.frombuffer(data, np.uint8, row_bytes * height).reshape(height, row_bytes)[
+        :, : width * pixel_bytes
+    ]
+    pixels = row_values.reshape(height, width, pixel_bytes)
     if encoding in _CONVERTED:
         return convert(pixels, _CONVERTED[encoding][1])
     if encoding == "mono16":
-        wide = pixels.view(">u2" if getattr(value, "is_bigendian", False) else "<u2")[..., 0]
+        wide_pixels = pixels.view(">u2" if getattr(message, "is_bigendian", False) else "<u2")[..., 0]
         # cameras of 10 or 12 bits leave the upper bits empty, so the greatest value decides the shift
-        return np.asarray(wide >> max(0, int(wide.max()).bit_length() - 8), np.uint8)
-    order = _CHANNELS[encoding][1]
-    return np.ascontiguousarray(pixels[..., 0] if size == 1 else pixels[..., order])
+        return np.asarray(wide_pixels >> max(0, int(wide_pixels.max()).bit_length() - 8), np.uint8)
+    channel_indices = _CHANNELS[encoding][1]
+    return np.ascontiguousarray(pixels[..., 0] if pixel_bytes == 1 else pixels[..., channel_indices])
 
 
-def _detections(listed: Any) -> tuple[Detection, ...]:
+def _detections(message_tags: Any) -> tuple[Detection, ...]:
     """Return the tags in a message.
 
     Raises:
         LogError: a tag does not have four finite corners.
     """
     detections = []
-    for tag in listed:
+    for tag in message_tags:
         corners = np.array([(corner.x, corner.y) for corner in tag.corners], np.float64)
         if corners.shape != (4, 2) or not np.isfinite(corners).all():
             raise LogError(f"tag {tag.id} does not have four corners that are finite")
@@ -289,12 +302,12 @@ def _detections(listed: Any) -> tuple[Detection, ...]:
     return tuple(sorted(detections, key=lambda tag: (tag.id, *tag.corners[0].tolist())))
 
 
-def _stamp_ns(value: Any) -> int:
+def _stamp_ns(message: Any) -> int:
     """Return the stamp inside a message; 0 without one."""
-    stamp = getattr(value, "timestamp", None) or getattr(getattr(value, "header", None), "stamp", None)
-    for seconds, nanoseconds in (("seconds", "nanos"), ("sec", "nanosec"), ("secs", "nsecs")):
-        if hasattr(stamp, seconds):
-            return int(getattr(stamp, seconds)) * 10**9 + int(getattr(stamp, nanoseconds))
+    stamp = getattr(message, "timestamp", None) or getattr(getattr(message, "header", None), "stamp", None)
+    for seconds_field, nanoseconds_field in (("seconds", "nanos"), ("sec", "nanosec"), ("secs", "nsecs")):
+        if hasattr(stamp, seconds_field):
+            return int(getattr(stamp, seconds_field)) * 10**9 + int(getattr(stamp, nanoseconds_field))
     return 0
 
 
@@ -354,21 +367,21 @@ class CameraFrames:
         self._capture, self._length_ns = opened(number), length_ns
 
     def __iter__(self) -> Iterator[Frame]:
-        first, last_ns = None, -1
+        first_ns, last_ns = None, -1
         try:
             while self._length_ns is None or last_ns < self._length_ns:
-                is_there, image = self._capture.read()
-                if not is_there:
-                    if first is None:
+                has_image, image = self._capture.read()
+                if not has_image:
+                    if first_ns is None:
                         raise LogError(f"{self.name} gives no picture; another program may be using it")
                     self.faults.append(
                         f"{self.name} gives no more pictures after {last_ns / 1e9:.3f} s; is it unplugged?"
                     )
                     return
                 # the wall clock may be set while the camera runs
-                now = time.monotonic_ns()
-                first = now if first is None else first
-                last_ns = max(now - first, last_ns + 1)
+                now_ns = time.monotonic_ns()
+                first_ns = now_ns if first_ns is None else first_ns
+                last_ns = max(now_ns - first_ns, last_ns + 1)
                 yield Frame(last_ns, image)
         finally:
             self._capture.release()

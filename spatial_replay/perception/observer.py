@@ -77,79 +77,101 @@ def poses_on_plane(
     if not tags:
         return []
     z = np.array([tag.z for tag in tags])
-    size = np.array([tag.size for tag in tags])
-    offset = np.array([(tag.x, tag.y) for tag in tags])
-    turn = np.array([tag.yaw for tag in tags])
+    sizes = np.array([tag.size for tag in tags])
+    tag_offsets = np.array([(tag.x, tag.y) for tag in tags])
+    tag_yaws = np.array([tag.yaw for tag in tags])
     # each tag unchanged, and with each of its eight coordinates moved by a step up and down
-    moves = np.concatenate([np.zeros((1, 8)), _STEP * np.eye(8), -_STEP * np.eye(8)]).reshape(17, 4, 2)
-    places = plane.places(corners[:, None] + moves, np.broadcast_to(z[:, None, None], (len(tags), 17, 4)))
-    centre = places.mean(axis=2)
-    ahead = (places[:, :, 1] - places[:, :, 0]) + (places[:, :, 2] - places[:, :, 3])
-    left = (places[:, :, 3] - places[:, :, 0]) + (places[:, :, 2] - places[:, :, 1])
-    # in a square, the sides to the left, turned by -90 degrees, equal the sides ahead: average both
-    along = ahead + np.stack([left[..., 1], -left[..., 0]], axis=-1)
-    # `along` is the sum of four edges
-    edge = np.linalg.norm(along, axis=-1) / 4
-    yaw = np.arctan2(along[..., 1], along[..., 0]) - turn[:, None]
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    shift = np.stack(
-        [cosine * offset[:, :1] - sine * offset[:, 1:], sine * offset[:, :1] + cosine * offset[:, 1:]],
+    corner_steps = np.concatenate([np.zeros((1, 8)), _STEP * np.eye(8), -_STEP * np.eye(8)]).reshape(17, 4, 2)
+    corner_places = plane.places(
+        corners[:, None] + corner_steps, np.broadcast_to(z[:, None, None], (len(tags), 17, 4))
+    )
+    centres = corner_places.mean(axis=2)
+    ahead_sides = (corner_places[:, :, 1] - corner_places[:, :, 0]) + (
+        corner_places[:, :, 2] - corner_places[:, :, 3]
+    )
+    left_sides = (corner_places[:, :, 3] - corner_places[:, :, 0]) + (
+        corner_places[:, :, 2] - corner_places[:, :, 1]
+    )
+    # in a square, the left sides turned by -90 degrees equal the sides ahead, so their average has less noise
+    edge_sums = ahead_sides + np.stack([left_sides[..., 1], -left_sides[..., 0]], axis=-1)
+    # `edge_sums` adds the vectors of four edges
+    edge_lengths = np.linalg.norm(edge_sums, axis=-1) / 4
+    yaws = np.arctan2(edge_sums[..., 1], edge_sums[..., 0]) - tag_yaws[:, None]
+    cosine, sine = np.cos(yaws), np.sin(yaws)
+    centre_shifts = np.stack(
+        [
+            cosine * tag_offsets[:, :1] - sine * tag_offsets[:, 1:],
+            sine * tag_offsets[:, :1] + cosine * tag_offsets[:, 1:],
+        ],
         axis=-1,
     )
-    position = centre - shift
+    positions = centres - centre_shifts
     # unwrapped, so that a step across 180 degrees is no large derivative
-    numbers = np.concatenate([position, np.unwrap(yaw, axis=1)[..., None], edge[..., None]], axis=-1)
-    derivative = (numbers[:, 1:9] - numbers[:, 9:]) / (2 * _STEP)
+    states = np.concatenate([positions, np.unwrap(yaws, axis=1)[..., None], edge_lengths[..., None]], axis=-1)
+    state_derivatives = (states[:, 1:9] - states[:, 9:]) / (2 * _STEP)
     variance = plane.corner_error**2
-    spread = variance * np.einsum("nki,nkj->nij", derivative, derivative)
-    shared = plane.covariance(corners.mean(axis=1), z)
-    parallax, larger = np.zeros(len(tags)), np.zeros(len(tags))
-    lifted = "its object is lifted or has tipped over"
+    state_spreads = variance * np.einsum("nki,nkj->nij", state_derivatives, state_derivatives)
+    plane_spreads = plane.covariance(corners.mean(axis=1), z)
+    parallaxes, length_errors = np.zeros(len(tags)), np.zeros(len(tags))
+    lift_reason = "its object is lifted or has tipped over"
     if isinstance(plane, HomographyPlane):
         bounds = plane.parallax(corners.reshape(-1, 2), np.repeat(z, 4))
-        parallax, larger = (bounds_of_corner.reshape(-1, 4).max(axis=1) for bounds_of_corner in bounds)
-        lifted += ", or the tag is higher above the reference tags than the file says"
-    squares = _squares(centre[:, 0], along[:, 0] / 4)
+        parallaxes, length_errors = (corner_bounds.reshape(-1, 4).max(axis=1) for corner_bounds in bounds)
+        lift_reason += ", or the tag is higher above the reference tags than the file says"
+    squares = _squares(centres[:, 0], edge_sums[:, 0] / 4)
     misfits = _misfits(plane, corners, squares, z)
     poses = []
     for index, tag in enumerate(tags):
-        of_pose = np.zeros((4, 4))
-        axes = [0, 1, 3]
-        of_pose[np.ix_(axes, axes)] = spread[index, :3, :3]
+        pose_spread = np.zeros((4, 4))
+        pose_axes = [0, 1, 3]
+        pose_spread[np.ix_(pose_axes, pose_axes)] = state_spreads[index, :3, :3]
         doubt = None
-        if not np.isfinite(numbers[index]).all():
+        if not np.isfinite(states[index]).all():
             doubt = f"tag {tag.id} is not in front of the camera"
-        elif size[index] > 0:
-            noise = sigmas * math.sqrt(spread[index, 3, 3]) / size[index]
-            ratio = edge[index, 0] / size[index] - 1
-            off = float(np.linalg.norm(places[index, 0] - squares[index], axis=1).max()) / size[index]
+        elif sizes[index] > 0:
+            size_noise = sigmas * math.sqrt(state_spreads[index, 3, 3]) / sizes[index]
+            size_error = edge_lengths[index, 0] / sizes[index] - 1
+            relative_misfit = (
+                float(np.linalg.norm(corner_places[index, 0] - squares[index], axis=1).max()) / sizes[index]
+            )
             # a tag above the plane of an uncalibrated camera appears larger, below it smaller
-            beyond = abs(ratio) - (larger[index] if ratio * tag.z > 0 else 0.0)
-            if beyond > _SIZE_TOLERANCE + noise or off > 2 * _SIZE_TOLERANCE + 2 * noise:
+            unexplained_error = abs(size_error) - (length_errors[index] if size_error * tag.z > 0 else 0.0)
+            if (
+                unexplained_error > _SIZE_TOLERANCE + size_noise
+                or relative_misfit > 2 * _SIZE_TOLERANCE + 2 * size_noise
+            ):
                 doubt = (
-                    f"tag {tag.id} appears {abs(ratio):.0%} {'larger' if ratio > 0 else 'smaller'} than it"
-                    f" is, or leans: {lifted}"
+                    f"tag {tag.id} appears {abs(size_error):.0%} {'larger' if size_error > 0 else 'smaller'}"
+                    f" than it is, or leans: {lift_reason}"
                 )
-        place = np.array([*numbers[index, 0, :2], 0.0])
-        yaw_of_object, off_by = float(numbers[index, 0, 2]), float(parallax[index])
+        place = np.array([*states[index, 0, :2], 0.0])
+        yaw, pose_parallax = float(states[index, 0, 2]), float(parallaxes[index])
         misfit = float(misfits[index])
-        poses.append(ObjectPose(place, yaw_of_object, of_pose, shared[index], off_by, doubt, misfit))
+        poses.append(ObjectPose(place, yaw, pose_spread, plane_spreads[index], pose_parallax, doubt, misfit))
     return poses
 
 
 def _squares(centres: Floats, edges: Floats) -> Floats:
     """Return the corners (N, 4, 2) of squares with centres (N, 2) and lower edges (N, 2)."""
     half = edges[:, None] / 2
-    across = np.stack([-half[..., 1], half[..., 0]], axis=-1)
-    corners: Floats = np.concatenate([-half - across, half - across, half + across, -half + across], axis=1)
+    normal = np.stack([-half[..., 1], half[..., 0]], axis=-1)
+    corners: Floats = np.concatenate(
+        [
+            -half - normal,
+            half - normal,
+            half + normal,
+            -half + normal,
+        ],
+        axis=1,
+    )
     return np.asarray(centres[:, None] + corners)
 
 
-def _misfits(plane: Plane, corners: Floats, squares: Floats, z: Floats) -> Floats:
+def _misfits(plane: Plane, corners: Floats, squares: Floats, heights: Floats) -> Floats:
     """Return the misfits (N,) of corners (N, 4, 2) to squares at heights (N,); see `ObjectPose.misfit`."""
-    places = np.concatenate([squares, np.repeat(z, 4).reshape(-1, 4, 1)], axis=2)
-    off = corners.reshape(-1, 2) - plane.pixels(places.reshape(-1, 3))
-    return np.asarray(np.linalg.norm(off.reshape(-1, 8), axis=1) / math.sqrt(_LEFT_OVER))
+    places = np.concatenate([squares, np.repeat(heights, 4).reshape(-1, 4, 1)], axis=2)
+    pixel_errors = corners.reshape(-1, 2) - plane.pixels(places.reshape(-1, 3))
+    return np.asarray(np.linalg.norm(pixel_errors.reshape(-1, 8), axis=1) / math.sqrt(_LEFT_OVER))
 
 
 def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: float) -> ObjectPose | None:
@@ -162,46 +184,53 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
         corners: (4, 2), corners of the tag, pixels.
     """
     half = tag.size / 2
-    square = np.array([(-half, -half, 0.0), (half, -half, 0.0), (half, half, 0.0), (-half, half, 0.0)])
-    start = _level_start(plane, corners, tag)
-    if not np.isfinite(start).all():
+    square = np.array(
+        [
+            (-half, -half, 0.0),
+            (half, -half, 0.0),
+            (half, half, 0.0),
+            (-half, half, 0.0),
+        ]
+    )
+    level_pose = _level_start(plane, corners, tag)
+    if not np.isfinite(level_pose).all():
         return None
-    weight = np.array([1 / plane.corner_error] * 8 + [1 / _LEANING] * 2)
-    upright = np.zeros((2, 6))
-    upright[[0, 1], [3, 4]] = 1.0
+    residual_weights = np.array([1 / plane.corner_error] * 8 + [1 / _LEANING] * 2)
+    tilt_derivative = np.zeros((2, 6))
+    tilt_derivative[[0, 1], [3, 4]] = 1.0
     # Gauss-Newton on x, y, z of the tag's centre, and on the rotation vector of its tilt and turn
-    state = np.concatenate([start[:3], np.zeros(3)])
-    moves = np.concatenate([np.zeros((1, 6)), _SMALL * np.eye(6), -_SMALL * np.eye(6)])
-    weighted, residual = np.zeros((10, 6)), np.zeros(10)
+    state = np.concatenate([level_pose[:3], np.zeros(3)])
+    state_steps = np.concatenate([np.zeros((1, 6)), _SMALL * np.eye(6), -_SMALL * np.eye(6)])
+    weighted_derivative, residual = np.zeros((10, 6)), np.zeros(10)
     for _ in range(_ITERATIONS):
-        states = state + moves
-        turns = rotations(states[:, 3:]) @ rotations(np.array([[0.0, 0.0, start[3]]]))
-        points = np.einsum("kij,nj->kni", turns, square) + states[:, None, :3]
-        pixels = plane.pixels(points.reshape(-1, 3)).reshape(13, 8)
-        derivative = ((pixels[1:7] - pixels[7:]) / (2 * _SMALL)).T
-        residual = np.concatenate([corners.ravel() - pixels[0], -state[3:5]])
-        weighted = weight[:, None] * np.concatenate([derivative, upright])
-        state = state + np.linalg.lstsq(weighted, weight * residual, rcond=None)[0]
+        moved_states = state + state_steps
+        moved_rotations = rotations(moved_states[:, 3:]) @ rotations(np.array([[0.0, 0.0, level_pose[3]]]))
+        points = np.einsum("kij,nj->kni", moved_rotations, square) + moved_states[:, None, :3]
+        corner_pixels = plane.pixels(points.reshape(-1, 3)).reshape(13, 8)
+        derivative = ((corner_pixels[1:7] - corner_pixels[7:]) / (2 * _SMALL)).T
+        residual = np.concatenate([corners.ravel() - corner_pixels[0], -state[3:5]])
+        weighted_derivative = residual_weights[:, None] * np.concatenate([derivative, tilt_derivative])
+        state = state + np.linalg.lstsq(weighted_derivative, residual_weights * residual, rcond=None)[0]
     if not np.isfinite(state).all():
         return None
-    spread = np.linalg.inv(weighted.T @ weighted)
-    yaw = start[3] + state[5] - tag.yaw
+    state_spread = np.linalg.inv(weighted_derivative.T @ weighted_derivative)
+    yaw = level_pose[3] + state[5] - tag.yaw
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    shift = np.array([cosine * tag.x - sine * tag.y, sine * tag.x + cosine * tag.y, tag.z])
+    tag_offset = np.array([cosine * tag.x - sine * tag.y, sine * tag.x + cosine * tag.y, tag.z])
     # derivative of the object's pose by the tag's pose
-    lever = np.eye(4)
-    lever[:2, 3] = shift[1], -shift[0]
-    axes = [0, 1, 2, 5]
+    pose_derivative = np.eye(4)
+    pose_derivative[:2, 3] = tag_offset[1], -tag_offset[0]
+    pose_axes = [0, 1, 2, 5]
     doubt = None
-    off = float(np.sqrt(np.square(residual[:8]).sum() / 4))
-    if off > sigmas * (2 * plane.corner_error) or np.linalg.norm(state[3:5]) > sigmas * _LEANING:
+    corner_error_px = float(np.sqrt(np.square(residual[:8]).sum() / 4))
+    if corner_error_px > sigmas * (2 * plane.corner_error) or np.linalg.norm(state[3:5]) > sigmas * _LEANING:
         doubt = f"tag {tag.id} does not look like an upright tag of its size: its object has tipped over"
-    shared = plane.covariance(corners.mean(axis=0)[None], state[2:3])[0]
+    plane_spread = plane.covariance(corners.mean(axis=0)[None], state[2:3])[0]
     return ObjectPose(
-        state[:3] - shift,
+        state[:3] - tag_offset,
         float(yaw),
-        lever @ spread[np.ix_(axes, axes)] @ lever.T,
-        shared,
+        pose_derivative @ state_spread[np.ix_(pose_axes, pose_axes)] @ pose_derivative.T,
+        plane_spread,
         doubt=doubt,
         misfit=float(np.linalg.norm(residual[:8])) / math.sqrt(_LEFT_OVER),
     )
@@ -210,34 +239,38 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
 def _level_start(plane: CameraPlane, corners: Floats, tag: MountedTag) -> Floats:
     """Return x, y, z and yaw of an upright tag at the distance that follows from its size in the image."""
     places = plane.places(corners, np.full(4, tag.z))
-    along = (places[1] - places[0]) + (places[2] - places[3])
-    left = (places[3] - places[0]) + (places[2] - places[1])
-    along = along + np.array([left[1], -left[0]])
-    eye = -plane.rotation.T @ plane.pose[3:]
+    edge_sum = (places[1] - places[0]) + (places[2] - places[3])
+    left_sides = (places[3] - places[0]) + (places[2] - places[1])
+    edge_sum = edge_sum + np.array([left_sides[1], -left_sides[0]])
+    camera_place = -plane.rotation.T @ plane.pose[3:]
     centre = np.append(places.mean(axis=0), tag.z)
-    place = eye + (centre - eye) * (4 * tag.size / np.linalg.norm(along))
-    return np.append(place, math.atan2(along[1], along[0]))
+    tag_place = camera_place + (centre - camera_place) * (4 * tag.size / np.linalg.norm(edge_sum))
+    return np.append(tag_place, math.atan2(edge_sum[1], edge_sum[0]))
 
 
 def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     """Fuse the poses from several tags on an object, each weighted by its covariance."""
     if len(poses) == 1:
         return poses[0]
-    first = poses[0].yaw
+    first_yaw = poses[0].yaw
     # yaws within half a turn of the first one, so that their mean is between them
-    states = np.array(
-        [[*pose.place, first + math.remainder(pose.yaw - first, 2 * math.pi)] for pose in poses]
+    pose_states = np.array(
+        [[*pose.place, first_yaw + math.remainder(pose.yaw - first_yaw, 2 * math.pi)] for pose in poses]
     )
     # pseudo-inverses, because poses on the plane have no variance of z
     weights = [np.linalg.pinv(pose.spread, hermitian=True, rcond=1e-12) for pose in poses]
     spread = np.linalg.pinv(sum(weights, np.zeros((4, 4))), hermitian=True, rcond=1e-12)
-    mean = spread @ sum((w @ x for w, x in zip(weights, states, strict=True)), np.zeros(4))
+    mean_state = spread @ sum((w @ x for w, x in zip(weights, pose_states, strict=True)), np.zeros(4))
     # tags that contradict each other beyond noise are misplaced in the file: the spread covers that
-    off = states - mean
-    excess = sum(float(x @ w @ x) for w, x in zip(weights, off, strict=True)) / max(3 * (len(poses) - 1), 1)
+    deviations = pose_states - mean_state
+    reduced_chi_square = sum(float(x @ w @ x) for w, x in zip(weights, deviations, strict=True)) / max(
+        3 * (len(poses) - 1), 1
+    )
     shared = np.max([pose.shared for pose in poses], axis=0)
     parallax = max(pose.parallax for pose in poses)
-    return ObjectPose(mean[:3], float(mean[3]), spread * max(excess, 1.0), shared, parallax)
+    return ObjectPose(
+        mean_state[:3], float(mean_state[3]), spread * max(reduced_chi_square, 1.0), shared, parallax
+    )
 
 
 def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
@@ -251,15 +284,15 @@ def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
         outline: (K, 2), points of the footprint in the object's frame.
     """
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
-    swing = np.stack(
+    yaw_derivatives = np.stack(
         [-sine * outline[:, 0] - cosine * outline[:, 1], cosine * outline[:, 0] - sine * outline[:, 1]]
     )
-    lever = np.zeros((outline.shape[0], 3, 4))
-    lever[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    lever[:, :2, 3] = swing.T
-    spread = lever @ pose.spread @ lever.transpose(0, 2, 1)
-    spread[:, :2, :2] += pose.shared
-    return pose.parallax + sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[:, -1].max()), 0.0))
+    point_derivatives = np.zeros((outline.shape[0], 3, 4))
+    point_derivatives[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    point_derivatives[:, :2, 3] = yaw_derivatives.T
+    point_spreads = point_derivatives @ pose.spread @ point_derivatives.transpose(0, 2, 1)
+    point_spreads[:, :2, :2] += pose.shared
+    return pose.parallax + sigmas * math.sqrt(max(float(np.linalg.eigvalsh(point_spreads)[:, -1].max()), 0.0))
 
 
 # ----------------------------------------------------------------------------------------- frames of one time
@@ -277,20 +310,22 @@ def simultaneous(
         cameras: frames of each camera, with increasing times.
         offsets_ns: offset that is added to the stamps of each camera; 0 by default.
     """
-    offsets = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
-    shifted = [_shift(frames, offset) for frames, offset in zip(cameras, offsets, strict=True)]
+    camera_offsets_ns = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
+    shifted_cameras = [
+        _shift(frames, offset_ns) for frames, offset_ns in zip(cameras, camera_offsets_ns, strict=True)
+    ]
     if len(cameras) == 1:
         # the frames of a single camera need no read ahead
-        yield from ((frame,) for frame in shifted[0])
+        yield from ((frame,) for frame in shifted_cameras[0])
         return
-    coming = [_Coming(frames) for frames in shifted]
-    while present := [camera for camera in coming if camera.now is not None]:
-        gaps = [camera.gap_ns for camera in present if camera.gap_ns]
-        first_ns = min(camera.time_ns for camera in present)
-        last_ns = first_ns + (min(gaps) // 2 if gaps else 0)
+    read_ahead = [_ReadAhead(frames) for frames in shifted_cameras]
+    while active_cameras := [camera for camera in read_ahead if camera.next_frame is not None]:
+        gaps_ns = [camera.gap_ns for camera in active_cameras if camera.gap_ns]
+        earliest_ns = min(camera.time_ns for camera in active_cameras)
+        latest_ns = earliest_ns + (min(gaps_ns) // 2 if gaps_ns else 0)
         yield tuple(
-            camera.take() if camera.now is not None and camera.time_ns <= last_ns else None
-            for camera in coming
+            camera.take() if camera.next_frame is not None and camera.time_ns <= latest_ns else None
+            for camera in read_ahead
         )
 
 
@@ -298,27 +333,27 @@ def _shift(frames: Iterable[Frame], offset_ns: int) -> Iterator[Frame]:
     return (replace(frame, time_ns=frame.time_ns + offset_ns) if offset_ns else frame for frame in frames)
 
 
-class _Coming:
+class _ReadAhead:
     """The frames of one camera, with the next two frames read ahead."""
 
     def __init__(self, frames: Iterator[Frame]) -> None:
         self._frames = frames
-        self.now, self._later = next(frames, None), next(frames, None)
+        self.next_frame, self._second_frame = next(frames, None), next(frames, None)
 
     @property
     def time_ns(self) -> int:
         """Time of the next frame."""
-        return 0 if self.now is None else self.now.time_ns
+        return 0 if self.next_frame is None else self.next_frame.time_ns
 
     @property
     def gap_ns(self) -> int:
         """Time between the next two frames; 0 if there are not two."""
-        return 0 if self._later is None else self._later.time_ns - self.time_ns
+        return 0 if self._second_frame is None else self._second_frame.time_ns - self.time_ns
 
     def take(self) -> Frame | None:
         """Return the next frame, and read another one."""
-        frame, self.now = self.now, self._later
-        self._later = next(self._frames, None)
+        frame, self.next_frame = self.next_frame, self._second_frame
+        self._second_frame = next(self._frames, None)
         return frame
 
 
@@ -418,12 +453,12 @@ class CameraView:
                 detection for detection in frame.detections if detection.family in ("", self.tags.family)
             ]
             width, height = self._size_without_image()
-        usable = self._single(detections)
+        corners_by_tag = self._single(detections)
         if self._size != (width, height):
             self._size, self._plane = (width, height), given_plane(self.tags, (width, height))
             self._averages.clear()
-        self._refer(usable)
-        poses = {} if self._plane is None else self._poses(self._plane, usable)
+        self._refer(corners_by_tag)
+        poses = {} if self._plane is None else self._poses(self._plane, corners_by_tag)
         return View(frame, tuple(detections), self._plane), poses
 
     def _size_without_image(self) -> tuple[int, int]:
@@ -437,39 +472,47 @@ class CameraView:
 
     def _single(self, detections: Iterable[Detection]) -> dict[int, Floats]:
         """Return the corners of tags that are in the image exactly once; two equal tags are ambiguous."""
-        times = Counter(detection.id for detection in detections)
-        self.seen.update(times.keys())
-        self.twice.update(number for number, count in times.items() if count > 1)
-        return {detection.id: detection.corners for detection in detections if times[detection.id] == 1}
+        tag_counts = Counter(detection.id for detection in detections)
+        self.seen.update(tag_counts.keys())
+        self.twice.update(tag_id for tag_id, count in tag_counts.items() if count > 1)
+        return {detection.id: detection.corners for detection in detections if tag_counts[detection.id] == 1}
 
     def _refer(self, corners: Mapping[int, Floats]) -> None:
         """Average the reference tags, and fit the plane again while the averages change."""
         if not self.tags.references or self.tags.pose is not None:
             return
-        present = {
+        seen_references = {
             reference.id: corners[reference.id]
             for reference in self.tags.references
             if reference.id in corners
         }
-        before = {number: self._averages[number] for number in present if number in self._averages}
-        off = [float(np.linalg.norm(present[n] - mean, axis=1).mean()) for n, (mean, _) in before.items()]
-        if off and float(np.median(off)) > _MOVED:
+        earlier_averages = {
+            tag_id: self._averages[tag_id] for tag_id in seen_references if tag_id in self._averages
+        }
+        shifts_px = [
+            float(np.linalg.norm(seen_references[n] - mean_corners, axis=1).mean())
+            for n, (mean_corners, _) in earlier_averages.items()
+        ]
+        if shifts_px and float(np.median(shifts_px)) > _MOVED:
             self.moved += 1
             self._averages.clear()
-        is_new = False
-        for number, reference_corners in present.items():
-            mean, count = self._averages.get(number, (reference_corners, 0))
-            if count < _MOST_AVERAGED:
-                is_new = True
-                self._averages[number] = (mean + (reference_corners - mean) / (count + 1), count + 1)
-        if not is_new:
+        is_changed = False
+        for tag_id, tag_corners in seen_references.items():
+            mean_corners, detection_count = self._averages.get(tag_id, (tag_corners, 0))
+            if detection_count < _MOST_AVERAGED:
+                is_changed = True
+                self._averages[tag_id] = (
+                    mean_corners + (tag_corners - mean_corners) / (detection_count + 1),
+                    detection_count + 1,
+                )
+        if not is_changed:
             return
         if len(self._averages) < LEAST_REFERENCES:
             self._plane = None
             return
         try:
-            means = {number: mean for number, (mean, _) in self._averages.items()}
-            self.fit = plane_from_references(self.tags, means, self._size or (0, 0))
+            corners_by_id = {tag_id: mean_corners for tag_id, (mean_corners, _) in self._averages.items()}
+            self.fit = plane_from_references(self.tags, corners_by_id, self._size or (0, 0))
             self._plane = self.fit.plane
         except UsageError:
             # tags that fitted before do not fit while the camera or a tag moves
@@ -479,25 +522,25 @@ class CameraView:
 
     def _poses(self, plane: Plane, corners: Mapping[int, Floats]) -> dict[int, ObjectPose]:
         """Return poses of objects by tag, from each tag in the image."""
-        present = sorted(number for number in corners if number in self.tags.by_id)
-        flat = [number for number in present if not self.tags.by_id[number][0].is_lifted]
+        object_tag_ids = sorted(tag_id for tag_id in corners if tag_id in self.tags.by_id)
+        flat_tag_ids = [tag_id for tag_id in object_tag_ids if not self.tags.by_id[tag_id][0].is_lifted]
         sigmas = self.tags.sigmas
         poses: dict[int, ObjectPose] = {}
-        if flat:
-            of_flat = np.stack([corners[number] for number in flat])
-            mounted = [self.tags.by_id[number][1] for number in flat]
-            poses |= zip(flat, poses_on_plane(plane, of_flat, mounted, sigmas), strict=True)
+        if flat_tag_ids:
+            flat_corners = np.stack([corners[tag_id] for tag_id in flat_tag_ids])
+            flat_tags = [self.tags.by_id[tag_id][1] for tag_id in flat_tag_ids]
+            poses |= zip(flat_tag_ids, poses_on_plane(plane, flat_corners, flat_tags, sigmas), strict=True)
         if isinstance(plane, CameraPlane):
-            for number in present:
-                tagged, tag = self.tags.by_id[number]
-                pose = pose_in_space(plane, corners[number], tag, sigmas) if tagged.is_lifted else None
+            for tag_id in object_tag_ids:
+                tagged, tag = self.tags.by_id[tag_id]
+                pose = pose_in_space(plane, corners[tag_id], tag, sigmas) if tagged.is_lifted else None
                 if pose is not None:
-                    poses[number] = pose
-        poses = {number: self._with_misfits(plane, number, pose) for number, pose in poses.items()}
+                    poses[tag_id] = pose
+        poses = {tag_id: self._with_misfits(plane, tag_id, pose) for tag_id, pose in poses.items()}
         self._parallax = max(self._parallax, *(pose.parallax for pose in poses.values()), 0.0)
         return poses
 
-    def _with_misfits(self, plane: Plane, number: int, pose: ObjectPose) -> ObjectPose:
+    def _with_misfits(self, plane: Plane, tag_id: int, pose: ObjectPose) -> ObjectPose:
         """Return the pose with a spread that covers the latest misfits of its tag.
 
         Reference tags rest, and a codec sharpens resting parts of a video. So their misfits do not show the
@@ -506,60 +549,66 @@ class CameraView:
         if self.tags.corner_error is not None or pose.doubt is not None:
             return pose
         # with the error of the reference tags alone, 20 to 41 of 150 outlines were wrong at crf 36
-        misfits = self._misfits.setdefault(number, deque(maxlen=_LATE))
+        misfits = self._misfits.setdefault(tag_id, deque(maxlen=_LATE))
         misfits.append(pose.misfit)
-        larger = max(_SHARED * max(misfits) / plane.corner_error, 1.0)
+        error_ratio = max(_SHARED * max(misfits) / plane.corner_error, 1.0)
         self._sharpness["fitted"] += 1
-        self._sharpness["blurred"] += larger > _BLURRED
-        return pose._replace(spread=pose.spread * larger**2)
+        self._sharpness["blurred"] += error_ratio > _BLURRED
+        return pose._replace(spread=pose.spread * error_ratio**2)
 
     def _why_no_plane(self) -> str:
         if self.fit is not None:
             return "the reference tags stopped fitting each other, as the camera or a tag moved"
-        absent = [str(tag.id) for tag in self.tags.references if tag.id not in self.seen]
-        if len(self.tags.references) - len(absent) >= LEAST_REFERENCES:
+        unseen_ids = [str(tag.id) for tag in self.tags.references if tag.id not in self.seen]
+        if len(self.tags.references) - len(unseen_ids) >= LEAST_REFERENCES:
             return (
                 "enough reference tags were seen, but fewer than"
                 f" {LEAST_REFERENCES} of them once in a frame while the camera stood still"
             )
-        were = "was" if len(absent) == 1 else "were"
-        return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_text(absent)} {were} not"
+        verb = "was" if len(unseen_ids) == 1 else "were"
+        return f"fewer than {LEAST_REFERENCES} reference tags were seen; {tags_text(unseen_ids)} {verb} not"
 
     def remarks(self) -> list[str]:
         """Return remarks on the camera: no tag seen, no plane, uncertain places, or moves."""
-        frames, lines = plural(self.frames, "frame"), []
-        of_it = f" of {self.name}" if self.name else ""
+        frames_text, lines = plural(self.frames, "frame"), []
+        of_camera = f" of {self.name}" if self.name else ""
         if self.frames and not self.seen:
             lines.append(
-                f"no tag of family {self.tags.family} is in any of {frames}{of_it}; check the family, the"
-                " light, that tags are 20 pixels or larger, with a white rim, and that the camera looks"
-                " from above"
+                f"no tag of family {self.tags.family} is in any of {frames_text}{of_camera}; check the"
+                " family, the light, that tags are 20 pixels or larger, with a white rim, and that the camera"
+                " looks from above"
             )
             return lines
         if self.frames and self.tags.references and self._plane is None:
-            lines.append(f"the plane{of_it} is not known: {self._why_no_plane()}")
-        for number, count in sorted(self.twice.items()):
+            lines.append(f"the plane{of_camera} is not known: {self._why_no_plane()}")
+        for tag_id, frame_count in sorted(self.twice.items()):
             lines.append(
-                f"tag {number} is in {plural(count, 'frame')}{of_it} more than once, and left out there"
+                f"tag {tag_id} is in {plural(frame_count, 'frame')}{of_camera} more than once, and left out"
+                " there"
             )
         if self._parallax:
-            above = max((tag.z for _, tag in self.tags.by_id.values() if tag.id in self.seen), key=abs)
+            largest_height = max(
+                (tag.z for _, tag in self.tags.by_id.values() if tag.id in self.seen), key=abs
+            )
             lines.append(
-                f"tags on objects are up to {1e3 * abs(above):.3g} mm {'above' if above > 0 else 'below'} the"
-                f" reference tags, and no camera{of_it} is calibrated: outlines are up to"
-                f" {1e3 * self._parallax:.3g} mm less certain; calibrate the camera (tags calibrate), or fix"
+                f"tags on objects are up to {1e3 * abs(largest_height):.3g} mm"
+                f" {'above' if largest_height > 0 else 'below'} the reference tags, and no"
+                f" camera{of_camera} is calibrated: outlines are up to {1e3 * self._parallax:.3g} mm less"
+                " certain; calibrate the camera (tags calibrate), or fix"
                 " the reference tags as high as the others and give their height (plane: height: …)"
             )
-        fitted, blurred = self._sharpness["fitted"], self._sharpness["blurred"]
-        if 2 * blurred > fitted:
+        fitted_count, blurred_count = self._sharpness["fitted"], self._sharpness["blurred"]
+        if 2 * blurred_count > fitted_count:
             lines.append(
-                f"the video{of_it} is blurred or strongly compressed: in {blurred} of {fitted} places,"
-                f" objects are more than {_BLURRED:g} times less certain; expose shorter, or"
-                " compress less (crf 18)"
+                f"the video{of_camera} is blurred or strongly compressed: in {blurred_count} of"
+                f" {fitted_count} places, objects are more than {_BLURRED:g} times less certain; expose"
+                " shorter, or compress less (crf 18)"
             )
         if self.moved:
-            who = self.name or "the camera"
-            lines.append(f"{who} has moved {plural(self.moved, 'time')}: places are uncertain while it does")
+            camera_name = self.name or "the camera"
+            lines.append(
+                f"{camera_name} has moved {plural(self.moved, 'time')}: places are uncertain while it does"
+            )
         return lines
 
 
@@ -615,16 +664,18 @@ class TagObserver:
         if hold_ns < 0:
             raise UsageError(f"objects are held for {hold_ns} ns; give 0 or more")
         self.tags, self.hold_ns = tags, hold_ns
-        count = len(cameras)
+        camera_count = len(cameras)
         self._cameras = [
-            CameraView(name if count > 1 else "", tags.of_camera(name, number, count=count))
-            for number, name in enumerate(cameras, 1)
+            CameraView(
+                name if camera_count > 1 else "", tags.of_camera(name, camera_number, count=camera_count)
+            )
+            for camera_number, name in enumerate(cameras, 1)
         ]
-        self._last: dict[str, tuple[int, TrackedObject]] = {}
-        self._hidden: dict[str, str | None] = {}
+        self._last_seen: dict[str, tuple[int, TrackedObject]] = {}
+        self._unknown_classes: dict[str, str | None] = {}
         self._outlines = {tagged.name: _outline(tagged.footprint) for tagged in tags.objects}
         self._doubts: dict[str, tuple[str, int]] = {}
-        self._apart: dict[str, tuple[float, int]] = {}
+        self._tag_distances: dict[str, tuple[float, int]] = {}
         self.frames = self._last_ns = 0
 
     @property
@@ -658,7 +709,7 @@ class TagObserver:
         self.frames += 1
         self._last_ns = time_ns
         views: list[View | None] = []
-        poses: list[tuple[int, Mapping[int, ObjectPose]]] = []
+        poses_by_camera: list[tuple[int, Mapping[int, ObjectPose]]] = []
         for camera, frame in zip(self._cameras, frames, strict=True):
             view = None
             if frame is not None:
@@ -666,60 +717,66 @@ class TagObserver:
                     view, poses_by_tag = camera.look(frame)
                 except UsageError as error:
                     raise UsageError(f"{camera.name}: {error}" if camera.name else str(error)) from None
-                poses.append((abs(frame.time_ns - time_ns), poses_by_tag))
+                poses_by_camera.append((abs(frame.time_ns - time_ns), poses_by_tag))
             views.append(view)
-        objects = dict(self._locate(poses))
-        held = self._hold(time_ns, objects)
-        reported_ns = {name: self._last[name][0] for name in held}
-        sample = Sample(time_ns, {**objects, **held}, unknown=self._hidden, reported_ns=reported_ns)
+        objects = dict(self._locate(poses_by_camera))
+        held_objects = self._hold(time_ns, objects)
+        reported_ns = {name: self._last_seen[name][0] for name in held_objects}
+        sample = Sample(
+            time_ns, {**objects, **held_objects}, unknown=self._unknown_classes, reported_ns=reported_ns
+        )
         return Observation(sample, tuple(views))
 
     # ------------------------------------------------------------------------------------- the objects
 
     def _locate(
-        self, poses: Sequence[tuple[int, Mapping[int, ObjectPose]]]
+        self, poses_by_camera: Sequence[tuple[int, Mapping[int, ObjectPose]]]
     ) -> Iterator[tuple[str, TrackedObject]]:
         """Yield the objects that have a pose without a doubt.
 
         Args:
-            poses: for each camera with a frame, the time offset of its frame, and its poses by tag.
+            poses_by_camera: time offset of the frame, ns, and poses by tag, of each camera with a frame.
         """
         for tagged in self.tags.objects:
-            poses_of_object = [
-                (off, poses_by_tag[tag.id])
-                for off, poses_by_tag in poses
+            object_poses = [
+                (offset_ns, poses_by_tag[tag.id])
+                for offset_ns, poses_by_tag in poses_by_camera
                 for tag in tagged.tags
                 if tag.id in poses_by_tag
             ]
-            for _, pose in poses_of_object:
+            for _, pose in object_poses:
                 if pose.doubt is not None:
-                    text, count = self._doubts.get(tagged.name, (pose.doubt, 0))
-                    self._doubts[tagged.name] = text, count + 1
-            sound = [(off, pose) for off, pose in poses_of_object if pose.doubt is None]
+                    doubt_text, frame_count = self._doubts.get(tagged.name, (pose.doubt, 0))
+                    self._doubts[tagged.name] = doubt_text, frame_count + 1
+            usable_poses = [(offset_ns, pose) for offset_ns, pose in object_poses if pose.doubt is None]
             # frames with a time offset are used if they make the object more certain
-            found_at = [
-                self._track(tagged, fuse([pose for off, pose in sound if off <= latest]), latest)
-                for latest in sorted({off for off, _ in sound})
+            candidates = [
+                self._track(
+                    tagged,
+                    fuse([pose for offset_ns, pose in usable_poses if offset_ns <= latest_offset_ns]),
+                    latest_offset_ns,
+                )
+                for latest_offset_ns in sorted({offset_ns for offset_ns, _ in usable_poses})
             ]
-            self._compare(tagged, [pose for _, pose in sound])
-            if found_at:
-                yield tagged.name, min(found_at, key=lambda tracked: tracked.uncertainty)
+            self._compare(tagged, [pose for _, pose in usable_poses])
+            if candidates:
+                yield tagged.name, min(candidates, key=lambda tracked: tracked.uncertainty)
 
     def _compare(self, tagged: TaggedObject, poses: Sequence[ObjectPose]) -> None:
         """Note an object if places from its tags are further apart than its size plus their uncertainty."""
         if len(poses) < 2:
             return
         outline = self._outlines[tagged.name]
-        size = 2 * max(
+        diameter = 2 * max(
             float(np.linalg.norm(outline, axis=1).max()), *(part.radius for part in tagged.footprint.parts)
         )
-        unsure = 2 * max(radius(pose, outline, self.tags.sigmas) for pose in poses)
-        apart = max(float(np.linalg.norm((poses[0].place - pose.place)[:2])) for pose in poses)
-        if apart > size + unsure:
-            most, count = self._apart.get(tagged.name, (0.0, 0))
-            self._apart[tagged.name] = max(most, apart), count + 1
+        uncertainty = 2 * max(radius(pose, outline, self.tags.sigmas) for pose in poses)
+        distance = max(float(np.linalg.norm((poses[0].place - pose.place)[:2])) for pose in poses)
+        if distance > diameter + uncertainty:
+            largest_distance, frame_count = self._tag_distances.get(tagged.name, (0.0, 0))
+            self._tag_distances[tagged.name] = max(largest_distance, distance), frame_count + 1
 
-    def _track(self, tagged: TaggedObject, pose: ObjectPose, off_ns: int) -> TrackedObject:
+    def _track(self, tagged: TaggedObject, pose: ObjectPose, offset_ns: int) -> TrackedObject:
         height = tagged.height
         if height is not None and tagged.is_lifted:
             height = height[0] + float(pose.place[2]), height[1] + float(pose.place[2])
@@ -729,53 +786,56 @@ class TagObserver:
             yaw=math.remainder(pose.yaw, 2 * math.pi),
             height=height,
             uncertainty=radius(pose, self._outlines[tagged.name], self.tags.sigmas)
-            + tagged.fastest * off_ns / 1e9,
+            + tagged.fastest * offset_ns / 1e9,
         )
 
     def _hold(self, time_ns: int, objects: Mapping[str, TrackedObject]) -> dict[str, TrackedObject]:
         """Return the held objects; store the places of visible objects and the names of unknown ones."""
-        held: dict[str, TrackedObject] = {}
+        held_objects: dict[str, TrackedObject] = {}
         for tagged in self.tags.objects:
             if tagged.name in objects:
-                self._last[tagged.name] = time_ns, objects[tagged.name]
-                self._hidden.pop(tagged.name, None)
-            elif tagged.name in self._last:
-                since_ns, last = self._last[tagged.name]
-                if time_ns - since_ns <= self.hold_ns:
-                    grown = last.uncertainty + tagged.fastest * (time_ns - since_ns) / 1e9
+                self._last_seen[tagged.name] = time_ns, objects[tagged.name]
+                self._unknown_classes.pop(tagged.name, None)
+            elif tagged.name in self._last_seen:
+                last_seen_ns, last_object = self._last_seen[tagged.name]
+                if time_ns - last_seen_ns <= self.hold_ns:
+                    uncertainty = last_object.uncertainty + tagged.fastest * (time_ns - last_seen_ns) / 1e9
                     # a yaw has no uncertainty, so the yaw of an object that may have turned is unknown
-                    yaw = None if tagged.fastest else last.yaw
-                    held[tagged.name] = TrackedObject(
-                        last.footprint, last.class_name, yaw, last.height, grown
+                    yaw = None if tagged.fastest else last_object.yaw
+                    held_objects[tagged.name] = TrackedObject(
+                        last_object.footprint, last_object.class_name, yaw, last_object.height, uncertainty
                     )
                 else:
-                    self._hidden[tagged.name] = tagged.class_name
-        return held
+                    self._unknown_classes[tagged.name] = tagged.class_name
+        return held_objects
 
     # ------------------------------------------------------------------------------------- remarks
 
     def remarks(self) -> tuple[str, ...]:
         """Return remarks on the run, such as tags that are not in the file and objects never seen."""
-        of_cameras = [line for camera in self._cameras for line in camera.remarks()]
-        seen = sum((camera.seen for camera in self._cameras), Counter[int]())
-        if not seen:
-            return tuple(of_cameras)
+        camera_lines = [line for camera in self._cameras for line in camera.remarks()]
+        frames_by_tag = sum((camera.seen for camera in self._cameras), Counter[int]())
+        if not frames_by_tag:
+            return tuple(camera_lines)
         lines: list[str] = []
-        unmapped = [number for number in sorted(seen) if number not in self.tags.ids]
-        if unmapped:
-            tag_texts = [f"{number} (in {plural(seen[number], 'frame')})" for number in unmapped]
+        unmapped_ids = [tag_id for tag_id in sorted(frames_by_tag) if tag_id not in self.tags.ids]
+        if unmapped_ids:
+            tag_texts = [f"{tag_id} (in {plural(frames_by_tag[tag_id], 'frame')})" for tag_id in unmapped_ids]
             lines.append(f"{self.tags.name} has no {tags_text(tag_texts)}")
-        missing = [tagged for tagged in self.tags.objects if not any(tag.id in seen for tag in tagged.tags)]
-        frames = plural(sum(camera.frames for camera in self._cameras), "frame")
-        lines += [
-            f"{tagged.name} was never seen: no {tags_text([str(tag.id) for tag in tagged.tags])} in {frames}"
-            for tagged in missing[:_MOST_NAMED]
+        unseen_objects = [
+            tagged for tagged in self.tags.objects if not any(tag.id in frames_by_tag for tag in tagged.tags)
         ]
-        lines += of_cameras
-        for object_name, (text, count) in sorted(self._doubts.items()):
-            lines.append(f"{object_name} is unknown in {plural(count, 'frame')}: {text}")
-        for object_name, (most, count) in sorted(self._apart.items()):
-            where = f"in {plural(count, 'frame')}, by up to {most:.3g} {self.tags.unit}"
+        frames_text = plural(sum(camera.frames for camera in self._cameras), "frame")
+        lines += [
+            f"{tagged.name} was never seen: no {tags_text([str(tag.id) for tag in tagged.tags])} in"
+            f" {frames_text}"
+            for tagged in unseen_objects[:_MOST_NAMED]
+        ]
+        lines += camera_lines
+        for object_name, (doubt_text, frame_count) in sorted(self._doubts.items()):
+            lines.append(f"{object_name} is unknown in {plural(frame_count, 'frame')}: {doubt_text}")
+        for object_name, (largest_distance, frame_count) in sorted(self._tag_distances.items()):
+            where = f"in {plural(frame_count, 'frame')}, by up to {largest_distance:.3g} {self.tags.unit}"
             lines.append(
                 f"{object_name}: its tags contradict each other {where}; check their places on it, and of"
                 " cameras the pose and the --offset"
@@ -810,7 +870,9 @@ def _outline(footprint: Footprint) -> Floats:
 
 def _move(footprint: Footprint, x: float, y: float, yaw: float) -> Footprint:
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[cosine, sine], [-sine, cosine]])
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
     return Footprint(
-        tuple(ConvexPart(part.vertices @ turn + np.array([x, y]), part.radius) for part in footprint.parts)
+        tuple(
+            ConvexPart(part.vertices @ rotation + np.array([x, y]), part.radius) for part in footprint.parts
+        )
     )

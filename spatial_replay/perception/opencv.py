@@ -100,31 +100,31 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    at = 2
-    while data[at] == 0xFF:
-        marker = data[at + 1]
+    offset = 2
+    while data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == 0xFF:
             # fill bytes before a marker
-            at += 1
+            offset += 1
             continue
         if marker in _JPEG_FRAMES:
             # after marker, length and precision: https://www.w3.org/Graphics/JPEG/itu-t81.pdf, B.2.2
-            height, width = struct.unpack_from(">HH", data, at + 5)
+            height, width = struct.unpack_from(">HH", data, offset + 5)
             return width, height
-        at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])
+        offset += 2 + int(struct.unpack_from(">H", data, offset + 2)[0])
     return None
 
 
 def _webp_size(data: bytes) -> tuple[int, int] | None:
     # https://developers.google.com/speed/webp/docs/riff_container
-    kind = data[12:16]
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+    chunk_type = data[12:16]
+    if chunk_type == b"VP8X":
+        width, height = (int.from_bytes(data[offset : offset + 3], "little") + 1 for offset in (24, 27))
         return width, height
-    if kind == b"VP8L":
+    if chunk_type == b"VP8L":
         bits = struct.unpack_from("<I", data, 21)[0]
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    if kind == b"VP8 ":
+    if chunk_type == b"VP8 ":
         width, height = struct.unpack_from("<HH", data, 26)
         return width & 0x3FFF, height & 0x3FFF
     return None
@@ -152,19 +152,19 @@ def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
         )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    turn, _ = _load().Rodrigues(rotation)
-    return np.concatenate([np.asarray(turn, np.float64).ravel(), -rotation @ eye])
+    rotation_vector, _ = _load().Rodrigues(rotation)
+    return np.concatenate([np.asarray(rotation_vector, np.float64).ravel(), -rotation @ eye])
 
 
 def rotations(vectors: Floats) -> Floats:
     """Return the rotation matrices (N, 3, 3) of rotation vectors (N, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    x, y, z = (vectors / safe[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    sine, versine = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
-    matrices: Floats = np.eye(3) + sine * cross + versine * (cross @ cross)
+    angles = np.linalg.norm(vectors, axis=1)
+    nonzero_angles = np.where(angles > 1e-12, angles, 1.0)
+    x, y, z = (vectors / nonzero_angles[:, None]).T
+    zeros = np.zeros_like(x)
+    cross_matrices = np.stack([zeros, -z, y, z, zeros, -x, -y, x, zeros], axis=1).reshape(-1, 3, 3)
+    sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
+    matrices: Floats = np.eye(3) + sine * cross_matrices + versine * (cross_matrices @ cross_matrices)
     return matrices
 
 
@@ -201,42 +201,50 @@ def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:
     return corners
 
 
-def _refine(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
-    ahead = np.roll(corners, -1, axis=1) - corners
-    length = np.linalg.norm(ahead, axis=2)
-    along = ahead / length[..., None]
+def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Floats:
+    edge_vectors = np.roll(corners, -1, axis=1) - corners
+    edge_lengths = np.linalg.norm(edge_vectors, axis=2)
+    edge_directions = edge_vectors / edge_lengths[..., None]
     # y points down in images, so this points out of a tag whose corners are in our order
-    outward = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    reach = np.minimum(_CELLS * length.min(axis=1) / cells, _WIDEST) * share
-    shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
-    on_edge = corners[:, :, None] + shares[:, None] * ahead[:, :, None]
-    steps = np.arange(-round(_WIDEST / _APART), round(_WIDEST / _APART) + 1) * _APART
+    outward_normals = np.stack([-edge_directions[..., 1], edge_directions[..., 0]], axis=-1)
+    search_ranges = np.minimum(_CELLS * edge_lengths.min(axis=1) / cells, _WIDEST) * range_share
+    edge_shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
+    edge_points = corners[:, :, None] + edge_shares[:, None] * edge_vectors[:, :, None]
+    offsets = np.arange(-round(_WIDEST / _APART), round(_WIDEST / _APART) + 1) * _APART
     # one pixel further on each side, for differences
-    wide = np.arange(steps[0] - 1.0, steps[-1] + 1.0 + _APART / 2, _APART)
-    points = on_edge[..., None, :] + wide[:, None] * outward[:, :, None, None]
-    values = _bilinear(grey, points)
-    two = round(2.0 / _APART)
-    rise = values[..., two:] - values[..., :-two]
-    weight = np.where(np.abs(steps) <= reach[:, None, None, None], np.square(np.maximum(rise, 0.0)), 0.0)
-    total = weight.sum(axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = (weight * steps).sum(axis=-1) / total
-    total = np.where(np.isfinite(at), total, 0.0)
-    # a line through the steps of each edge, offset = a + b * share, with little weight on faint steps
-    weights = np.minimum(total, np.median(total, axis=-1, keepdims=True))
-    sums = [(weights * shares**power).sum(axis=-1) for power in range(3)]
-    at = np.nan_to_num(at)
-    moments = [(weights * at * shares**power).sum(axis=-1) for power in range(2)]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = (sums[0] * moments[1] - sums[1] * moments[0]) / (sums[0] * sums[2] - sums[1] ** 2)
-        begin = (moments[0] - slope * sums[1]) / sums[0]
-    start = corners + begin[..., None] * outward
-    direction = ahead + slope[..., None] * outward
-    met = _meeting(np.roll(start, 1, axis=1), np.roll(direction, 1, axis=1), start, direction)
-    is_sound = np.isfinite(met).all(axis=(1, 2)) & (
-        np.linalg.norm(met - corners, axis=2).max(axis=1) <= 2 * reach + 1.0
+    wide_offsets = np.arange(offsets[0] - 1.0, offsets[-1] + 1.0 + _APART / 2, _APART)
+    sample_points = edge_points[..., None, :] + wide_offsets[:, None] * outward_normals[:, :, None, None]
+    brightness = _bilinear(grey, sample_points)
+    window_size = round(2.0 / _APART)
+    brightness_rise = brightness[..., window_size:] - brightness[..., :-window_size]
+    step_weights = np.where(
+        np.abs(offsets) <= search_ranges[:, None, None, None],
+        np.square(np.maximum(brightness_rise, 0.0)),
+        0.0,
     )
-    return np.where(is_sound[:, None, None], met, corners)
+    total_weights = step_weights.sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step_offsets = (step_weights * offsets).sum(axis=-1) / total_weights
+    total_weights = np.where(np.isfinite(step_offsets), total_weights, 0.0)
+    # a line through the steps of each edge, offset = a + b * share, with little weight on faint steps
+    line_weights = np.minimum(total_weights, np.median(total_weights, axis=-1, keepdims=True))
+    weight_moments = [(line_weights * edge_shares**power).sum(axis=-1) for power in range(3)]
+    step_offsets = np.nan_to_num(step_offsets)
+    offset_moments = [(line_weights * step_offsets * edge_shares**power).sum(axis=-1) for power in range(2)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = (weight_moments[0] * offset_moments[1] - weight_moments[1] * offset_moments[0]) / (
+            weight_moments[0] * weight_moments[2] - weight_moments[1] ** 2
+        )
+        intercepts = (offset_moments[0] - slopes * weight_moments[1]) / weight_moments[0]
+    line_starts = corners + intercepts[..., None] * outward_normals
+    line_directions = edge_vectors + slopes[..., None] * outward_normals
+    intersections = _meeting(
+        np.roll(line_starts, 1, axis=1), np.roll(line_directions, 1, axis=1), line_starts, line_directions
+    )
+    is_accepted = np.isfinite(intersections).all(axis=(1, 2)) & (
+        np.linalg.norm(intersections - corners, axis=2).max(axis=1) <= 2 * search_ranges + 1.0
+    )
+    return np.where(is_accepted[:, None, None], intersections, corners)
 
 
 def _bilinear(grey: Image, points: Floats) -> Floats:
@@ -245,23 +253,33 @@ def _bilinear(grey: Image, points: Floats) -> Floats:
     # below the last pixel, so that its next neighbour exists
     x = np.clip(points[..., 0], 0, width - 1.001)
     y = np.clip(points[..., 1], 0, height - 1.001)
-    column, row = x.astype(np.int64), y.astype(np.int64)
-    u, v = x - column, y - row
-    flat, at = grey.ravel(), row * width + column
-    above = (1 - u) * flat[at] + u * flat[at + 1]
-    below = (1 - u) * flat[at + width] + u * flat[at + width + 1]
-    values: Floats = (1 - v) * above + v * below
+    columns, rows = x.astype(np.int64), y.astype(np.int64)
+    x_share, y_share = x - columns, y - rows
+    flat_grey, flat_indices = grey.ravel(), rows * width + columns
+    upper_values = (1 - x_share) * flat_grey[flat_indices] + x_share * flat_grey[flat_indices + 1]
+    lower_values = (1 - x_share) * flat_grey[flat_indices + width] + x_share * flat_grey[
+        flat_indices + width + 1
+    ]
+    values: Floats = (1 - y_share) * upper_values + y_share * lower_values
     return values
 
 
-def _meeting(first: Floats, along: Floats, second: Floats, across: Floats) -> Floats:
+def _meeting(
+    first_points: Floats, first_directions: Floats, second_points: Floats, second_directions: Floats
+) -> Floats:
     """Return the intersections (…, 2) of lines, each given by a point and a direction."""
-    cross = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
-    between = second - first
+    cross_products = (
+        first_directions[..., 0] * second_directions[..., 1]
+        - first_directions[..., 1] * second_directions[..., 0]
+    )
+    point_offsets = second_points - first_points
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = (between[..., 0] * across[..., 1] - between[..., 1] * across[..., 0]) / cross
-    met: Floats = first + share[..., None] * along
-    return met
+        first_shares = (
+            point_offsets[..., 0] * second_directions[..., 1]
+            - point_offsets[..., 1] * second_directions[..., 0]
+        ) / cross_products
+    intersections: Floats = first_points + first_shares[..., None] * first_directions
+    return intersections
 
 
 # ----------------------------------------------------------------------------------------------------- OpenCV
@@ -313,15 +331,17 @@ class Camera:
         """Return the undistorted places of pixels (…, 2) on the plane at distance 1 from the camera."""
         if not self.distortion:
             return np.asarray((pixels - np.array(self.centre)) / np.array(self.focal), np.float64)
-        flat = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
-        undistorted = _load().undistortPoints(flat, self.matrix, np.array(self.distortion))
+        flat_pixels = np.ascontiguousarray(pixels, np.float64).reshape(-1, 1, 2)
+        undistorted = _load().undistortPoints(flat_pixels, self.matrix, np.array(self.distortion))
         return np.asarray(undistorted, np.float64).reshape(pixels.shape)
 
     def pixels(self, points: Floats) -> Floats:
         """Return the pixels (N, 2) of points (N, 3) in the camera's frame."""
-        zero = np.zeros(3)
-        flat = np.ascontiguousarray(points, np.float64)
-        projected, _ = _load().projectPoints(flat, zero, zero, self.matrix, np.array(self.distortion))
+        zeros = np.zeros(3)
+        flat_points = np.ascontiguousarray(points, np.float64)
+        projected, _ = _load().projectPoints(
+            flat_points, zeros, zeros, self.matrix, np.array(self.distortion)
+        )
         return np.asarray(projected, np.float64).reshape(-1, 2)
 
 
@@ -351,11 +371,11 @@ class TagDetector:
         corners, ids, _ = self._detector.detectMarkers(grey)
         if ids is None:
             return []
-        ours = np.array(corners, np.float64).reshape(-1, 4, 2)[:, _OURS_FROM_OPENCV]
-        refined = refined_corners(grey, ours, self._cells)
+        ordered_corners = np.array(corners, np.float64).reshape(-1, 4, 2)[:, _OURS_FROM_OPENCV]
+        corners_by_tag = refined_corners(grey, ordered_corners, self._cells)
         detections = [
-            Detection(int(number), tag_corners)
-            for number, tag_corners in zip(np.ravel(ids), refined, strict=True)
+            Detection(int(tag_id), tag_corners)
+            for tag_id, tag_corners in zip(np.ravel(ids), corners_by_tag, strict=True)
         ]
         return sorted(detections, key=lambda tag: (tag.id, *tag.corners[0].tolist()))
 
@@ -372,11 +392,11 @@ def tag_cells(family: str, number: int) -> Image:
         UsageError: there is no such family, or it has no such tag.
     """
     dictionary = _dictionary(family)
-    count = FAMILY_SIZES[family]
-    if not 0 <= number < count:
-        raise UsageError(f"family {family} has no tag {number}; its tags are 0 to {count - 1}")
-    cells = dictionary.markerSize + 2
-    picture = _load().aruco.generateImageMarker(dictionary, number, cells, borderBits=1)
+    tag_count = FAMILY_SIZES[family]
+    if not 0 <= number < tag_count:
+        raise UsageError(f"family {family} has no tag {number}; its tags are 0 to {tag_count - 1}")
+    cell_count = dictionary.markerSize + 2
+    picture = _load().aruco.generateImageMarker(dictionary, number, cell_count, borderBits=1)
     return np.ascontiguousarray(np.asarray(picture, np.uint8)[::-1, ::-1])
 
 
@@ -394,13 +414,15 @@ def fit_pose(points: Floats, pixels: Floats, camera: Camera) -> Floats | None:
     """
     cv2 = _load()
     matrix, distortion = camera.matrix, np.array(camera.distortion)
-    is_solved, turn, shift = cv2.solvePnP(
+    is_solved, rotation_vector, translation = cv2.solvePnP(
         np.ascontiguousarray(points), np.ascontiguousarray(pixels), matrix, distortion
     )
     if not is_solved:
         return None
-    turn, shift = cv2.solvePnPRefineLM(points, np.ascontiguousarray(pixels), matrix, distortion, turn, shift)
-    pose = np.concatenate([turn.ravel(), shift.ravel()]).astype(np.float64)
+    rotation_vector, translation = cv2.solvePnPRefineLM(
+        points, np.ascontiguousarray(pixels), matrix, distortion, rotation_vector, translation
+    )
+    pose = np.concatenate([rotation_vector.ravel(), translation.ravel()]).astype(np.float64)
     return pose if np.isfinite(pose).all() else None
 
 
@@ -434,7 +456,7 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
     """
     cv2 = _load()
     # k3 stays 0, because tags on a sheet seldom determine it
-    rms, matrix, distortion, _, _, spread, *_ = cv2.calibrateCameraExtended(
+    rms, matrix, distortion, _, _, deviations, *_ = cv2.calibrateCameraExtended(
         # OpenCV calibrates from float32 only
         [np.asarray(view, np.float32) for view in points],
         [np.asarray(view, np.float32).reshape(-1, 1, 2) for view in pixels],
@@ -443,11 +465,14 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
         None,
         flags=cv2.CALIB_FIX_K3,
     )
-    numbers = tuple(round(float(coefficient), 8) for coefficient in np.ravel(distortion)[:4])
+    coefficients = tuple(round(float(coefficient), 8) for coefficient in np.ravel(distortion)[:4])
     camera = Camera(
-        (float(matrix[0, 0]), float(matrix[1, 1])), (float(matrix[0, 2]), float(matrix[1, 2])), size, numbers
+        (float(matrix[0, 0]), float(matrix[1, 1])),
+        (float(matrix[0, 2]), float(matrix[1, 2])),
+        size,
+        coefficients,
     )
-    fx, fy, cx, cy = np.ravel(spread)[:4].tolist()
+    fx, fy, cx, cy = np.ravel(deviations)[:4].tolist()
     return Calibration(camera, float(rms), (fx, fy, cx, cy))
 
 
@@ -535,12 +560,12 @@ def open_camera(number: int) -> Any:
     """
     cv2 = _load()
     # OpenCV's warnings are muted, because the error below reports the failure
-    log = cv2.utils.logging
-    level = log.setLogLevel(log.LOG_LEVEL_ERROR)
+    opencv_log = cv2.utils.logging
+    level = opencv_log.setLogLevel(opencv_log.LOG_LEVEL_ERROR)
     try:
         capture = cv2.VideoCapture(number)
     finally:
-        log.setLogLevel(level)
+        opencv_log.setLogLevel(level)
     if not capture.isOpened():
         raise UsageError(
             f"camera {number} cannot be opened; check that it is plugged in (/dev/video{number}) and that no"

@@ -113,12 +113,12 @@ class HomographyPlane:
         entries = self.pixel_from_plane.ravel()[:8]
         steps = _STEP * np.maximum(np.abs(entries), 1e-3)
         # central differences by each entry
-        moved = np.repeat(np.append(entries, 1.0)[None], 16, axis=0)
-        moved[np.arange(8), np.arange(8)] += steps
-        moved[np.arange(8, 16), np.arange(8)] -= steps
-        inverse = np.linalg.inv(moved.reshape(16, 3, 3))
+        moved_entries = np.repeat(np.append(entries, 1.0)[None], 16, axis=0)
+        moved_entries[np.arange(8), np.arange(8)] += steps
+        moved_entries[np.arange(8, 16), np.arange(8)] -= steps
+        inverse_matrices = np.linalg.inv(moved_entries.reshape(16, 3, 3))
         homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-        homogeneous_places = np.einsum("kij,nj->kni", inverse, homogeneous)
+        homogeneous_places = np.einsum("kij,nj->kni", inverse_matrices, homogeneous)
         places = homogeneous_places[..., :2] / homogeneous_places[..., 2:]
         derivative = (places[:8] - places[8:]) / (2 * steps)[:, None, None]
         return np.asarray(np.einsum("kni,kl,lnj->nij", derivative, self.spread, derivative), np.float64)
@@ -141,18 +141,22 @@ class HomographyPlane:
         """
         matrix, places = self.pixel_from_plane, self.places(pixels, z)
         depth = places @ matrix[2, :2] + matrix[2, 2]
-        local = (matrix[:2, :2] - pixels[:, :, None] * matrix[2, :2]) / depth[:, None, None]
-        greater, lesser = np.linalg.svd(local, compute_uv=False).T
-        size = np.array(self.size, np.float64)
-        half = float(np.linalg.norm(size)) / 2
+        local_jacobians = (matrix[:2, :2] - pixels[:, :, None] * matrix[2, :2]) / depth[:, None, None]
+        greater_singulars, lesser_singulars = np.linalg.svd(local_jacobians, compute_uv=False).T
+        size_px = np.array(self.size, np.float64)
+        half_diagonal_px = float(np.linalg.norm(size_px)) / 2
         # without images, the image is assumed to reach as far as the detections
-        focal = (half or float(np.linalg.norm(pixels, axis=1).max()) / 2) / _WIDEST
-        off_axis = np.linalg.norm(pixels - (size - 1) / 2, axis=1) / focal if half else _WIDEST
-        cosine = lesser / greater / np.sqrt(1 + np.square(off_axis))
-        above = focal / greater * cosine
+        focal_px = (half_diagonal_px or float(np.linalg.norm(pixels, axis=1).max()) / 2) / _WIDEST
+        off_axis = (
+            np.linalg.norm(pixels - (size_px - 1) / 2, axis=1) / focal_px if half_diagonal_px else _WIDEST
+        )
+        cosines = lesser_singulars / greater_singulars / np.sqrt(1 + np.square(off_axis))
+        camera_heights = focal_px / greater_singulars * cosines
         with np.errstate(divide="ignore"):
-            larger = np.where(above > np.abs(z), np.abs(z) / (above - np.abs(z)), np.inf)
-        return np.abs(z) * np.sqrt(1 / np.square(cosine) - 1), np.asarray(larger)
+            length_errors = np.where(
+                camera_heights > np.abs(z), np.abs(z) / (camera_heights - np.abs(z)), np.inf
+            )
+        return np.abs(z) * np.sqrt(1 / np.square(cosines) - 1), np.asarray(length_errors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,12 +185,14 @@ class CameraPlane:
     def covariance(self, pixels: Floats, z: Floats) -> Floats:
         """See `Plane`."""
         directions = self.camera.directions(pixels)
-        places = []
+        places_by_sign = []
         for sign in (1.0, -1.0):
-            moved = self.pose + sign * _STEP * np.eye(6)
-            turns = rotations(moved[:, :3])
-            places.append([_cast(directions, turns[k], moved[k, 3:], z) for k in range(6)])
-        derivative = (np.array(places[0]) - np.array(places[1])) / (2 * _STEP)
+            moved_poses = self.pose + sign * _STEP * np.eye(6)
+            moved_rotations = rotations(moved_poses[:, :3])
+            places_by_sign.append(
+                [_cast(directions, moved_rotations[k], moved_poses[k, 3:], z) for k in range(6)]
+            )
+        derivative = (np.array(places_by_sign[0]) - np.array(places_by_sign[1])) / (2 * _STEP)
         return np.asarray(np.einsum("kni,kl,lnj->nij", derivative, self.spread, derivative), np.float64)
 
     def pixels(self, places: Floats) -> Floats:
@@ -206,33 +212,35 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     """
     references = [tag for tag in tags.references if tag.id in corners]
     known_corners = np.concatenate([tag.corners for tag in references])
-    seen = np.concatenate([corners[tag.id] for tag in references])
-    solved = _solve(known_corners, seen, tags.camera)
-    if solved is None:
+    seen_corners = np.concatenate([corners[tag.id] for tag in references])
+    solution = _solve(known_corners, seen_corners, tags.camera)
+    if solution is None:
         raise UsageError(f"{tags.name}: {_edge_on()}")
-    solution, (fitted, derivative) = solved, _appearing(known_corners, solved, tags.camera)
-    off = np.linalg.norm(fitted - seen, axis=1)
-    unknowns = derivative.shape[-1]
+    fitted_corners, derivative = _appearing(known_corners, solution, tags.camera)
+    corner_errors_px = np.linalg.norm(fitted_corners - seen_corners, axis=1)
+    unknown_count = derivative.shape[-1]
     # per degree of freedom, so that few tags do not look exact
-    rms = float(np.sqrt(np.square(off).sum() / max(2 * len(off) - unknowns, 1)))
-    by_tag = off.reshape(-1, 4).mean(axis=1)
-    place = int(by_tag.argmax())
-    worst = references[place].id, float(by_tag[place])
-    _refuse_misfit(tags, references, by_tag, seen, known_corners)
-    error = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
-    flat_derivative = derivative.reshape(-1, unknowns)
+    rms = float(
+        np.sqrt(np.square(corner_errors_px).sum() / max(2 * len(corner_errors_px) - unknown_count, 1))
+    )
+    tag_errors_px = corner_errors_px.reshape(-1, 4).mean(axis=1)
+    worst_index = int(tag_errors_px.argmax())
+    worst_tag = references[worst_index].id, float(tag_errors_px[worst_index])
+    _refuse_misfit(tags, references, tag_errors_px, seen_corners, known_corners)
+    corner_error_px = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
+    flat_derivative = derivative.reshape(-1, unknown_count)
     # an error of a tag's place moves its corners by this many pixels per unit
-    per_pixel = _pixels_per_unit(seen, known_corners)
-    variance = error**2 + (tags.reference_error * per_pixel) ** 2
+    pixels_per_unit = _pixels_per_unit(seen_corners, known_corners)
+    variance = corner_error_px**2 + (tags.reference_error * pixels_per_unit) ** 2
     # covariance of a least squares fit: variance (J^T J)^-1
     spread = np.asarray(variance * np.linalg.pinv(flat_derivative.T @ flat_derivative), np.float64)
     plane: Plane
     if tags.camera is None:
-        plane = HomographyPlane(solution, spread, error, size)
+        plane = HomographyPlane(solution, spread, corner_error_px, size)
     else:
-        plane = CameraPlane(tags.camera, solution, spread, error)
-    _refuse_edge_on(tags, seen, known_corners)
-    return Fit(plane, rms, worst)
+        plane = CameraPlane(tags.camera, solution, spread, corner_error_px)
+    _refuse_edge_on(tags, seen_corners, known_corners)
+    return Fit(plane, rms, worst_tag)
 
 
 def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
@@ -250,11 +258,11 @@ def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
             f"{tags.name}: the camera is calibrated for images of {width} x {height}; these have"
             f" {size[0]} x {size[1]}; record with that size, or calibrate again (tags calibrate)"
         )
-    error = tags.corner_error or USUAL_CORNER_ERROR
+    corner_error_px = tags.corner_error or USUAL_CORNER_ERROR
     if tags.is_image:
-        return ImagePlane(size[1], error)
+        return ImagePlane(size[1], corner_error_px)
     if tags.pose is not None and tags.camera is not None:
-        return CameraPlane(tags.camera, tags.pose, np.zeros((6, 6)), error)
+        return CameraPlane(tags.camera, tags.pose, np.zeros((6, 6)), corner_error_px)
     return None
 
 
@@ -262,17 +270,17 @@ def _through(matrix: Floats, points: Floats) -> Floats:
     """Map points (…, 2) by a homography."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved: Floats = homogeneous[..., :2] / homogeneous[..., 2:]
-    return moved
+        mapped_points: Floats = homogeneous[..., :2] / homogeneous[..., 2:]
+    return mapped_points
 
 
 def _cast(directions: Floats, rotation: Floats, shift: Floats, z: Floats) -> Floats:
     """Return the places of camera rays (…, 2) at heights (…) above the plane; NaN behind the camera."""
-    eye = -rotation.T @ shift
+    camera_place = -rotation.T @ shift
     rays = np.concatenate([directions, np.ones((*directions.shape[:-1], 1))], axis=-1) @ rotation
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (z - eye[2]) / rays[..., 2]
-    places = eye[:2] + np.where(distance > 0, distance, np.nan)[..., None] * rays[..., :2]
+        distances = (z - camera_place[2]) / rays[..., 2]
+    places = camera_place[:2] + np.where(distances > 0, distances, np.nan)[..., None] * rays[..., :2]
     return np.asarray(places)
 
 
@@ -281,77 +289,91 @@ def _homography_jacobian(matrix: Floats, points: Floats) -> tuple[Floats, Floats
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     u, v, w = homogeneous.T
     x, y = points.T
-    zero, ones = np.zeros_like(x), np.ones_like(x)
-    first = np.stack([x, y, ones, zero, zero, zero, -u / w * x, -u / w * y], axis=1) / w[:, None]
-    second = np.stack([zero, zero, zero, x, y, ones, -v / w * x, -v / w * y], axis=1) / w[:, None]
-    return homogeneous[:, :2] / w[:, None], np.stack([first, second], axis=1)
+    zeros, ones = np.zeros_like(x), np.ones_like(x)
+    u_derivative = np.stack([x, y, ones, zeros, zeros, zeros, -u / w * x, -u / w * y], axis=1) / w[:, None]
+    v_derivative = np.stack([zeros, zeros, zeros, x, y, ones, -v / w * x, -v / w * y], axis=1) / w[:, None]
+    return homogeneous[:, :2] / w[:, None], np.stack([u_derivative, v_derivative], axis=1)
 
 
-def _pixels_per_unit(seen: Floats, known: Floats) -> float:
+def _pixels_per_unit(seen_corners: Floats, known_corners: Floats) -> float:
     """Return the largest number of pixels per unit of the plane, from the edges of tags."""
-    edges = [np.diff(corners.reshape(-1, 4, 2), axis=1).reshape(-1, 2) for corners in (seen, known)]
-    lengths = [np.linalg.norm(edge, axis=1) for edge in edges]
-    return float((lengths[0] / lengths[1]).max())
+    edge_vectors = [
+        np.diff(corners.reshape(-1, 4, 2), axis=1).reshape(-1, 2) for corners in (seen_corners, known_corners)
+    ]
+    edge_lengths = [np.linalg.norm(vectors, axis=1) for vectors in edge_vectors]
+    return float((edge_lengths[0] / edge_lengths[1]).max())
 
 
 def _refuse_misfit(
-    tags: TagsFile, references: Sequence[MountedTag], off: Floats, seen: Floats, known: Floats
+    tags: TagsFile,
+    references: Sequence[MountedTag],
+    tag_errors_px: Floats,
+    seen_corners: Floats,
+    known_corners: Floats,
 ) -> None:
     """Check that no tag's error in `off` (K,), pixels, exceeds noise and the stated error of places."""
-    limit = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen, known)
-    if off.max() <= limit:
+    limit_px = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen_corners, known_corners)
+    if tag_errors_px.max() <= limit_px:
         return
-    first = references[0]
+    first_tag = references[0]
     # half a turn first, because OpenCV prints AprilTags upside down
     for turns in (2, 1, 3):
         # the corners of all tags in a turned order
-        turned = np.roll(known.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)
-        solved = _solve(turned, seen, tags.camera)
-        if solved is not None and _off_by_tag(turned, seen, solved, tags.camera).max() <= limit:
+        turned_corners = np.roll(known_corners.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)
+        solution = _solve(turned_corners, seen_corners, tags.camera)
+        if (
+            solution is not None
+            and _off_by_tag(turned_corners, seen_corners, solution, tags.camera).max() <= limit_px
+        ):
             raise UsageError(
                 f"{tags.name}: the reference tags fit each other only if all are turned by {90 * turns}"
-                f" degrees, as other programs print them; write {first.id}: {{at: [{first.x:g}, {first.y:g}],"
-                f" yaw: {90 * turns}deg}}, the others alike, and the same yaw for tags on objects"
+                f" degrees, as other programs print them; write {first_tag.id}: {{at: [{first_tag.x:g},"
+                f" {first_tag.y:g}], yaw: {90 * turns}deg}}, the others alike, and the same yaw"
+                " for tags on objects"
             )
-    alone = _off_alone(tags, seen, known)
-    if alone is not None and alone[2] <= limit:
-        place, away, _ = alone
+    outlier = _off_alone(tags, seen_corners, known_corners)
+    if outlier is not None and outlier[2] <= limit_px:
+        tag_index, error_px, _ = outlier
         raise UsageError(
-            f"{tags.name}: the reference tags do not fit each other: tag {references[place].id} is off by"
-            f" {away:.1f} pixels from where the others place it; check its place, its yaw and its size"
+            f"{tags.name}: the reference tags do not fit each other: tag {references[tag_index].id} is off by"
+            f" {error_px:.1f} pixels from where the others place it; check its place, its yaw and its size"
         )
-    worst = references[int(off.argmax())].id
+    worst_id = references[int(tag_errors_px.argmax())].id
     raise UsageError(
-        f"{tags.name}: the reference tags do not fit each other: tag {worst} is off most, by"
-        f" {off.max():.1f} pixels; check the places, the yaw and the size of the tags, or"
+        f"{tags.name}: the reference tags do not fit each other: tag {worst_id} is off most, by"
+        f" {tag_errors_px.max():.1f} pixels; check the places, the yaw and the size of the tags, or"
         " calibrate the camera if its lens bends straight lines (tags calibrate)"
     )
 
 
-def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float, float] | None:
+def _off_alone(
+    tags: TagsFile, seen_corners: Floats, known_corners: Floats
+) -> tuple[int, float, float] | None:
     """Find the tag without which the other tags fit best; None if no fit exists.
 
     Returns:
         its index, its error in the fit of the others, and the largest error of the others, pixels.
     """
     candidates: list[tuple[float, int, float]] = []
-    for place in range(len(known) // 4):
-        others = np.arange(len(known)) // 4 != place
-        solved = _solve(known[others], seen[others], tags.camera)
-        if solved is not None:
-            by_tag = _off_by_tag(known, seen, solved, tags.camera)
-            candidates.append((float(np.delete(by_tag, place).max()), place, float(by_tag[place])))
+    for tag_index in range(len(known_corners) // 4):
+        is_other = np.arange(len(known_corners)) // 4 != tag_index
+        solution = _solve(known_corners[is_other], seen_corners[is_other], tags.camera)
+        if solution is not None:
+            tag_errors_px = _off_by_tag(known_corners, seen_corners, solution, tags.camera)
+            candidates.append(
+                (float(np.delete(tag_errors_px, tag_index).max()), tag_index, float(tag_errors_px[tag_index]))
+            )
     if not candidates:
         return None
-    most, place, away = min(candidates)
-    return place, away, most
+    other_error_px, tag_index, error_px = min(candidates)
+    return tag_index, error_px, other_error_px
 
 
-def _solve(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
+def _solve(known_corners: Floats, seen_corners: Floats, camera: Camera | None) -> Floats | None:
     """Fit the homography (3, 3), or a camera's pose (6,), from places to pixels; None if there is none."""
     if camera is not None:
-        return fit_pose(_flat(known), seen, camera)
-    homography = fit_homography(known, seen)
+        return fit_pose(_flat(known_corners), seen_corners, camera)
+    homography = fit_homography(known_corners, seen_corners)
     return (
         None
         if homography is None or abs(homography[2, 2]) < 1e-12
@@ -359,26 +381,32 @@ def _solve(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
     )
 
 
-def _appearing(known: Floats, found: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
+def _appearing(known_corners: Floats, solution: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
     """Return the pixels of places, and their derivative by the homography or the pose."""
-    return _homography_jacobian(found, known) if camera is None else projection(_flat(known), found, camera)
+    return (
+        _homography_jacobian(solution, known_corners)
+        if camera is None
+        else projection(_flat(known_corners), solution, camera)
+    )
 
 
-def _off_by_tag(known: Floats, seen: Floats, found: Floats, camera: Camera | None) -> Floats:
+def _off_by_tag(
+    known_corners: Floats, seen_corners: Floats, solution: Floats, camera: Camera | None
+) -> Floats:
     """Return the mean error of each tag's corners, (K,), pixels."""
-    off = np.linalg.norm(_appearing(known, found, camera)[0] - seen, axis=1)
-    return np.asarray(off.reshape(-1, 4).mean(axis=1))
+    corner_errors_px = np.linalg.norm(_appearing(known_corners, solution, camera)[0] - seen_corners, axis=1)
+    return np.asarray(corner_errors_px.reshape(-1, 4).mean(axis=1))
 
 
 def _flat(places: Floats) -> Floats:
     return np.concatenate([places, np.zeros((len(places), 1))], axis=1)
 
 
-def _refuse_edge_on(tags: TagsFile, seen: Floats, known: Floats) -> None:
+def _refuse_edge_on(tags: TagsFile, seen_corners: Floats, known_corners: Floats) -> None:
     """Check that tags are not seen edge-on."""
-    areas = [np.abs(_areas(corners.reshape(-1, 4, 2))) for corners in (seen, known)]
-    longest = np.linalg.norm(np.diff(seen.reshape(-1, 4, 2), axis=1), axis=2).max(axis=1)
-    if float(np.median(areas[0] / longest**2)) < _LEAST_SLANT:
+    tag_areas = [np.abs(_areas(corners.reshape(-1, 4, 2))) for corners in (seen_corners, known_corners)]
+    longest_edges = np.linalg.norm(np.diff(seen_corners.reshape(-1, 4, 2), axis=1), axis=2).max(axis=1)
+    if float(np.median(tag_areas[0] / longest_edges**2)) < _LEAST_SLANT:
         raise UsageError(f"{tags.name}: {_edge_on()}")
 
 

@@ -54,9 +54,18 @@ class MountedTag:
     def corners(self) -> Floats:
         """(4, 2), corners in the order of a `Detection`."""
         half = self.size / 2
-        turn = np.array([[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]])
-        square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
-        corners: Floats = square @ turn + np.array([self.x, self.y])
+        rotation = np.array(
+            [[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]]
+        )
+        square = np.array(
+            [
+                (-half, -half),
+                (half, -half),
+                (half, half),
+                (-half, half),
+            ]
+        )
+        corners: Floats = square @ rotation + np.array([self.x, self.y])
         return corners
 
 
@@ -138,14 +147,14 @@ class TagsFile:
             UsageError: the file lacks this camera, or gives one pose or one image for several cameras.
         """
         if self.cameras:
-            camera = self.cameras.get(name, self.cameras.get(str(number)))
-            if camera is None:
+            camera_and_pose = self.cameras.get(name, self.cameras.get(str(number)))
+            if camera_and_pose is None:
                 camera_names = ", ".join(self.cameras)
                 raise UsageError(
                     f"{self.name} has no camera {name or number}; its cameras are {camera_names}; name this"
                     f" one by its video or topic, or by its number, {number}"
                 )
-            return replace(self, camera=camera[0], pose=camera[1])
+            return replace(self, camera=camera_and_pose[0], pose=camera_and_pose[1])
         if count > 1 and self.is_image:
             raise UsageError(
                 f"{self.name}: plane: image is that of one camera; for several, give reference tags"
@@ -178,61 +187,68 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         UsageError: the text is not valid; all errors are listed.
     """
     document = checked_document(text, name, schema_of("perception", "tags"), _contradictions, "a tags file")
-    value: Any = document.value
-    camera_value = value.get("camera") or {}
-    size = value.get("size")
-    plane = value.get("plane", {})
+    content: Any = document.value
+    camera_value = content.get("camera") or {}
+    default_size = content.get("size")
+    plane = content.get("plane", {})
     is_image = plane == "image"
     camera = _camera(camera_value) if camera_value else None
-    several: Mapping[str, Any] = value.get("cameras", {})
+    camera_entries: Mapping[str, Any] = content.get("cameras", {})
     try:
-        level = 0.0 if is_image else _length(plane.get("height", 0.0))
+        reference_height = 0.0 if is_image else _length(plane.get("height", 0.0))
         objects = tuple(
-            _object(own_name, entry, size, value, level) for own_name, entry in value["objects"].items()
+            _object(object_name, entry, default_size, content, reference_height)
+            for object_name, entry in content["objects"].items()
         )
-        references = () if is_image else tuple(_references(plane, size))
+        references = () if is_image else tuple(_references(plane, default_size))
         pose = _pose(camera_value)
-        cameras = {camera_name: (_camera(entry), _pose(entry)) for camera_name, entry in several.items()}
+        cameras = {
+            camera_name: (_camera(entry), _pose(entry)) for camera_name, entry in camera_entries.items()
+        }
     except (UsageError, GeometryError) as error:
         raise UsageError(f"{name}: {error}") from None
     return TagsFile(
         name=name,
-        family=value.get("family", "36h11"),
+        family=content.get("family", "36h11"),
         objects=objects,
         is_image=is_image,
         references=references,
         camera=camera,
         pose=pose,
         cameras=MappingProxyType(cameras),
-        corner_error=value.get("corner_error"),
+        corner_error=content.get("corner_error"),
         reference_error=0.0 if is_image else _length(plane.get("error", 0.0)),
-        sigmas=float(value.get("sigmas", 4.0)),
-        hold_ns=duration_ns_from_text(value["hold"]) if "hold" in value else 0,
+        sigmas=float(content.get("sigmas", 4.0)),
+        hold_ns=duration_ns_from_text(content["hold"]) if "hold" in content else 0,
         by_id=MappingProxyType({tag.id: (tagged, tag) for tagged in objects for tag in tagged.tags}),
         text=text,
     )
 
 
 def _object(
-    name: str, entry: Mapping[str, Any], size: Any, defaults: Mapping[str, Any], level: float
+    name: str,
+    entry: Mapping[str, Any],
+    default_size: Any,
+    defaults: Mapping[str, Any],
+    reference_height: float,
 ) -> TaggedObject:
     """Return an object; `level` is the height of the reference tags."""
-    height = entry.get("height")
-    interval = None if height is None else (_length(height[0]), _length(height[1]))
+    height_entry = entry.get("height")
+    heights = None if height_entry is None else (_length(height_entry[0]), _length(height_entry[1]))
     # an image has no heights; a tag on an object without a height is as high as the reference tags
-    top = level if interval is None or _is_image(defaults) else interval[1]
-    mounted = entry["tags"] if "tags" in entry else [entry["tag"]]
+    default_height = reference_height if heights is None or _is_image(defaults) else heights[1]
+    mountings = entry["tags"] if "tags" in entry else [entry["tag"]]
     tags = []
-    for mounting in mounted:
-        tag = mounting if isinstance(mounting, dict) else {"id": mounting}
-        z = _length(tag.get("z", top)) - level
-        tags.append(_tag(tag["id"], tag, 0.0 if size is None else size, z))
+    for mounting in mountings:
+        tag_entry = mounting if isinstance(mounting, dict) else {"id": mounting}
+        z = _length(tag_entry.get("z", default_height)) - reference_height
+        tags.append(_tag(tag_entry["id"], tag_entry, 0.0 if default_size is None else default_size, z))
     return TaggedObject(
         name,
         _footprint(entry),
         tuple(tags),
         entry.get("class"),
-        interval,
+        heights,
         entry.get("lifted", False),
         _length(entry.get("fastest", defaults.get("fastest", 1000.0 if _is_image(defaults) else 1.0))),
     )
@@ -240,44 +256,46 @@ def _object(
 
 def _footprint(entry: Mapping[str, Any]) -> Footprint:
     if "box" in entry:
-        length, width = (_length(side) / 2 for side in entry["box"])
-        return Footprint.box(-length, -width, length, width)
+        half_length, half_width = (_length(side) / 2 for side in entry["box"])
+        return Footprint.box(-half_length, -half_width, half_length, half_width)
     if "disc" in entry:
         return Footprint.disc(0.0, 0.0, _length(entry["disc"]))
     return Footprint.polygon([[_length(coordinate) for coordinate in corner] for corner in entry["polygon"]])
 
 
-def _references(plane: Mapping[str, Any], size: Any) -> Iterator[MountedTag]:
-    for number, entry in plane.get("tags", {}).items():
-        tag = entry if isinstance(entry, dict) else {"at": entry}
-        yield _tag(int(number), tag, plane.get("size", size))
+def _references(plane: Mapping[str, Any], default_size: Any) -> Iterator[MountedTag]:
+    for tag_id, entry in plane.get("tags", {}).items():
+        tag_entry = entry if isinstance(entry, dict) else {"at": entry}
+        yield _tag(int(tag_id), tag_entry, plane.get("size", default_size))
 
 
-def _tag(number: int, entry: Mapping[str, Any], size: Any, z: float = 0.0) -> MountedTag:
+def _tag(tag_id: int, entry: Mapping[str, Any], default_size: Any, z: float = 0.0) -> MountedTag:
     x, y = (_length(coordinate) for coordinate in entry.get("at", (0.0, 0.0)))
-    return MountedTag(number, _length(entry.get("size", size)), x, y, _angle(entry.get("yaw", 0.0)), z)
+    return MountedTag(
+        tag_id, _length(entry.get("size", default_size)), x, y, _angle(entry.get("yaw", 0.0)), z
+    )
 
 
-def _camera(value: Mapping[str, Any]) -> Camera:
-    width, height = value["size"]
-    (fx, fy), (cx, cy) = value["focal"], value.get("centre", ((width - 1) / 2, (height - 1) / 2))
+def _camera(entry: Mapping[str, Any]) -> Camera:
+    width, height = entry["size"]
+    (fx, fy), (cx, cy) = entry["focal"], entry.get("centre", ((width - 1) / 2, (height - 1) / 2))
     return Camera(
         (float(fx), float(fy)),
         (float(cx), float(cy)),
         (width, height),
-        tuple(map(float, value.get("distortion", ()))),
+        tuple(map(float, entry.get("distortion", ()))),
     )
 
 
-def _pose(camera: Mapping[str, Any]) -> Floats | None:
+def _pose(camera_entry: Mapping[str, Any]) -> Floats | None:
     """Return the pose (6,) from a camera's position and the point that it looks at; None without them."""
-    value = camera.get("pose")
-    if value is None:
+    pose_entry = camera_entry.get("pose")
+    if pose_entry is None:
         return None
     eye, target = (
-        np.array([_length(coordinate) for coordinate in value[key]]) for key in ("position", "look_at")
+        np.array([_length(coordinate) for coordinate in pose_entry[key]]) for key in ("position", "look_at")
     )
-    return pose_looking_at(eye, target, np.array(value.get("up", (0.0, 0.0, 1.0)), np.float64))
+    return pose_looking_at(eye, target, np.array(pose_entry.get("up", (0.0, 0.0, 1.0)), np.float64))
 
 
 def _length(value: Any) -> float:
@@ -304,46 +322,50 @@ def _is_image(value: Mapping[str, Any]) -> bool:
 
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
     """Find faults that a schema cannot express, such as a tag that is used twice or an undetermined plane."""
-    value: Any = document.value
-    if not isinstance(value, dict) or not isinstance(value.get("objects"), dict):
+    content: Any = document.value
+    if not isinstance(content, dict) or not isinstance(content.get("objects"), dict):
         return []
     faults: list[tuple[Place, str]] = []
-    used: dict[int, str] = {}
+    tag_uses: dict[int, str] = {}
 
-    def use(number: Any, place: Place, what: str) -> None:
-        if not isinstance(number, int) or isinstance(number, bool):
+    def use(tag_id: Any, place: Place, description: str) -> None:
+        if not isinstance(tag_id, int) or isinstance(tag_id, bool):
             return
-        if number in used:
-            faults.append((place, f"tag {number} is {used[number]} already; a tag is in one place"))
-        used.setdefault(number, what)
+        if tag_id in tag_uses:
+            faults.append((place, f"tag {tag_id} is {tag_uses[tag_id]} already; a tag is in one place"))
+        tag_uses.setdefault(tag_id, description)
 
-        family = value.get("family", "36h11")
-        if number >= FAMILY_SIZES.get(family, number + 1):
-            last = FAMILY_SIZES[family] - 1
-            faults.append((place, f"family {family} has no tag {number}; its tags are 0 to {last}"))
+        family = content.get("family", "36h11")
+        if tag_id >= FAMILY_SIZES.get(family, tag_id + 1):
+            last_id = FAMILY_SIZES[family] - 1
+            faults.append((place, f"family {family} has no tag {tag_id}; its tags are 0 to {last_id}"))
 
-    if _is_image(value) and isinstance(value.get("size"), str):
+    if _is_image(content) and isinstance(content.get("size"), str):
         faults.append(
-            (("size",), f"in plane: image lengths are pixels; write a number; got {value['size']!r}")
+            (("size",), f"in plane: image lengths are pixels; write a number; got {content['size']!r}")
         )
-    camera = value.get("camera") or value.get("cameras")
-    if "camera" in value and "cameras" in value:
+    camera = content.get("camera") or content.get("cameras")
+    if "camera" in content and "cameras" in content:
         faults.append((("cameras",), "give either camera, of one or of all, or cameras, one for each"))
-    plane = value.get("plane")
+    plane = content.get("plane")
     references = plane.get("tags") if isinstance(plane, dict) else None
-    reach = _reach(references or (camera.get("pose") if isinstance(camera, dict) else None))
-    if large := _beyond(value.get("size"), reach):
-        faults.append((("size",), large))
-    if large := _beyond(plane.get("height") if isinstance(plane, dict) else None, reach):
-        faults.append((("plane", "height"), large))
-    for name, entry in cast("dict[str, Any]", value["objects"]).items():
+    reach_m = _reach(references or (camera.get("pose") if isinstance(camera, dict) else None))
+    if length_fault := _beyond(content.get("size"), reach_m):
+        faults.append((("size",), length_fault))
+    if length_fault := _beyond(plane.get("height") if isinstance(plane, dict) else None, reach_m):
+        faults.append((("plane", "height"), length_fault))
+    for name, entry in cast("dict[str, Any]", content["objects"]).items():
         if not isinstance(entry, dict):
             continue
         place: Place = ("objects", name)
-        shapes = [key for key in ("box", "disc", "polygon") if key in entry]
-        keys = (*shapes, "height")
-        faults += [((*place, key), large) for key in keys if (large := _beyond(entry.get(key), reach))]
-        if len(shapes) != 1:
+        shape_keys = [key for key in ("box", "disc", "polygon") if key in entry]
+        length_keys = (*shape_keys, "height")
+        faults += [
+            ((*place, key), length_fault)
+            for key in length_keys
+            if (length_fault := _beyond(entry.get(key), reach_m))
+        ]
+        if len(shape_keys) != 1:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")
             )
@@ -352,12 +374,12 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         if ("tag" in entry) == ("tags" in entry):
             faults.append((place, "give either tag, a number, or tags, a list"))
         tags = entry["tags"] if isinstance(entry.get("tags"), list) else [entry.get("tag")]
-        for index, tag in enumerate(tags):
-            tag_place = (*place, "tags", index) if "tags" in entry else (*place, "tag")
+        for tag_index, tag in enumerate(tags):
+            tag_place = (*place, "tags", tag_index) if "tags" in entry else (*place, "tag")
             use(tag.get("id") if isinstance(tag, dict) else tag, tag_place, f"on {name}")
-            if isinstance(tag, dict) and tag.get("z") and _is_image(value):
+            if isinstance(tag, dict) and tag.get("z") and _is_image(content):
                 faults.append((tag_place, "an image has no heights; leave z out, or give reference tags"))
-            has_size = "size" in value or (isinstance(tag, dict) and "size" in tag)
+            has_size = "size" in content or (isinstance(tag, dict) and "size" in tag)
             if entry.get("lifted") and not has_size:
                 faults.append((tag_place, "a lifted object is found by the size of its tags; give size"))
         if entry.get("lifted") and not camera:
@@ -371,44 +393,48 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
                 faults.append((tag_place, f"expected the number of a tag; got {key[:40]!r}"))
                 continue
             use(int(key), tag_place, "a reference tag")
-            own_size = isinstance(entry, dict) and "size" in entry
-            if not own_size and "size" not in value and "size" not in plane:
+            has_own_size = isinstance(entry, dict) and "size" in entry
+            if not has_own_size and "size" not in content and "size" not in plane:
                 faults.append(
                     (tag_place, "the size of the tag is missing; give size for all, or for this one")
                 )
-    each_camera = camera if "cameras" in value and isinstance(camera, dict) else {"camera": camera}
-    lacking = [str(name) for name, of in each_camera.items() if not (isinstance(of, dict) and "pose" in of)]
-    are_enough = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
-    if plane != "image" and lacking and not are_enough:
-        least = f"{LEAST_REFERENCES} or more tags with known places"
+    camera_entries = camera if "cameras" in content and isinstance(camera, dict) else {"camera": camera}
+    cameras_without_pose = [
+        str(name)
+        for name, camera_entry in camera_entries.items()
+        if not (isinstance(camera_entry, dict) and "pose" in camera_entry)
+    ]
+    has_enough_references = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
+    if plane != "image" and cameras_without_pose and not has_enough_references:
+        references_text = f"{LEAST_REFERENCES} or more tags with known places"
         alternative = "the camera with its pose, or write plane: image for pixels"
-        if "cameras" in value:
-            alternative = f"the pose of each camera; {lacking[0]} has none"
-        faults.append((("plane",), f"the plane is not determined: give {least}, or {alternative}"))
+        if "cameras" in content:
+            alternative = f"the pose of each camera; {cameras_without_pose[0]} has none"
+        faults.append((("plane",), f"the plane is not determined: give {references_text}, or {alternative}"))
     return faults
 
 
-def _reach(known: Any) -> float:
+def _reach(point_entries: Any) -> float:
     """Return the diagonal of the box around points, in metres; inf if it is not known.
 
     The points are the reference tags, or a camera and the point that it looks at.
     """
     try:
-        entries = [entry for key, entry in known.items() if key != "up"]
+        entries = [entry for key, entry in point_entries.items() if key != "up"]
         places = [[*map(_length, entry["at"] if isinstance(entry, dict) else entry)] for entry in entries]
         return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
     except (AttributeError, KeyError, TypeError, ValueError, UsageError):
         return math.inf
 
 
-def _beyond(value: Any, reach: float) -> str:
+def _beyond(length_entry: Any, reach_m: float) -> str:
     """Return the fault of a length without a unit that exceeds `reach`; "" for a smaller length."""
-    number = max(_plain_numbers(value), default=0.0)
-    if number <= reach:
+    length = max(_plain_numbers(length_entry), default=0.0)
+    if length <= reach_m:
         return ""
     return (
-        f"{number:g} is {number:g} m, and the table that the camera sees is within {reach:.3g} m; write"
-        f" {number:g}mm, or {number:g}m if that is meant"
+        f"{length:g} is {length:g} m, and the table that the camera sees is within {reach_m:.3g} m;"
+        f" write {length:g}mm, or {length:g}m if that is meant"
     )
 
 

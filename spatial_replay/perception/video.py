@@ -74,17 +74,17 @@ class Shown(NamedTuple):
 
 
 @dataclass(slots=True, eq=False)
-class _Sent:
+class _PendingPacket:
     """A pending packet.
 
     Attributes:
-        of: object that was passed with it.
-        before, after: numbers of losses before and after it was decoded.
+        of: object that was passed with the packet.
+        losses_before, losses_after: numbers of losses before and after its decoding.
     """
 
     of: Any
-    before: int
-    after: int
+    losses_before: int
+    losses_after: int
     pts: int | None
     time_base: Any
 
@@ -101,10 +101,10 @@ class Decoder:
         context.flags |= av.codec.context.Flags.copy_opaque
         self._context = context
         self._losses = 0
-        # number of losses before the last key frame, which no longer count
-        self._mended = 0
+        # losses before the last key frame no longer count
+        self._mended_losses = 0
         # packets after a loss whose frames are pending
-        self._waiting: list[_Sent] = []
+        self._pending: list[_PendingPacket] = []
 
     def decode(self, packet: Any, of: Any = None) -> list[Decoded]:
         """Decode a packet; return the finished frames, which may be frames of earlier packets.
@@ -117,62 +117,74 @@ class Decoder:
             av.FFmpegError: the packet cannot be decoded; later frames are not true until the next key frame.
         """
         av = load_av()
-        sent = _Sent(of, self._losses, self._losses, None, None)
+        pending = _PendingPacket(of, self._losses, self._losses, None, None)
         is_end = packet is None or not packet.size
         if packet is not None:
-            packet.opaque = sent
-            sent.pts, sent.time_base = packet.pts, packet.time_base
-        with _TURN, av.logging.Capture() as said:
+            packet.opaque = pending
+            pending.pts, pending.time_base = packet.pts, packet.time_base
+        with _TURN, av.logging.Capture() as log_messages:
             # FFmpeg reports missing frames at this level only
             av.logging.set_level(av.logging.DEBUG)
             try:
                 frames = self._context.decode(packet)
             except av.FFmpegError:
                 self._losses += 1
-                sent.after = self._losses
-                self._await(sent)
+                pending.losses_after = self._losses
+                self._await(pending)
                 raise
             finally:
                 av.logging.set_level(None)
         self._losses += any(
             (level <= av.logging.ERROR and not text.startswith(_HARMLESS)) or text.startswith(_MISSING)
-            for level, _, text in said
+            for level, _, text in log_messages
         )
-        sent.after = self._losses
+        pending.losses_after = self._losses
         if not is_end:
-            self._await(sent)
-        decoded: list[Decoded] = []
+            self._await(pending)
+        decoded_frames: list[Decoded] = []
         for frame in frames:
-            packet_of_frame = frame.opaque or sent
-            self._waiting = [waiting for waiting in self._waiting if waiting is not packet_of_frame]
-            decoded += self._skipped_frames(frame.pts)
-            decoded.append(self._judge(frame, packet_of_frame))
-        if is_end or len(self._waiting) > _MOST_WAITING:
-            decoded += self._skipped_frames(None)
-        return decoded
+            packet_of_frame = frame.opaque or pending
+            self._pending = [
+                pending_packet for pending_packet in self._pending if pending_packet is not packet_of_frame
+            ]
+            decoded_frames += self._skipped_frames(frame.pts)
+            decoded_frames.append(self._judge(frame, packet_of_frame))
+        if is_end or len(self._pending) > _MOST_WAITING:
+            decoded_frames += self._skipped_frames(None)
+        return decoded_frames
 
-    def _await(self, sent: _Sent) -> None:
-        if sent.after and sent.pts is not None:
-            self._waiting.append(sent)
+    def _await(self, pending: _PendingPacket) -> None:
+        if pending.losses_after and pending.pts is not None:
+            self._pending.append(pending)
 
     def _skipped_frames(self, pts: int | None) -> Iterator[Decoded]:
         """Yield empty frames for pending frames before a stamp; some decoders skip frames after a loss."""
-        late = [waiting for waiting in self._waiting if pts is None or cast("int", waiting.pts) < pts]
-        self._waiting = [waiting for waiting in self._waiting if waiting not in late]
+        late_packets = [
+            pending_packet
+            for pending_packet in self._pending
+            if pts is None or cast("int", pending_packet.pts) < pts
+        ]
+        self._pending = [
+            pending_packet for pending_packet in self._pending if pending_packet not in late_packets
+        ]
         width, height = self._context.width, self._context.height
-        for late_packet in sorted(late, key=lambda sent: cast("int", sent.pts)):
-            if late_packet.after > self._mended and width and height:
+        for late_packet in sorted(late_packets, key=lambda sent: cast("int", sent.pts)):
+            if late_packet.losses_after > self._mended_losses and width and height:
                 frame = load_av().VideoFrame(width, height, "gray")
                 frame.pts, frame.time_base = late_packet.pts, late_packet.time_base
                 yield Decoded(late_packet.of, frame, False)
 
-    def _judge(self, frame: Any, sent: _Sent) -> Decoded:
+    def _judge(self, frame: Any, pending: _PendingPacket) -> Decoded:
         if frame.is_corrupt:
-            self._mended = -1
+            self._mended_losses = -1
         # with intra refresh (strip by strip), FFmpeg marks the first frame as key, but it is predicted
-        elif frame.key_frame and frame.pict_type not in _predicted_kinds() and sent.before == sent.after:
-            self._mended = max(self._mended, sent.after)
-        return Decoded(sent.of, frame, sent.after <= self._mended)
+        elif (
+            frame.key_frame
+            and frame.pict_type not in _predicted_kinds()
+            and pending.losses_before == pending.losses_after
+        ):
+            self._mended_losses = max(self._mended_losses, pending.losses_after)
+        return Decoded(pending.of, frame, pending.losses_after <= self._mended_losses)
 
 
 class H264Decoder:
@@ -182,7 +194,7 @@ class H264Decoder:
         """Open the decoder; frames before the first key frame are not decoded."""
         self._decoder = Decoder(load_av().CodecContext.create("h264", "r"))
         self._is_ready = False
-        self._count = 0
+        self._message_count = 0
 
     def decode(self, data: bytes, of: Any = None) -> Iterator[Shown]:
         """Decode a message; yield the finished images, which may be of earlier messages.
@@ -197,13 +209,13 @@ class H264Decoder:
             av = load_av()
             # stamps count the messages, so that skipped frames are noticed
             packet = av.Packet(data)
-            packet.pts, packet.time_base = self._count, Fraction(1)
-            self._count += 1
+            packet.pts, packet.time_base = self._message_count, Fraction(1)
+            self._message_count += 1
             try:
-                decoded = self._decoder.decode(packet, of)
+                decoded_frames = self._decoder.decode(packet, of)
             except av.FFmpegError as error:
                 raise LogError(f"a frame cannot be decoded ({reason(error)})") from None
-            for frame in decoded:
+            for frame in decoded_frames:
                 yield Shown(frame.of, picture(frame), frame.is_true)
 
     def rest(self) -> Iterator[Shown]:
@@ -252,11 +264,11 @@ class Untrue:
 
 def has_key(data: bytes) -> bool:
     """Return whether a decoder can start at a message of H.264 in Annex B form."""
-    at = data.find(b"\x00\x00\x01")
-    while 0 <= at < len(data) - 3:
-        if data[at + 3] & 31 in (_IDR, _SEQUENCE_PARAMETERS):
+    offset = data.find(b"\x00\x00\x01")
+    while 0 <= offset < len(data) - 3:
+        if data[offset + 3] & 31 in (_IDR, _SEQUENCE_PARAMETERS):
             return True
-        at = data.find(b"\x00\x00\x01", at + 3)
+        offset = data.find(b"\x00\x00\x01", offset + 3)
     return False
 
 
@@ -406,61 +418,63 @@ class VideoFile:
 
     def __iter__(self) -> Iterator[Frame]:
         av = load_av()
-        last_ns = before_ns = -1
-        first, count, widest_ns = None, 0, 0
+        last_ns = previous_ns = -1
+        first_stamp_ns, frame_count, longest_gap_ns = None, 0, 0
         untrue = Untrue()
         # a frame that is not true waits for the next one, because the last frame of a cut file is dropped
-        waiting: Frame | None = None
+        waiting_frame: Frame | None = None
         try:
             length_ns = self._length_ns()
             for decoded in self._decode():
-                stamp = self._stamp_ns(decoded.frame, count)
-                count += 1
-                first = stamp if first is None and decoded.is_true else first
-                time_ns = 0 if first is None else stamp - first
+                stamp_ns = self._stamp_ns(decoded.frame, frame_count)
+                frame_count += 1
+                first_stamp_ns = stamp_ns if first_stamp_ns is None and decoded.is_true else first_stamp_ns
+                time_ns = 0 if first_stamp_ns is None else stamp_ns - first_stamp_ns
                 untrue.add(time_ns, decoded.is_true)
-                if waiting is not None:
-                    yield waiting
-                    waiting = None
-                if first is None:
+                if waiting_frame is not None:
+                    yield waiting_frame
+                    waiting_frame = None
+                if first_stamp_ns is None:
                     continue
                 if time_ns < last_ns and decoded.is_true:
-                    raise LogError(self._order_fault(count, stamp, last_ns - time_ns))
+                    raise LogError(self._order_fault(frame_count, stamp_ns, last_ns - time_ns))
                 if time_ns <= last_ns:
-                    self.faults.append(f"{self.name}: frame {count} is not after the one before it; left out")
+                    self.faults.append(
+                        f"{self.name}: frame {frame_count} is not after the one before it; left out"
+                    )
                     continue
-                widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
-                before_ns, last_ns = last_ns, time_ns
+                longest_gap_ns = max(longest_gap_ns, time_ns - last_ns) if last_ns >= 0 else 0
+                previous_ns, last_ns = last_ns, time_ns
                 frame = Frame(time_ns, picture(decoded), decoded.of)
                 if decoded.is_true:
                     yield frame
                 else:
-                    waiting = frame
+                    waiting_frame = frame
             # only the last frame is not true, so the file ends within it
             if untrue.last == untrue.frames == 1:
-                at = (
+                where = (
                     "in its first frame"
-                    if first is None
-                    else f"after {before_ns / 1e9:.3f} s, within a frame"
+                    if first_stamp_ns is None
+                    else f"after {previous_ns / 1e9:.3f} s, within a frame"
                 )
-                self.faults.append(f"{self.name} breaks off {at}")
+                self.faults.append(f"{self.name} breaks off {where}")
                 return
-            if waiting is not None:
-                yield waiting
+            if waiting_frame is not None:
+                yield waiting_frame
             self.faults += untrue.faults(self.name)
             # a last frame of more than 1.5 times the longest interval means that frames are missing
-            if widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
-                ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
-                self.faults.append(f"{self.name} breaks off after {ends}")
+            if longest_gap_ns and last_ns + longest_gap_ns * 3 // 2 < length_ns:
+                end_text = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
+                self.faults.append(f"{self.name} breaks off after {end_text}")
         except (av.FFmpegError, EOFError) as error:
-            at = "before its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s"
-            self.faults.append(f"{self.name} breaks off {at} ({reason(error)})")
+            where = "before its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s"
+            self.faults.append(f"{self.name} breaks off {where} ({reason(error)})")
         finally:
             self.close()
 
-    def _order_fault(self, number: int, stamp_ns: int, back_ns: int) -> str:
+    def _order_fault(self, frame_number: int, stamp_ns: int, back_ns: int) -> str:
         return (
-            f"{self.name} has time stamps that go back: frame {number} has {stamp_ns / 1e9:.3f} s,"
+            f"{self.name} has time stamps that go back: frame {frame_number} has {stamp_ns / 1e9:.3f} s,"
             f" {back_ns / 1e9:.3f} s less than the frame before it; give its frame rate, as in"
             f" --rate {self._own_rate or 30:g}"
         )
@@ -472,9 +486,9 @@ class VideoFile:
         is_avi = self._container.format.name == "avi"
         is_reordered = is_avi and self._stream.codec_context.has_b_frames
         slots: deque[int] = deque()
-        convert = None
+        annex_b_filter = None
         if self.copy_fault is None:
-            convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
+            annex_b_filter = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
         for packet in self._container.demux(self._stream):
             # FFmpeg guesses pts for an .avi: with B frames, they are out of order and up to 0.2 s late
             if is_avi:
@@ -485,17 +499,17 @@ class VideoFile:
             if packet.is_corrupt:
                 self.faults.append(f"{self.name}: a packet is damaged")
             copies: list[bytes] = []
-            frames: list[Decoded] = []
+            decoded_frames: list[Decoded] = []
             try:
-                frames = self._decoder.decode(packet, (copies, slot))
+                decoded_frames = self._decoder.decode(packet, (copies, slot))
             except av.InvalidDataError as error:
                 self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
             # after decoding, because the filter consumes the packet's content
-            if convert is not None and packet.size:
+            if annex_b_filter is not None and packet.size:
                 # a damaged packet was reported above
                 with suppress(av.InvalidDataError):
-                    copies += [bytes(converted) for converted in convert.filter(packet)]
-            for decoded in frames:
+                    copies += [bytes(converted_packet) for converted_packet in annex_b_filter.filter(packet)]
+            for decoded in decoded_frames:
                 copies, slot = decoded.of
                 # a key frame is not displayed before it is decoded: earlier slots belong to lost frames
                 while decoded.frame.key_frame and slot is not None and slots and slots[0] < slot:
@@ -514,18 +528,18 @@ class VideoFile:
         # the length of the container may be that of another, longer stream
         return 1000 * (container.duration or 0) if len(container.streams) == 1 else 0
 
-    def _stamp_ns(self, frame: Any, count: int) -> int:
+    def _stamp_ns(self, frame: Any, frame_count: int) -> int:
         if self._rate is not None:
             if frame.pts is not None:
                 self._goes_back |= self._last_pts is not None and frame.pts < self._last_pts
                 self._last_pts = frame.pts
-            return round(count * 1e9 / self._rate)
+            return round(frame_count * 1e9 / self._rate)
         if frame.pts is None or frame.time_base is None:
             raise LogError(
                 f"{self.name} has no time stamps; say how many frames a second it has, as in --rate 30"
             )
-        stamp: Fraction = frame.pts * frame.time_base / _NS
-        return round(stamp)
+        stamp_ns: Fraction = frame.pts * frame.time_base / _NS
+        return round(stamp_ns)
 
     def close(self) -> None:
         """Close the file."""
@@ -626,14 +640,16 @@ def _to_encode(frame: Frame, size: tuple[int, int]) -> Any:
 def _lacks_index(path: Path) -> bool:
     """Return whether a file is an .mp4 or .mov without `moov`, the index of its frames."""
     with path.open("rb") as file:
-        kinds: list[bytes] = []
-        size, at = path.stat().st_size, 0
-        while at + 8 <= size and len(kinds) < _MOST_BOXES:
-            file.seek(at)
-            head = file.read(16)
-            length, kind = int.from_bytes(head[:4]), head[4:8]
+        box_types: list[bytes] = []
+        file_size, offset = path.stat().st_size, 0
+        while offset + 8 <= file_size and len(box_types) < _MOST_BOXES:
+            file.seek(offset)
+            box_header = file.read(16)
+            box_length, box_type = int.from_bytes(box_header[:4]), box_header[4:8]
             # length 1: eight bytes of length follow; length 0: the box ends with the file (ISO/IEC 14496-12)
-            length = {0: size - at, 1: int.from_bytes(head[8:])}.get(length, length)
-            kinds.append(kind)
-            at += max(length, 8)
-    return kinds[:1] == [b"ftyp"] and b"moov" not in kinds
+            box_length = {0: file_size - offset, 1: int.from_bytes(box_header[8:])}.get(
+                box_length, box_length
+            )
+            box_types.append(box_type)
+            offset += max(box_length, 8)
+    return box_types[:1] == [b"ftyp"] and b"moov" not in box_types
