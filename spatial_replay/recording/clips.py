@@ -55,7 +55,7 @@ Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 class _Below(NamedTuple):
     """Threshold below which a robustness falls: certainly, or possibly."""
 
-    number: float
+    threshold: float
     is_possible: bool
 
 
@@ -86,8 +86,8 @@ class Trigger:
                 raise UsageError(f"{name} is {value!r}; give seconds, 0 or more")
         if self.most_bytes < 2**20:
             raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
-        for text in self.texts:
-            _parse_condition(text)
+        for condition_text in self.texts:
+            _parse_condition(condition_text)
 
     @property
     def texts(self) -> list[str]:
@@ -104,20 +104,21 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     Raises:
         UsageError: the text is no condition, or names no spec.
     """
-    name, what = _parse_condition(text)
-    if what == MANUAL:
+    # the target is a verdict, `EVENT`, `MANUAL` or a threshold
+    name, target = _parse_condition(text)
+    if target == MANUAL:
         return lambda updates, has_changed: None
-    if what == EVENT:
+    if target == EVENT:
         return lambda updates, has_changed: EVENT if has_changed else None
     if not files:
         raise UsageError(f"the trigger {text!r} waits for a spec, but there is none; give a specification")
     if not name:
         return lambda updates, _: next(
             (
-                f"{spec.spec.name} {what}"
+                f"{spec.spec.name} {target}"
                 for update in updates
                 for spec in update.specs
-                if str(spec.verdict) == what
+                if str(spec.verdict) == target
             ),
             None,
         )
@@ -131,13 +132,13 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     if name not in names:
         hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
         raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
-    if isinstance(what, _Below):
+    if isinstance(target, _Below):
         monitor = next(monitor for monitor in monitors if name in monitor.names)
-        below = f"{name} {'possibly ' if what.is_possible else ''}below {what.number:g}"
+        reason = f"{name} {'possibly ' if target.is_possible else ''}below {target.threshold:g}"
         # the lower end shows that the value may be below, the upper end that it certainly is
-        end = 0 if what.is_possible else 1
-        return lambda updates, _: below if monitor.interval(name)[end] < what.number else None
-    return lambda updates, _: f"{name} {what}" if _verdict(updates, name) == what else None
+        bound = 0 if target.is_possible else 1
+        return lambda updates, _: reason if monitor.interval(name)[bound] < target.threshold else None
+    return lambda updates, _: f"{name} {target}" if _verdict(updates, name) == target else None
 
 
 def _parse_condition(text: str) -> tuple[str, str | _Below]:
@@ -210,7 +211,7 @@ class TriggeredClip:
     dropped: int
 
 
-class _Held(NamedTuple):
+class _RingEntry(NamedTuple):
     """A message, sample or external event in the ring; `size` is its memory in bytes."""
 
     time_ns: int
@@ -226,55 +227,59 @@ class _ManualTrigger(NamedTuple):
     message_ns: int
 
 
-class _Open:
+class _OpenClip:
     """An unfinished clip: entries of the ring wait to be written, and later entries follow."""
 
     def __init__(
-        self, path: Path, files: Sequence[Specification], about: Mapping[str, str], fired: str, at_ns: int
+        self,
+        path: Path,
+        files: Sequence[Specification],
+        about: Mapping[str, str],
+        reason: str,
+        trigger_ns: int,
     ) -> None:
-        self.path, self.reasons, self.at_ns = path, [fired], at_ns
-        self.waiting: deque[_Held] = deque()
+        self.path, self.reasons, self.trigger_ns = path, [reason], trigger_ns
+        self.waiting_entries: deque[_RingEntry] = deque()
         self.waiting_bytes = 0
-        self.begin_ns = self.until_ns = at_ns
+        self.begin_ns = self.until_ns = trigger_ns
         self.first_ns: int | None = None
-        self.last_s = time.monotonic()
+        self.last_put_s = time.monotonic()
         self.channels: Mapping[int, Channel] = {}
         self._stream = open_output(path)
         try:
             # with a clock, chunks are closed after a second, so that a kill loses little
             self._writer = LogWriter(self._stream, clock=time.monotonic)
-            self._recording = Recording(self._writer, files, {**about, "trigger": fired})
+            self._recording = Recording(self._writer, files, {**about, "trigger": reason})
         except BaseException:
             with suppress(OutputError):
                 self._stream.close()
             raise
-        self._last_ns: dict[int, int] = {}
-        self._sample_ns = -1
+        self._last_sample_ns = -1
 
-    def put(self, entry: _Held) -> None:
-        self.waiting.append(entry)
+    def put(self, entry: _RingEntry) -> None:
+        self.waiting_entries.append(entry)
         self.waiting_bytes += entry.size
-        self.last_s = time.monotonic()
+        self.last_put_s = time.monotonic()
 
     def write(self, most_bytes: float = _SLICE_BYTES) -> None:
         """Write waiting entries, up to about `most_bytes`."""
         samples: list[Sample] = []
         messages: list[Row] = []
         events: list[RunEvent] = []
-        size = 0
-        while self.waiting and size < most_bytes:
-            entry = self.waiting.popleft()
-            size += entry.size
+        written_bytes = 0
+        while self.waiting_entries and written_bytes < most_bytes:
+            entry = self.waiting_entries.popleft()
+            written_bytes += entry.size
             self.first_ns = entry.time_ns if self.first_ns is None else min(self.first_ns, entry.time_ns)
             if isinstance(entry.content, Row):
                 messages.append(entry.content._replace(log_time_ns=entry.time_ns))
             elif isinstance(entry.content, RunEvent):
                 events.append(entry.content)
             # times of samples in a log must increase
-            elif entry.time_ns > self._sample_ns:
+            elif entry.time_ns > self._last_sample_ns:
                 samples.append(entry.content)
-                self._sample_ns = entry.time_ns
-        self.waiting_bytes -= size
+                self._last_sample_ns = entry.time_ns
+        self.waiting_bytes -= written_bytes
         if not (samples or messages or events):
             return
         self._recording.add(Trace.from_samples(samples), Messages.from_rows(self.channels, messages))
@@ -289,10 +294,10 @@ class _Open:
         """Write all waiting entries, and close the log."""
         try:
             self.write(math.inf)
-            held_s = 0.0 if self.first_ns is None else max(0.0, (self.at_ns - self.first_ns) / 1e9)
+            held_s = 0.0 if self.first_ns is None else max(0.0, (self.trigger_ns - self.first_ns) / 1e9)
             record = {
                 "reasons": json.dumps(self.reasons),
-                "time_ns": str(self.at_ns),
+                "time_ns": str(self.trigger_ns),
                 "before_s": repr(before_s),
                 "after_s": repr(after_s),
                 "held_before_s": repr(held_s),
@@ -302,7 +307,7 @@ class _Open:
             self._writer.close()
         finally:
             self._stream.close()
-        return TriggeredClip(self.path, self.reasons[0], self.at_ns, held_s, end.dropped)
+        return TriggeredClip(self.path, self.reasons[0], self.trigger_ns, held_s, end.dropped)
 
 
 class ClipLog(RecorderLog):
@@ -324,11 +329,11 @@ class ClipLog(RecorderLog):
         """Compile the specifications, and create the folder."""
         self._folder, self._files, self._about = folder, files, dict(about or {})
         self._trigger = trigger
-        texts = trigger.texts
+        condition_texts = trigger.texts
         units = Axes.from_metadata(self._about).units
         self._monitors = [Monitor(file, units=units) for file in files]
-        self._conditions = [(text, condition_of(text, files, self._monitors)) for text in texts]
-        self._held_before = dict.fromkeys(texts, False)
+        self._conditions = [(text, condition_of(text, files, self._monitors)) for text in condition_texts]
+        self._was_fulfilled = dict.fromkeys(condition_texts, False)
         self._before_ns, self._after_ns = round(trigger.before_s * 1e9), round(trigger.after_s * 1e9)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -336,10 +341,10 @@ class ClipLog(RecorderLog):
             raise OutputError(f"{folder}: {system_reason(error)}") from None
         self._changes = VerdictChanges(files)
         warm_up(files, ())
-        self._samples: deque[_Held] = deque()
-        self._messages: deque[_Held] = deque()
-        self._static: deque[_Held] = deque(maxlen=_MOST_STATIC)
-        self._events: deque[_Held] = deque(maxlen=_MOST_EVENTS)
+        self._samples: deque[_RingEntry] = deque()
+        self._messages: deque[_RingEntry] = deque()
+        self._static: deque[_RingEntry] = deque(maxlen=_MOST_STATIC)
+        self._events: deque[_RingEntry] = deque(maxlen=_MOST_EVENTS)
         self._missed: dict[Missed, deque[int]] = {
             "sample": deque(maxlen=_MOST_MISSED),
             "message": deque(maxlen=_MOST_MISSED),
@@ -348,9 +353,9 @@ class ClipLog(RecorderLog):
         self.held_bytes = 0
         self._newest_ns = self._evicted_ns = -1
         self._zero_ns: int | None = None
-        self._progress: dict[type, tuple[int, float]] = {}
-        self._open: _Open | None = None
-        self._manual: deque[_ManualTrigger] = deque()
+        self._latest_arrivals: dict[type, tuple[int, float]] = {}
+        self._open: _OpenClip | None = None
+        self._manual_triggers: deque[_ManualTrigger] = deque()
         self._remarks: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._has_overflowed = False
         self.written: tuple[TriggeredClip, ...] = ()
@@ -358,7 +363,7 @@ class ClipLog(RecorderLog):
     @property
     def is_busy(self) -> bool:
         """Whether entries of a clip wait to be written, or a trigger by hand is due."""
-        return self._is_due or (self._open is not None and bool(self._open.waiting))
+        return self._is_due or (self._open is not None and bool(self._open.waiting_entries))
 
     def fire(self, reason: str, sample_ns: int, message_ns: int) -> None:
         """Fire by hand, from any thread.
@@ -367,7 +372,7 @@ class ClipLog(RecorderLog):
             sample_ns, message_ns: times of the newest queued sample and message, -1 for none. The clip is
                 around the later time or, without one, around the next sample or message.
         """
-        self._manual.append(_ManualTrigger(reason, sample_ns, message_ns))
+        self._manual_triggers.append(_ManualTrigger(reason, sample_ns, message_ns))
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return the remarks since the last call."""
@@ -380,7 +385,7 @@ class ClipLog(RecorderLog):
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Add the next samples and messages to the ring, and write entries of an open clip."""
         entries = [*self._held_messages(messages)]
-        entries += [_Held(sample.time_ns, sample, _sample_bytes(sample)) for sample in samples]
+        entries += [_RingEntry(sample.time_ns, sample, _sample_bytes(sample)) for sample in samples]
         self._begin_due()
         # in order of time, so that the ring holds the messages around the sample that fires
         for entry in sorted(entries, key=lambda entry: entry.time_ns):
@@ -395,7 +400,7 @@ class ClipLog(RecorderLog):
             # a clip may not hold more memory than the ring
             while self._open.waiting_bytes > self._trigger.most_bytes:
                 self._open.write()
-            if not self._open.waiting and self._is_past(self._open.until_ns):
+            if not self._open.waiting_entries and self._is_past(self._open.until_ns):
                 self._finish(is_interrupted=False)
 
     def miss(self, time_ns: int, kind: Missed) -> None:
@@ -404,10 +409,10 @@ class ClipLog(RecorderLog):
 
     def report(self, event: RunEvent) -> None:
         """Add an external event to the ring; fire if the trigger has the condition `EVENT`."""
-        held = _Held(event.time_ns, event)
-        self._events.append(held)
+        entry = _RingEntry(event.time_ns, event)
+        self._events.append(entry)
         if self._open is not None and event.time_ns <= self._open.until_ns:
-            self._open.put(held)
+            self._open.put(entry)
         if EVENT in self._trigger.texts:
             self._begin(event.what, event.time_ns)
 
@@ -417,7 +422,10 @@ class ClipLog(RecorderLog):
             return
         self._open.flush()
         # without entries for longer than the clip lasts, the run has stopped
-        if not self._open.waiting and time.monotonic() - self._open.last_s > self._trigger.after_s + 2.0:
+        if (
+            not self._open.waiting_entries
+            and time.monotonic() - self._open.last_put_s > self._trigger.after_s + 2.0
+        ):
             self._finish(is_interrupted=True)
 
     def end(self, end: RunEnd) -> None:
@@ -438,53 +446,63 @@ class ClipLog(RecorderLog):
         updates = [monitor.update(sample) for monitor in self._monitors]
         changes = list(self._changes.after(updates))
         has_changed = not all(change.is_first for change in changes)
-        for text, condition in self._conditions:
+        for condition_text, condition in self._conditions:
             reason = condition(updates, has_changed)
-            if reason is not None and not self._held_before[text]:
+            if reason is not None and not self._was_fulfilled[condition_text]:
                 self._begin(reason, sample.time_ns)
             # every event fires; any other condition fires only when it begins to hold
-            self._held_before[text] = reason is not None and text != EVENT
+            self._was_fulfilled[condition_text] = reason is not None and condition_text != EVENT
 
     @property
     def _is_due(self) -> bool:
         """Whether the ring has reached the time of the oldest trigger by hand; False before any entry."""
-        if not self._manual or self._newest_ns < 0:
+        if not self._manual_triggers or self._newest_ns < 0:
             return False
-        evaluated_ns, _ = self._progress.get(Sample, (-1, 0.0))
-        return self._manual[0].sample_ns <= evaluated_ns and self._manual[0].message_ns <= self._newest_ns
+        evaluated_ns, _ = self._latest_arrivals.get(Sample, (-1, 0.0))
+        return (
+            self._manual_triggers[0].sample_ns <= evaluated_ns
+            and self._manual_triggers[0].message_ns <= self._newest_ns
+        )
 
     def _begin_due(self) -> None:
         """Open the clips of all due triggers by hand."""
         while self._is_due:
-            manual = self._manual.popleft()
-            time_ns = max(manual.sample_ns, manual.message_ns)
-            self._begin(manual.reason, self._newest_ns if time_ns < 0 else time_ns)
+            manual = self._manual_triggers.popleft()
+            reached_ns = max(manual.sample_ns, manual.message_ns)
+            self._begin(manual.reason, self._newest_ns if reached_ns < 0 else reached_ns)
 
     def _is_past(self, time_ns: int) -> bool:
         """Return whether no more samples and messages up to a time are expected."""
         now_s = time.monotonic()
         return all(
-            newest_ns > time_ns or now_s - came_s > _LATE_S for newest_ns, came_s in self._progress.values()
+            newest_ns > time_ns or now_s - arrived_s > _LATE_S
+            for newest_ns, arrived_s in self._latest_arrivals.values()
         )
 
-    def _held_messages(self, messages: Messages) -> Iterator[_Held]:
+    def _held_messages(self, messages: Messages) -> Iterator[_RingEntry]:
         self._channels = messages.channels or self._channels
-        static = {
-            n for n, channel in messages.channels.items() if channel.topic.rsplit("/", 1)[-1] == _STATIC
+        static_ids = {
+            channel_id
+            for channel_id, channel in messages.channels.items()
+            if channel.topic.rsplit("/", 1)[-1] == _STATIC
         }
         for row in messages.rows():
-            held = _Held(row.log_time_ns, row, _MESSAGE_BYTES + len(row.payload))
-            if row.channel in static:
-                self._static.append(held)
-            yield held
+            entry = _RingEntry(row.log_time_ns, row, _MESSAGE_BYTES + len(row.payload))
+            if row.channel in static_ids:
+                self._static.append(entry)
+            yield entry
 
-    def _hold(self, entry: _Held) -> None:
-        kind: type = Sample if isinstance(entry.content, Sample) else Row
-        (self._samples if kind is Sample else self._messages).append(entry)
+    def _hold(self, entry: _RingEntry) -> None:
+        content_type: type = Sample if isinstance(entry.content, Sample) else Row
+        (self._samples if content_type is Sample else self._messages).append(entry)
         self.held_bytes += entry.size
         self._newest_ns = max(self._newest_ns, entry.time_ns)
-        newest_ns = max(self._progress[kind][0], entry.time_ns) if kind in self._progress else entry.time_ns
-        self._progress[kind] = newest_ns, time.monotonic()
+        newest_ns = (
+            max(self._latest_arrivals[content_type][0], entry.time_ns)
+            if content_type in self._latest_arrivals
+            else entry.time_ns
+        )
+        self._latest_arrivals[content_type] = newest_ns, time.monotonic()
         self._evict()
         clip = self._open
         if clip is not None and entry.time_ns <= clip.until_ns:
@@ -500,28 +518,28 @@ class ClipLog(RecorderLog):
         if self._open is not None:
             clip = self._open
             clip.reasons.append(reason)
-            following = self._between(clip.until_ns + 1, at_ns + self._after_ns)
+            following_entries = self._between(clip.until_ns + 1, at_ns + self._after_ns)
         else:
-            number = len(self.written) + 1
+            clip_number = len(self.written) + 1
             # logs of an earlier run in this folder keep their numbers
-            while any(self._folder.glob(f"{number:04d}-*.mcap")):
-                number += 1
+            while any(self._folder.glob(f"{clip_number:04d}-*.mcap")):
+                clip_number += 1
             slug = re.sub(r"[^A-Za-z0-9_]+", "-", reason).strip("-")[:60] or "trigger"
-            path = self._folder / f"{number:04d}-{slug}.mcap"
-            zero = {} if self._zero_ns is None else {ZERO: str(self._zero_ns)}
-            clip = self._open = _Open(path, self._files, {**self._about, **zero}, reason, at_ns)
+            path = self._folder / f"{clip_number:04d}-{slug}.mcap"
+            zero_metadata = {} if self._zero_ns is None else {ZERO: str(self._zero_ns)}
+            clip = self._open = _OpenClip(path, self._files, {**self._about, **zero_metadata}, reason, at_ns)
             clip.channels = self._channels
             begin_ns = clip.begin_ns = at_ns - self._before_ns
-            for held in self._static:
-                if held.time_ns < begin_ns:
+            for static_entry in self._static:
+                if static_entry.time_ns < begin_ns:
                     # older static transforms are repeated at the clip's begin
-                    clip.put(held._replace(time_ns=max(begin_ns, 0)))
-            following = self._between(begin_ns, at_ns + self._after_ns)
-        for entry in following:
+                    clip.put(static_entry._replace(time_ns=max(begin_ns, 0)))
+            following_entries = self._between(begin_ns, at_ns + self._after_ns)
+        for entry in following_entries:
             clip.put(entry)
         clip.until_ns = max(clip.until_ns, at_ns + self._after_ns)
 
-    def _between(self, begin_ns: int, end_ns: int) -> list[_Held]:
+    def _between(self, begin_ns: int, end_ns: int) -> list[_RingEntry]:
         entries = [*self._messages, *self._samples, *self._events]
         entries_within = [entry for entry in entries if begin_ns <= entry.time_ns <= end_ns]
         return sorted(entries_within, key=lambda entry: entry.time_ns)
@@ -529,7 +547,7 @@ class ClipLog(RecorderLog):
     def _evict(self) -> None:
         """Evict entries that are too old, and then the oldest entries until the ring fits its limit."""
         # a late sample may fire, so the age of entries counts from the newest sample
-        reached_ns, arrived_s = self._progress.get(Sample, (self._newest_ns, 0.0))
+        reached_ns, arrived_s = self._latest_arrivals.get(Sample, (self._newest_ns, 0.0))
         if time.monotonic() - arrived_s > _LATE_S:
             reached_ns = self._newest_ns
         oldest_ns = reached_ns - self._before_ns - _LATE_NS
@@ -537,16 +555,16 @@ class ClipLog(RecorderLog):
             ring = self._messages
             if not self._messages or (self._samples and self._samples[0].time_ns < self._messages[0].time_ns):
                 ring = self._samples
-            is_over = self.held_bytes > self._trigger.most_bytes
-            if ring[0].time_ns >= oldest_ns and not is_over:
+            is_too_large = self.held_bytes > self._trigger.most_bytes
+            if ring[0].time_ns >= oldest_ns and not is_too_large:
                 return
-            dropped = ring.popleft()
-            self._evicted_ns = max(self._evicted_ns, dropped.time_ns)
-            self.held_bytes -= dropped.size
+            evicted_entry = ring.popleft()
+            self._evicted_ns = max(self._evicted_ns, evicted_entry.time_ns)
+            self.held_bytes -= evicted_entry.size
             # this entry was within `before_s`, so the ring is too small
-            if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
+            if is_too_large and evicted_entry.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True
-                held_s = max(0.0, (reached_ns - dropped.time_ns) / 1e9)
+                held_s = max(0.0, (reached_ns - evicted_entry.time_ns) / 1e9)
                 needed_bytes = self._trigger.most_bytes * self._trigger.before_s / max(held_s, 1e-3)
                 self._remarks.put(
                     f"the ring of {_megabytes(self._trigger.most_bytes)} holds {held_s:.1f} s, not the "
@@ -558,31 +576,31 @@ class ClipLog(RecorderLog):
         if clip is None:
             return
         begin_ns, until_ns = clip.begin_ns, clip.until_ns
-        missed = {
+        missed_counts = {
             kind: sum(begin_ns <= time_ns <= until_ns for time_ns in tuple(times_ns))
             for kind, times_ns in self._missed.items()
         }
-        end = RunEnd(is_interrupted, missed["sample"], missed["message"])
-        outcome = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
-        self.written = (*self.written, outcome)
-        more = plural(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
-        lost = "".join(
+        end = RunEnd(is_interrupted, missed_counts["sample"], missed_counts["message"])
+        finished_clip = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
+        self.written = (*self.written, finished_clip)
+        further_text = plural(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
+        dropped_text = "".join(
             f"; {plural(count, kind)} of it {'was' if count == 1 else 'were'} dropped"
-            for kind, count in missed.items()
+            for kind, count in missed_counts.items()
             if count
         )
         self._remarks.put(
-            f"wrote {clip.path}: {outcome.held_s:.1f} s before and up to {self._trigger.after_s:g} s after"
-            f" {outcome.reason}{f', and {more}' if more else ''}{lost}"
+            f"wrote {clip.path}: {finished_clip.held_s:.1f} s before and up to {self._trigger.after_s:g} s"
+            f" after {finished_clip.reason}{f', and {further_text}' if further_text else ''}{dropped_text}"
         )
 
 
 def _sample_bytes(sample: Sample) -> int:
-    size = _SAMPLE_BYTES
+    sample_bytes = _SAMPLE_BYTES
     for tracked in sample.objects.values():
-        size += _OBJECT_BYTES + sum(len(part.packed) for part in tracked.footprint.parts)
-    return size
+        sample_bytes += _OBJECT_BYTES + sum(len(part.packed) for part in tracked.footprint.parts)
+    return sample_bytes
 
 
-def _megabytes(size: float) -> str:
-    return f"{size / 2**20:,.0f} MB"
+def _megabytes(size_bytes: float) -> str:
+    return f"{size_bytes / 2**20:,.0f} MB"

@@ -113,27 +113,27 @@ def check_topic(topic: object) -> None:
 
 
 def _schema(
-    topic: str, encoding: str, schema: object, name: str | None, schema_encoding: str | None
+    topic: str, encoding: str, schema: object, schema_name: str | None, schema_encoding: str | None
 ) -> Schema:
     """Return the schema of a definition that is no protobuf class."""
-    expected = (ENCODINGS[encoding], *_OTHER_SCHEMAS.get(encoding, ()))
-    if schema_encoding is not None and schema_encoding not in expected:
+    schema_encodings = (ENCODINGS[encoding], *_OTHER_SCHEMAS.get(encoding, ()))
+    if schema_encoding is not None and schema_encoding not in schema_encodings:
         raise UsageError(
             f"{topic}: the schema is encoded as {shortened(schema_encoding)}; a schema of {encoding}"
-            f" messages is {' or '.join(expected)}"
+            f" messages is {' or '.join(schema_encodings)}"
         )
-    text = _text(topic, encoding, schema)
-    if expected[0] == "jsonschema":
-        title = _title(topic, text)
-        name = name or title
-    if not name:
+    definition = _text(topic, encoding, schema)
+    if schema_encodings[0] == "jsonschema":
+        title = _title(topic, definition)
+        schema_name = schema_name or title
+    if not schema_name:
         raise UsageError(
             f"{topic}: the schema has no name; give schema_name, the type of the messages, such as"
             " 'sensor_msgs/msg/JointState'"
         )
     if encoding == "protobuf":
-        _check_descriptors(topic, text, name)
-    return Schema(name, schema_encoding or expected[0], text)
+        _check_descriptors(topic, definition, schema_name)
+    return Schema(schema_name, schema_encoding or schema_encodings[0], definition)
 
 
 def _text(topic: str, encoding: str, schema: object) -> bytes:
@@ -156,10 +156,10 @@ def _text(topic: str, encoding: str, schema: object) -> bytes:
     )
 
 
-def _title(topic: str, text: bytes) -> str:
+def _title(topic: str, definition: bytes) -> str:
     """Check a JSON schema, and return its title or, without a title, the name of the topic."""
     try:
-        schema = json.loads(text)
+        schema = json.loads(definition)
     except ValueError as error:
         raise UsageError(f"{topic}: the schema is not JSON: {error}") from None
     if not isinstance(schema, dict) or schema.get("type", "object") != "object":
@@ -171,9 +171,9 @@ def _title(topic: str, text: bytes) -> str:
     return title if isinstance(title, str) and title else topic.strip("/")
 
 
-def _check_descriptors(topic: str, text: bytes, name: str) -> None:
+def _check_descriptors(topic: str, definition: bytes, message_name: str) -> None:
     try:
-        files = FileDescriptorSet.FromString(text)
+        files = FileDescriptorSet.FromString(definition)
     except DecodeError:
         raise UsageError(
             f"{topic}: the schema is not a FileDescriptorSet; give the message class, or the bytes that"
@@ -182,19 +182,20 @@ def _check_descriptors(topic: str, text: bytes, name: str) -> None:
     type_names = [
         type_name for file in files.file for type_name in _type_names(file.package, file.message_type)
     ]
-    if name not in type_names:
+    if message_name not in type_names:
         raise UsageError(
-            f"{topic}: the schema has no message {name!r}; it has {listing(type_names) or 'no message'}"
+            f"{topic}: the schema has no message {message_name!r}; it has"
+            f" {listing(type_names) or 'no message'}"
         )
 
 
-def _type_names(prefix: str, types: Any) -> list[str]:
+def _type_names(prefix: str, message_types: Any) -> list[str]:
     message_type: DescriptorProto
-    names = []
-    for message_type in types:
-        name = f"{prefix}.{message_type.name}".lstrip(".")
-        names += [name, *_type_names(name, message_type.nested_type)]
-    return names
+    type_names = []
+    for message_type in message_types:
+        type_name = f"{prefix}.{message_type.name}".lstrip(".")
+        type_names += [type_name, *_type_names(type_name, message_type.nested_type)]
+    return type_names
 
 
 def _json(topic: str, data: Mapping[str, Any]) -> bytes:

@@ -24,20 +24,22 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     # the default and ignoring "handlers" are constants, which are not callable
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    arrived: list[int] = []
-    for number, handler in handlers.items():
+    handlers = {
+        signal_number: signal.getsignal(signal_number) for signal_number in (signal.SIGINT, signal.SIGTERM)
+    }
+    arrived_signals: list[int] = []
+    for signal_number, handler in handlers.items():
         if callable(handler):
             # an exception in the handler would leave a partial record
-            signal.signal(number, lambda number, frame: arrived.append(number))
+            signal.signal(signal_number, lambda arrived_number, _: arrived_signals.append(arrived_number))
     try:
         yield
     finally:
-        for number, handler in handlers.items():
+        for signal_number, handler in handlers.items():
             if callable(handler):
-                signal.signal(number, handler)
-    if arrived:
-        signal.raise_signal(arrived[0])
+                signal.signal(signal_number, handler)
+    if arrived_signals:
+        signal.raise_signal(arrived_signals[0])
 
 
 @contextmanager
@@ -71,5 +73,5 @@ def terminable() -> Iterator[None]:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def _leave(signal_number: int, frame: FrameType | None) -> None:
     raise SystemExit(TERMINATED)

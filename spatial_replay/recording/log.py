@@ -132,12 +132,12 @@ class Recording:
             known=known,
             units=self._axes.units,
         )
-        self._samples = self._messages = self._end_ns = 0
+        self._sample_count = self._message_count = self._end_ns = 0
         self._start_ns = LATEST_NS
         self._topics: set[str] = set()
         self._plan: Mapping[str, str] | None = None
         self._doubts: tuple[str, ...] = ()
-        self._images: set[str] = set()
+        self._image_topics: set[str] = set()
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         if about is not None and ZERO in about:
             self._evaluation.annotator.count_from(int(about[ZERO]))
@@ -150,7 +150,7 @@ class Recording:
 
     def __len__(self) -> int:
         """Return the number of samples so far."""
-        return self._samples
+        return self._sample_count
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
@@ -160,8 +160,8 @@ class Recording:
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
         """The verdict of each result by name, if the log ended now."""
-        reported = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
-        return {tree.name: stream.verdict for tree, stream in reported}
+        results = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
+        return {tree.name: stream.verdict for tree, stream in results}
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -185,10 +185,10 @@ class Recording:
         Raises:
             TraceError: samples that are not after the earlier samples.
         """
-        stretches = self._evaluation.extend(trace)
+        blocks = self._evaluation.extend(trace)
         messages = self._count_messages(trace, beside)
-        self._sink.write_messages(merge([messages, *self._evaluation.annotator.messages(trace, stretches)]))
-        self._hashes.add_results(stretches)
+        self._sink.write_messages(merge([messages, *self._evaluation.annotator.messages(trace, blocks)]))
+        self._hashes.add_results(blocks)
 
     def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
         """Write the next samples without an evaluation; `evaluate` must later receive them in their order."""
@@ -196,9 +196,9 @@ class Recording:
 
     def evaluate(self, trace: Trace) -> None:
         """Evaluate samples that `add_samples` wrote, and write the messages of their results."""
-        stretches = self._evaluation.extend(trace)
-        self._sink.write_messages(merge(self._evaluation.annotator.messages(trace, stretches)))
-        self._hashes.add_results(stretches)
+        blocks = self._evaluation.extend(trace)
+        self._sink.write_messages(merge(self._evaluation.annotator.messages(trace, blocks)))
+        self._hashes.add_results(blocks)
 
     def report(self, event: RunEvent) -> None:
         """Write an external event of the run.
@@ -209,20 +209,25 @@ class Recording:
 
     def _count_messages(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and other messages in the form in which they are written; count and hash them."""
-        replayable = sample_messages(trace, self._samples)
-        messages = replayable
+        certified_messages = sample_messages(trace, self._sample_count)
+        messages = certified_messages
         if beside is not None and len(beside):
             # a replay does not copy messages on topics of this package, such as planning times
-            copied = beside.of_topics({channel.topic for channel in beside.channels.values()} - DERIVED)
-            replayable, messages = merge([replayable, copied]), merge([replayable, beside])
+            replayed_messages = beside.of_topics(
+                {channel.topic for channel in beside.channels.values()} - DERIVED
+            )
+            certified_messages, messages = (
+                merge([certified_messages, replayed_messages]),
+                merge([certified_messages, beside]),
+            )
             self._topics.update(channel.topic for channel in beside.channels.values())
-            self._images |= image_topics(beside.channels.values())
-            self._messages += len(copied)
+            self._image_topics |= image_topics(beside.channels.values())
+            self._message_count += len(replayed_messages)
         if len(messages):
             self._start_ns = min(self._start_ns, int(messages.log_time_ns[0]))
             self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
-        self._samples += len(trace)
-        self._hashes.add_samples(trace, replayable)
+        self._sample_count += len(trace)
+        self._hashes.add_samples(trace, certified_messages)
         return messages
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
@@ -236,20 +241,24 @@ class Recording:
 
     def end(self, end: RunEnd = _WHOLE) -> None:
         """Write the records after the last sample; the certificate equals the certificate of a replay."""
-        ending = self._ending(end)
+        ending_metadata = self._ending(end)
         if end.doubts:
             self.add_metadata(DOUBTS, metadata_from_doubts(end.doubts))
-        if self._samples:
+        if self._sample_count:
             annotator = self._evaluation.annotator
             self._sink.write_messages(merge(annotator.end(self._end_ns, self._evaluation.finals)))
-        start = self._start_ns, "this log"
-        planned = (self._plan or {}).get("specification", "")
-        layout = self._evaluation.layout(self._topics, self._axes, self._images, start=start, planned=planned)
+        start_and_name = self._start_ns, "this log"
+        planned_specification = (self._plan or {}).get("specification", "")
+        layout = self._evaluation.layout(
+            self._topics, self._axes, self._image_topics, start=start_and_name, planned=planned_specification
+        )
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
-        if self._samples and streams:
-            places = self._evaluation.annotator.standing.order
-            results = [(self._evaluation.trees[place], streams[place]) for place in places]
+        if self._sample_count and streams:
+            tree_indices = self._evaluation.annotator.standing.order
+            results = [
+                (self._evaluation.trees[tree_index], streams[tree_index]) for tree_index in tree_indices
+            ]
             texts = {
                 tree.title: verdict_text(
                     stream.verdict,
@@ -259,7 +268,7 @@ class Recording:
                 for tree, stream in results
             }
             self._sink.add_metadata(VERDICTS, texts)
-        self._sink.add_metadata(ENDING, ending)
+        self._sink.add_metadata(ENDING, ending_metadata)
         self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan, self._doubts))
 
     def break_off(self, end: RunEnd) -> None:
@@ -267,14 +276,17 @@ class Recording:
         self._sink.add_metadata(ENDING, self._ending(end._replace(interrupted=True)) | {"failed": "true"})
 
     def _ending(self, end: RunEnd) -> dict[str, str]:
-        ending = {
-            "samples": str(self._samples),
+        ending_metadata = {
+            "samples": str(self._sample_count),
             "dropped": str(end.dropped),
             "interrupted": json.dumps(end.interrupted),
         }
-        if self._messages or end.messages_dropped:
-            ending |= {"messages": str(self._messages), "messages_dropped": str(end.messages_dropped)}
-        return ending
+        if self._message_count or end.messages_dropped:
+            ending_metadata |= {
+                "messages": str(self._message_count),
+                "messages_dropped": str(end.messages_dropped),
+            }
+        return ending_metadata
 
 
 def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[str, str]:
@@ -377,7 +389,7 @@ class FileLog(RecorderLog):
         """Begin the file, and compile all code that later writes need."""
         self._unevaluated: deque[Trace] = deque()
         self._plans: deque[Mapping[str, str]] = deque()
-        self._at_once = _AT_FIRST
+        self._batch_size = _AT_FIRST
         refuse_ending(path)
         self._stream = open_output(path, durability, overwrite=overwrite)
         try:
@@ -427,15 +439,15 @@ class FileLog(RecorderLog):
     def _evaluate_some(self) -> None:
         """Evaluate the next samples, about as many as take `_EVALUATING_S`."""
         trace = self._unevaluated.popleft()
-        count = min(self._at_once, len(trace))
-        if count < len(trace):
-            self._unevaluated.appendleft(trace.slice(count, len(trace)))
-        begun = time.monotonic()
-        self._recording.evaluate(trace.slice(0, count))
-        self.backlog -= count
+        sample_count = min(self._batch_size, len(trace))
+        if sample_count < len(trace):
+            self._unevaluated.appendleft(trace.slice(sample_count, len(trace)))
+        begin_s = time.monotonic()
+        self._recording.evaluate(trace.slice(0, sample_count))
+        self.backlog -= sample_count
         # the next batch follows from the measured speed
-        took_s = max(time.monotonic() - begun, 1e-6)
-        self._at_once = max(1, min(int(count * _EVALUATING_S / took_s), _MOST_AT_ONCE))
+        duration_s = max(time.monotonic() - begin_s, 1e-6)
+        self._batch_size = max(1, min(int(sample_count * _EVALUATING_S / duration_s), _MOST_AT_ONCE))
 
     def flush(self) -> None:
         """See `RecorderLog`."""
@@ -461,12 +473,12 @@ class FileLog(RecorderLog):
 
 def encodable(samples: Sequence[Sample]) -> list[Sample]:
     """Return the samples before the first one that cannot be encoded."""
-    sound: list[Sample] = []
+    encodable_samples: list[Sample] = []
     with suppress(Exception):
         for sample in samples:
             Trace.from_samples([sample])
-            sound.append(sample)
-    return sound
+            encodable_samples.append(sample)
+    return encodable_samples
 
 
 def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
@@ -503,13 +515,13 @@ def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomat
     recording.end()
     writer.close()
     # the code of arrows at violations, because these samples may have no violation
-    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
-    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
+    footprints = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(footprints, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
 
 
-def _example_object(kind: int, x: float) -> TrackedObject:
+def _example_object(shape_index: int, x: float) -> TrackedObject:
     box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
-    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[shape_index % 3]
     return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
 
 
@@ -552,15 +564,15 @@ class VerdictChanges:
 
     def after(self, updates: Sequence[Update]) -> Iterator[VerdictChange]:
         """Yield the changes at a sample, from the update of each specification."""
-        for states, update in zip(self._states, updates, strict=True):
-            for place, spec in enumerate(update.specs):
-                if spec.numbers is None or states[place].are_final:
+        for node_states, update in zip(self._states, updates, strict=True):
+            for spec_index, spec in enumerate(update.specs):
+                if spec.numbers is None or node_states[spec_index].are_final:
                     continue
                 times_ns = np.array([update.time_ns], np.int64)
-                before = states[place]
-                tracked = track(before, times_ns, spec.numbers[:1, :, None].copy(), self._root)
-                states[place] = tracked.states
-                is_first = not before.integers[0, 0] and tracked.states.integers[0, 0]
+                former_states = node_states[spec_index]
+                tracked = track(former_states, times_ns, spec.numbers[:1, :, None].copy(), self._root)
+                node_states[spec_index] = tracked.states
+                is_first = not former_states.integers[0, 0] and tracked.states.integers[0, 0]
                 if tracked.changes or is_first:
                     yield self._change(tracked.states, spec, update, is_first=bool(is_first))
 
@@ -569,14 +581,14 @@ class VerdictChanges:
     ) -> VerdictChange:
         period = states.period(0)
         name = spec.spec.name
-        about = requirement_text(spec.spec.id, spec.spec.title)
-        title = f"`{name}` ({about})" if about else f"`{name}`"
+        requirement = requirement_text(spec.spec.id, spec.spec.title)
+        title = f"`{name}` ({requirement})" if requirement else f"`{name}`"
         reasons = [result.reason for result in update.satisfied if result.spec is spec.spec]
         sentence = change_sentence(
             title, period, reasons[0] if period.code == SATISFIED and reasons else "", spec.unit
         )
         if period.code == VIOLATED:
-            names = {node for node in spec.names if node is not None} | {name}
-            reasons = [str(violation) for violation in update.violations if violation.spec in names]
+            node_names = {node for node in spec.names if node is not None} | {name}
+            reasons = [str(violation) for violation in update.violations if violation.spec in node_names]
             sentence = f"{title} is permanently violated: {'; '.join(reasons)}." if reasons else sentence
         return VerdictChange(update.time_ns, name, _WORDS[period.code], sentence, is_first)

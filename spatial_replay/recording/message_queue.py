@@ -59,7 +59,7 @@ class MessageQueue:
         # reentrant, because a signal handler may write while it interrupts a write of the same thread
         self.lock = threading.RLock()
         self.channels: dict[str, MessageChannel] = {}
-        self._declared: Mapping[int, Channel] = MappingProxyType({})
+        self._channels_by_id: Mapping[int, Channel] = MappingProxyType({})
         self._queue: queue.SimpleQueue[Row] = queue.SimpleQueue()
         self._bytes_in = self._bytes_out = 0
         self.newest_ns = -1
@@ -82,10 +82,10 @@ class MessageQueue:
             self.require_open()
             message_channel = self.channels.get(channel.topic)
             if message_channel is None:
-                number = len(self.channels)
-                message_channel = MessageChannel(self, number, channel)
+                channel_id = len(self.channels)
+                message_channel = MessageChannel(self, channel_id, channel)
                 # replaced instead of changed, because the writing thread reads it without the lock
-                self._declared = MappingProxyType({**self._declared, number: channel})
+                self._channels_by_id = MappingProxyType({**self._channels_by_id, channel_id: channel})
                 self.channels[channel.topic] = message_channel
             elif message_channel.declaration != channel:
                 raise UsageError(
@@ -113,15 +113,15 @@ class MessageQueue:
 
     def put(self, message: Row) -> bool:
         """Queue a message; return False if it was dropped. Call it with the lock held."""
-        size = len(message.payload)
-        while self._is_full(size):
+        payload_bytes = len(message.payload)
+        while self._is_full(payload_bytes):
             if not self._blocks:
                 return False
             # after a failure the queue is never emptied
             self.raise_failure()
             self._ring()
             time.sleep(PAUSE_S)
-        self._bytes_in += size
+        self._bytes_in += payload_bytes
         self._queue.put(message)
         # the writing thread is woken before the queue is full
         if self._bytes_in - self._bytes_out > _TOGETHER_BYTES or self._queue.qsize() * 2 >= self._limit:
@@ -130,21 +130,21 @@ class MessageQueue:
 
     def take(self) -> Messages:
         """Return some of the waiting messages, possibly none; only the writing thread calls it."""
-        rows: list[Row] = []
-        size = 0
+        messages: list[Row] = []
+        payload_bytes = 0
         with suppress(queue.Empty):
-            while size < _TOGETHER_BYTES:
-                row = self._queue.get_nowait()
-                rows.append(row)
-                size += len(row.payload)
+            while payload_bytes < _TOGETHER_BYTES:
+                message = self._queue.get_nowait()
+                messages.append(message)
+                payload_bytes += len(message.payload)
         # no lock: only this thread changes _bytes_out, and only holders of the lock change _bytes_in
-        self._bytes_out += size
-        return Messages.from_rows(self._declared, rows)
+        self._bytes_out += payload_bytes
+        return Messages.from_rows(self._channels_by_id, messages)
 
-    def _is_full(self, size: int) -> bool:
+    def _is_full(self, payload_bytes: int) -> bool:
         waiting_bytes = self._bytes_in - self._bytes_out
         return self._queue.qsize() >= self._limit or (
-            waiting_bytes > 0 and waiting_bytes + size > MOST_WAITING_BYTES
+            waiting_bytes > 0 and waiting_bytes + payload_bytes > MOST_WAITING_BYTES
         )
 
 
@@ -159,8 +159,8 @@ class MessageChannel:
         dropped: number of messages that were dropped because the queue was full.
     """
 
-    def __init__(self, queue: MessageQueue, number: int, declaration: Channel) -> None:
-        self._queue, self._number = queue, number
+    def __init__(self, queue: MessageQueue, channel_id: int, declaration: Channel) -> None:
+        self._queue, self._channel_id = queue, channel_id
         self.declaration = declaration
         self.topic, self.encoding = declaration.topic, declaration.encoding
         self._encode = payload_encoder(declaration)
@@ -188,10 +188,10 @@ class MessageChannel:
         with queue.lock:
             queue.require_open()
             if time_ns < self._last_ns:
-                at, last = times_apart(time_ns, self._last_ns)
+                time_text, last_time_text = times_apart(time_ns, self._last_ns)
                 raise UsageError(
-                    f"a message on {self.topic} at {at} follows one at {last}; give times that do not"
-                    " decrease, or a topic for each thread"
+                    f"a message on {self.topic} at {time_text} follows one at {last_time_text}; give"
+                    " times that do not decrease, or a topic for each thread"
                 )
             self._put(time_ns, time_ns, payload)
 
@@ -207,7 +207,7 @@ class MessageChannel:
 
     def _put(self, time_ns: int, publish_ns: int, payload: bytes) -> None:
         self._last_ns = time_ns
-        if self._queue.put(Row(self._number, self.written, time_ns, publish_ns, payload)):
+        if self._queue.put(Row(self._channel_id, self.written, time_ns, publish_ns, payload)):
             self.written += 1
             self._queue.newest_ns = max(self._queue.newest_ns, time_ns)
         else:
@@ -216,13 +216,13 @@ class MessageChannel:
 
     def _check_time(self, time_ns: object) -> int:
         try:
-            number = operator.index(time_ns)  # type: ignore[arg-type]
+            integer_ns = operator.index(time_ns)  # type: ignore[arg-type]
         except TypeError:
-            number = -1
+            integer_ns = -1
         # operator.index also accepts booleans
-        if isinstance(time_ns, bool) or not 0 <= number <= LATEST_NS:
+        if isinstance(time_ns, bool) or not 0 <= integer_ns <= LATEST_NS:
             raise UsageError(
                 f"the time of a message on {self.topic} is {shortened(time_ns)}; give integer nanoseconds"
                 " from 0 to 2**63 - 1"
             )
-        return number
+        return integer_ns

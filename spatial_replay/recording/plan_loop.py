@@ -66,18 +66,18 @@ def run_plan(
     look()
     planner = decider.planner
     assert planner is not None
-    waited, reached = 0, {planner.states}
+    waited_samples, reached_states = 0, {planner.states}
     while True:
         step = decider.next_step()
         if step.kind == "execute":
             decider.conclude(execute(step))
-            waited, reached = 0, {planner.states}
-        elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
+            waited_samples, reached_states = 0, {planner.states}
+        elif step.kind == "wait" and waited_samples < MOST_WAITING_SAMPLES:
             look()
             # a wait for other agents is bounded by the planner; any other wait by samples without a new state
             is_for_others = step.aim is not None and not step.ahead
-            waited += not is_for_others and (not step.ahead or planner.states in reached)
-            reached.add(planner.states)
+            waited_samples += not is_for_others and (not step.ahead or planner.states in reached_states)
+            reached_states.add(planner.states)
         elif step.kind != "hold" or _holds(planner, look):
             return step
 

@@ -74,20 +74,20 @@ class SampleWriter:
         # (https://docs.python.org/3/library/queue.html#queue.SimpleQueue.put)
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
-        self._waiting = waiting
+        self._waiting_limit = waiting
         # half a batch wakes the writing thread
-        self._enough = max(1, min(waiting, _TOGETHER) // 2)
+        self._wake_count = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
         self._most_lost_s = most_lost_s
         self._is_reserved = False
         self._events: queue.SimpleQueue[RunEvent] = queue.SimpleQueue()
-        missed = partial(log.miss, kind="message")
-        self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=missed)
+        count_missed = partial(log.miss, kind="message")
+        self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=count_missed)
         self.dropped = 0
         self.doubts: tuple[Doubt, ...] = ()
         self._last_ns = self._queued_ns = -1
-        self._unsafe_s: float | None = None
-        self._drains = False
+        self._unflushed_since_s: float | None = None
+        self._drains_messages = False
         # a daemon, so that a program that never closes its recorder can end
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
@@ -128,8 +128,10 @@ class SampleWriter:
         require_sample(sample)
         self._messages.require_open()
         if sample.time_ns <= self._last_ns:
-            at, last = times_apart(sample.time_ns, self._last_ns)
-            raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
+            time_text, last_time_text = times_apart(sample.time_ns, self._last_ns)
+            raise TraceError(
+                f"a sample at {time_text} follows one at {last_time_text}; give times that increase"
+            )
         self._last_ns = sample.time_ns
         is_reserved, self._is_reserved = self._is_reserved, False
         while not is_reserved and self._is_behind():
@@ -138,11 +140,11 @@ class SampleWriter:
                 return
             self._messages.raise_failure()
             time.sleep(PAUSE_S)
-        if self._unsafe_s is None:
-            self._unsafe_s = time.monotonic()
+        if self._unflushed_since_s is None:
+            self._unflushed_since_s = time.monotonic()
         self._queue.put(sample)
         self._queued_ns = sample.time_ns
-        if self._queue.qsize() >= self._enough:
+        if self._queue.qsize() >= self._wake_count:
             self._ring()
 
     @property
@@ -162,10 +164,10 @@ class SampleWriter:
 
     def _is_behind(self) -> bool:
         """Return whether too many samples wait, or the oldest unflushed sample is too old."""
-        if self._queue.qsize() + self._log.backlog >= self._waiting:
+        if self._queue.qsize() + self._log.backlog >= self._waiting_limit:
             return True
-        since = self._unsafe_s
-        return since is not None and time.monotonic() - since > self._most_lost_s
+        unflushed_since_s = self._unflushed_since_s
+        return unflushed_since_s is not None and time.monotonic() - unflushed_since_s > self._most_lost_s
 
     def close(self, *, interrupted: bool = False) -> None:
         """Write all waiting samples and finish the log.
@@ -207,21 +209,21 @@ class SampleWriter:
 
     def _write_waiting(self) -> None:
         flushed_s = drained_s = time.monotonic()
-        ended = False
-        while not ended:
-            now = time.monotonic()
-            samples, ended = self._waiting_samples()
+        is_ended = False
+        while not is_ended:
+            now_s = time.monotonic()
+            samples, is_ended = self._waiting_samples()
             # after a full batch, the remaining samples may have waited since the last complete drain
-            drained_s = now if len(samples) < _TOGETHER else drained_s
+            drained_s = now_s if len(samples) < _TOGETHER else drained_s
             self._record(samples, self._messages.take())
             self._report_events()
             # a decision is written before the samples that follow it
-            while self._drains and len(messages := self._messages.take()):
+            while self._drains_messages and len(messages := self._messages.take()):
                 self._record([], messages)
             if self._messages.failure is None and time.monotonic() - flushed_s >= FLUSH_S:
                 self._try(self._log.flush)
                 flushed_s = time.monotonic()
-                self._unsafe_s = drained_s if self._queue.qsize() else None
+                self._unflushed_since_s = drained_s if self._queue.qsize() else None
         # messages that were queued until the recorder was closed
         while len(messages := self._messages.take()):
             self._record([], messages)
@@ -240,24 +242,26 @@ class SampleWriter:
             trace = Trace.from_samples(samples)
         except Exception as error:
             # only the samples before the faulty one are written
-            sound = encodable(samples)
-            self._try(lambda: self._log.add(sound, Trace.from_samples(sound), messages))
+            encodable_samples = encodable(samples)
+            self._try(
+                lambda: self._log.add(encodable_samples, Trace.from_samples(encodable_samples), messages)
+            )
             self._fail(error)
         else:
             self._try(lambda: self._log.add(samples, trace, messages))
 
-    def _try(self, step: Callable[[], None]) -> None:
+    def _try(self, write_step: Callable[[], None]) -> None:
         """Run a step of the writing thread; an error becomes the failure of the recorder."""
         try:
-            step()
+            write_step()
         except Exception as error:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
         """Store an error for the next `write` to raise, because errors of this thread would go unnoticed."""
         if not isinstance(error, SpatialReplayError):
-            what = f"a sample or message could not be written ({type(error).__name__}: {error})"
-            failure = OutputError(f"{self.name} ends here: {what}")
+            failure_text = f"a sample or message could not be written ({type(error).__name__}: {error})"
+            failure = OutputError(f"{self.name} ends here: {failure_text}")
             failure.__cause__ = error
             error = failure
         self._messages.failure = error
@@ -269,7 +273,7 @@ class SampleWriter:
 
     def _waiting_samples(self) -> tuple[list[Sample], bool]:
         """Return gathered samples, and whether the log ends after them."""
-        if self._queue.qsize() < self._enough and not self._log.is_busy:
+        if self._queue.qsize() < self._wake_count and not self._log.is_busy:
             with suppress(queue.Empty):
                 self._bell.get(timeout=self._log.gather_s)
         samples: list[Sample] = []
@@ -359,7 +363,7 @@ class Recorder(SampleWriter):
             log: RecorderLog = FileLog(self._path, files, about, durability, overwrite=overwrite)
         else:
             log = self._clips = ClipLog(self._path, files, about, trigger)
-        self._entered = ExitStack()
+        self._exit_stack = ExitStack()
         self._files = tuple(files)
         self._box: BlackBox | None = None
         # with a trigger, samples stay in memory on purpose, so their age is not limited
@@ -388,7 +392,7 @@ class Recorder(SampleWriter):
 
         self._refuse_planner(planner)
         self._box = BlackBox(planner, self._write_decision, timings=timings)
-        self._drains = True
+        self._drains_messages = True
 
     def _refuse_planner(self, planner: Planner) -> None:
         if self._box is not None:
@@ -397,8 +401,8 @@ class Recorder(SampleWriter):
             remedy = "open a Recorder without a trigger, and with block=True"
             raise UsageError(f"{self.name} may drop samples, and decisions depend on all of them; {remedy}")
         if planner.specification not in self._files:
-            name, remedy = planner.specification.filename, "open the Recorder with planner=planner"
-            raise UsageError(f"{self.name} does not record {name}, the planner's specification; {remedy}")
+            filename, remedy = planner.specification.filename, "open the Recorder with planner=planner"
+            raise UsageError(f"{self.name} does not record {filename}, the planner's specification; {remedy}")
         if self._last_ns >= 0 or planner.has_observed:
             raise UsageError("decisions depend on all samples; attach a new planner before the first one")
 
@@ -514,11 +518,11 @@ class Recorder(SampleWriter):
         return () if self._clips is None else self._clips.take_remarks()
 
     def __enter__(self) -> Self:
-        self._entered.enter_context(terminable())
+        self._exit_stack.enter_context(terminable())
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with self._entered:
+        with self._exit_stack:
             self.close(interrupted=error is not None)

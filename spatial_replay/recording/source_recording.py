@@ -82,13 +82,13 @@ def record_source(
     tally = _Tally()
     traces = _traces(source, tally)
     # a source without samples raises before the output is created
-    first = next(traces)
+    first_trace = next(traces)
     about = {"source": source.name, "options": json.dumps(dict(source.options))}
     about |= _units_metadata(source, unit)
     stream = open_output(output, durability)
     try:
         with leaving(output), stream, recording_in(stream, files, about) as (_, recording):
-            for trace in chain([first], traces):
+            for trace in chain([first_trace], traces):
                 with uninterrupted():
                     recording.add(trace)
                 advance(len(trace))
@@ -117,15 +117,15 @@ def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:
     Raises:
         LogError: the source has no samples, or cannot be read.
     """
-    any_sample = False
+    has_samples = False
     for block in read_blocks(source):
         tally.add(block.trace)
         tally.remarks += block.remarks
         tally.doubts += block.doubts
         if len(block.trace):
-            any_sample = True
+            has_samples = True
             yield block.trace
-    if not any_sample:
+    if not has_samples:
         raise LogError("; ".join([f"{source.name} has no sample", *tally.faults[:1]]))
 
 
@@ -137,11 +137,11 @@ def recording_in(
     known: Sequence[SpecAutomaton] = (),
 ) -> Iterator[tuple[LogWriter, Recording]]:
     """Begin a log, and always write its end after the block; after an error it is marked as interrupted."""
-    interrupted = True
+    is_interrupted = True
 
     def end() -> None:
         with uninterrupted():
-            recording.end(RunEnd(interrupted))
+            recording.end(RunEnd(is_interrupted))
             writer.close()
 
     with ExitStack() as ending:
@@ -151,7 +151,7 @@ def recording_in(
             recording = Recording(writer, files, about, known)
             ending.callback(end)
         yield writer, recording
-        interrupted = False
+        is_interrupted = False
 
 
 class _Tally:
@@ -159,33 +159,33 @@ class _Tally:
 
     def __init__(self) -> None:
         self._times: list[int] = []
-        self._names: set[str] = set()
-        self._signals: set[str] = set()
+        self._object_names: set[str] = set()
+        self._signal_names: set[str] = set()
         self.faults: list[str] = []
         self.remarks: list[str] = []
         self.doubts: list[Doubt] = []
-        self._samples = self._unreadable = 0
+        self._sample_count = self._unreadable_count = 0
 
     def add(self, trace: Trace) -> None:
-        self._samples += len(trace)
+        self._sample_count += len(trace)
         self.faults += trace.faults
-        self._unreadable += trace.unreadable_count
-        self._names.update(trace.names)
-        self._signals.update(trace.signals)
+        self._unreadable_count += trace.unreadable_count
+        self._object_names.update(trace.names)
+        self._signal_names.update(trace.signals)
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
 
     def summary(self, name: str, files: Sequence[Specification]) -> Recorded:
-        names, signals = sorted(self._names), sorted(self._signals)
-        remarks = [remark for file in files for remark in check_names(file, names, signals)]
+        object_names, signal_names = sorted(self._object_names), sorted(self._signal_names)
+        remarks = [remark for file in files for remark in check_names(file, object_names, signal_names)]
         doubts = (doubt.remark(name) for doubt in dict.fromkeys(self.doubts))
         return Recorded(
-            self._samples,
+            self._sample_count,
             self._times[0],
             self._times[-1],
-            tuple(names),
+            tuple(object_names),
             counted_from(self.faults, self._times[0]),
-            self._unreadable,
+            self._unreadable_count,
             tuple(remark for remark in remarks if remark.severity == "error"),
             counted_from((*doubts, *self.remarks), self._times[0]),
         )
