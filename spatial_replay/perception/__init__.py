@@ -1,6 +1,6 @@
-"""Cameras: frames to tags, tags to objects with their uncertainty, objects to samples.
+"""Cameras: detected tags, poses of tagged objects with their uncertainty, and samples.
 
-Names are loaded when they are first used.
+Each name is imported at its first use.
 """
 
 from __future__ import annotations

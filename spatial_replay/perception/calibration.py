@@ -28,13 +28,16 @@ _LEAST_TAGS: Final = 4
 _LEAST_VIEWS: Final = 6
 _MOST_VIEWS: Final = 60
 _APART: Final = 0.04
-"""Least shift of tags between two views, as a share of the image's width; equal views add nothing."""
+"""Least shift of a tag between two views, fraction of the image's width; equal views add nothing."""
 
 _LOOSE: Final = 0.02
-"""Largest relative standard deviation of the focal length; above it, the views were too much alike."""
+"""Largest relative standard deviation of the focal length; above it, the views are too similar."""
 
 _WRONG: Final = 8.0
-"""Error of corners above which the sheet is not the stated one, pixels; a bent sheet is far below."""
+"""Largest root mean square error of corners, pixels. A larger error means another sheet than the stated one.
+
+The error of a bent sheet is far smaller.
+"""
 
 _WIDE: Final = 0.6
 """Least share of the image's width and height that the tags of all views should cover."""
@@ -44,7 +47,7 @@ class Calibrated(NamedTuple):
     """A calibration with remarks on its quality.
 
     Attributes:
-        views: number of frames behind the calibration.
+        views: number of frames that the calibration uses.
         remarks: advice for a better calibration.
     """
 
@@ -216,7 +219,7 @@ class TagSheet:
         return self._columns * self._rows
 
     def references(self) -> tuple[MountedTag, ...]:
-        """Return the tags of the first page at their places, in metres from its lower left corner, y up."""
+        """Return the tags of the first page. Places are in metres from the page's lower left corner, y up."""
         _, page_height_mm = PAPERS[self.paper]
         return tuple(
             MountedTag(tag_id, self.size, x_mm / 1e3, (page_height_mm - y_mm) / 1e3)
@@ -224,7 +227,7 @@ class TagSheet:
         )
 
     def write(self, output: Path) -> int:
-        """Write the sheets as PDF, and return the number of pages; equal sheets give equal bytes.
+        """Write the sheets as a PDF, and return the number of pages. Equal sheets give equal bytes.
 
         Raises:
             UsageError: fpdf2 is not installed, or the family lacks a tag.

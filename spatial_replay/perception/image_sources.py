@@ -44,7 +44,7 @@ _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
         "bgra8": (4, (0, 1, 2)),
     }
 )
-"""Encodings of raw images: bytes per pixel, and indices of blue, green and red, or grey, among them."""
+"""Encodings of raw images: bytes per pixel, and the byte indices of blue, green and red, or of grey."""
 
 _CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
     {
@@ -55,18 +55,18 @@ _CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
         "yuyv": (2, "YUV2BGR_YUYV"),
     }
 )
-"""Encodings that OpenCV converts: bytes per pixel, and OpenCV's name of the conversion."""
+"""Encodings that OpenCV converts: bytes per pixel, and the name of OpenCV's conversion."""
 
 _ENCODINGS: Final = (*_CHANNELS, "mono16", *_CONVERTED)
 
 _DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
     {"apriltag_msgs/AprilTagDetectionArray": "detections", "apriltag_msgs/ApriltagArrayStamped": "apriltags"}
 )
-"""Types of messages with detected tags, and their field with the tags."""
+"""Types of messages with detected tags, and the field that has the tags."""
 
 
 class ImageTopic:
-    """Frames of one topic of a log, with images or AprilTag detections, to iterate over once.
+    """Frames of one log topic with images or AprilTag detections. It can be iterated once.
 
     Attributes:
         name: name of the log.
@@ -81,12 +81,13 @@ class ImageTopic:
         """Open the log, and choose the topic.
 
         Args:
-            topic: name of the topic; None for the only topic with images, or else with detections.
+            topic: name of the topic. None chooses the only image topic or, without image topics, the only
+                topic with detections.
 
         Raises:
             MissingFileError: there is no such file.
             LogError: the file is not a log of messages.
-            UsageError: no such topic, a topic of JSON, or not exactly one topic to choose.
+            UsageError: no such topic, a topic of JSON messages, or a choice that is not unique.
         """
         self._reader = open_messages(path)
         self.name = self._reader.name
@@ -140,9 +141,10 @@ class ImageTopic:
             yield from map(_frame, decoder.rest())
 
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
-        """Yield the frame that is shown at each of some increasing times: the last one with an earlier stamp.
+        """Yield the latest frame at or before each of some increasing times.
 
-        Each frame is yielded once, and only the needed frames are decoded. Damaged frames are left out.
+        Several times with the same frame yield it once. Only the necessary frames are decoded. Damaged frames
+        are left out.
 
         Raises:
             UsageError: PyAV is not installed.
@@ -155,7 +157,7 @@ class ImageTopic:
         for frame_index in np.unique(frame_indices[frame_indices >= 0]).tolist():
             stamp_ns = int(frame_times.stamps_ns[frame_index])
             frame_log_ns = int(frame_times.log_times_ns[frame_index])
-            # a video is read from its key frame on, unless the decoder is past it already
+            # a video is read from the key frame, or from the decoder's position if that is later
             key_log_ns = int(frame_times.key_times_ns[frame_index])
             first_log_ns = frame_log_ns if decoder is None else max(key_log_ns, read_until_ns)
             read_until_ns = frame_log_ns + 1
@@ -169,7 +171,8 @@ class ImageTopic:
                     elif message_stamp_ns == stamp_ns:
                         shown_images.append(Shown(message_stamp_ns, _image(content, self._type), True))
             if decoder is not None and not shown_images:
-                # held back because data are missing: the next frame is decoded from its key frame again
+                # the decoder withholds the frame, because data are missing; the next frame begins at its key
+                # frame
                 shown_images += _of_stamp(stamp_ns, decoder.rest())
                 decoder, read_until_ns = H264Decoder(), 0
             image = next((image.image for image in reversed(shown_images) if image.is_true), None)
@@ -177,7 +180,7 @@ class ImageTopic:
                 yield Frame(stamp_ns, image)
 
     def _times_of_frames(self) -> _FrameTimes:
-        """Return the times of all frames, without decoding them."""
+        """Return the times of all frames without decoding images."""
         frame_times: list[tuple[int, int, int]] = []
         key_log_ns = last_stamp_ns = -1
         for message in self._reader.iter_messages({self.topic}):
@@ -195,7 +198,7 @@ class ImageTopic:
 
 
 class _FrameTimes(NamedTuple):
-    """Frames by their increasing stamps: log times, and log times of the key frames before them."""
+    """The increasing stamps of frames, their log times, and the log times of their key frames."""
 
     stamps_ns: Integers
     log_times_ns: Integers
@@ -247,7 +250,6 @@ def _frame(shown: Shown) -> tuple[int, Frame, bool]:
 
 
 def _of_stamp(stamp_ns: int, images: Iterable[Shown]) -> list[Shown]:
-    """Return the images with a stamp."""
     return [image for image in images if image.of == stamp_ns]
 
 
@@ -314,10 +316,11 @@ def _stamp_ns(message: Any) -> int:
 def open_frames(
     path: str | PathLike[str] | LogFile, *, topic: str | None = None, rate: float | None = None
 ) -> VideoFile | ImageTopic:
-    """Open a video, or a topic of a log with images or AprilTag detections; the content decides which it is.
+    """Open a video, or a log topic with images or AprilTag detections. The file's content decides the type.
 
     Args:
-        topic: topic of a log; None for the only topic with images, or else with detections.
+        topic: topic of a log. None chooses the only image topic or, without image topics, the only topic with
+            detections.
         rate: frames per second of a video, which replace its own stamps.
 
     Raises:
@@ -339,7 +342,7 @@ def open_frames(
 
 
 class CameraFrames:
-    """Frames of a camera until it is unplugged, to iterate over once; times count from the first frame.
+    """Frames of a camera until it is unplugged. It can be iterated once; times count from the first frame.
 
     Attributes:
         name: name, such as "camera 0".
@@ -357,7 +360,8 @@ class CameraFrames:
 
         Args:
             length_ns: time after which the frames end; None for no limit.
-            opened: function that opens the camera; its value has `read` and `release`, as OpenCV's captures.
+            opened: function that opens the camera; its result has `read` and `release`, like OpenCV's
+                captures.
 
         Raises:
             UsageError: there is no such camera, or OpenCV is not installed.
@@ -378,7 +382,7 @@ class CameraFrames:
                         f"{self.name} gives no more pictures after {last_ns / 1e9:.3f} s; is it unplugged?"
                     )
                     return
-                # the wall clock may be set while the camera runs
+                # monotonic, because the wall clock may be adjusted while the camera runs
                 now_ns = time.monotonic_ns()
                 first_ns = now_ns if first_ns is None else first_ns
                 last_ns = max(now_ns - first_ns, last_ns + 1)

@@ -30,13 +30,13 @@ _STEP: Final = 1e-3
 """Step of corners in numerical derivatives, pixels."""
 
 _SIZE_TOLERANCE: Final = 0.02
-"""Relative error of a tag's stated size, which is allowed in addition to noise."""
+"""Allowed relative error of a tag's stated size, in addition to noise."""
 
 _LEANING: Final = math.radians(3.0)
 """Standard deviation of the tilt of a carried object, radians."""
 
 _LEFT_OVER: Final = 4
-"""Degrees of freedom of a fitted tag: eight coordinates, less two of its place, its yaw and its size."""
+"""Degrees of freedom of a fitted tag: eight coordinates minus four unknowns (x, y, yaw, size)."""
 
 _SMALL: Final = 1e-6
 _ITERATIONS: Final = 5
@@ -46,12 +46,12 @@ class ObjectPose(NamedTuple):
     """Pose of an object from one of its tags.
 
     Attributes:
-        place: (3,), x, y, and height above its resting height in the tags file.
+        place: (3,), x, y, and height above the resting height of the tags file.
         yaw: orientation, radians.
         spread: (4, 4), covariance of x, y, z, yaw from the errors of corners.
         shared: (2, 2), covariance of x, y from the error of the plane, which nearby objects share.
-        parallax: largest error of the place because the height of its tag is not resolved.
-        doubt: reason why the pose is wrong; None if there is no reason.
+        parallax: largest error of the place from the unresolved height of the tag.
+        doubt: reason to distrust the pose, or None.
         misfit: distance of the corners from the fitted tag, pixels per degree of freedom.
     """
 
@@ -72,7 +72,7 @@ def poses_on_plane(
     Args:
         corners: (N, 4, 2), corners of one tag of each object, pixels.
         tags: the N tags.
-        sigmas: number of standard deviations from which the size of a tag in the image makes a doubt.
+        sigmas: deviation of a tag's size in the image from which its pose has a doubt, standard deviations.
     """
     if not tags:
         return []
@@ -80,7 +80,7 @@ def poses_on_plane(
     sizes = np.array([tag.size for tag in tags])
     tag_offsets = np.array([(tag.x, tag.y) for tag in tags])
     tag_yaws = np.array([tag.yaw for tag in tags])
-    # each tag unchanged, and with each of its eight coordinates moved by a step up and down
+    # 17 copies of each tag: unchanged, and with each of the eight coordinates moved by a step up or down
     corner_steps = np.concatenate([np.zeros((1, 8)), _STEP * np.eye(8), -_STEP * np.eye(8)]).reshape(17, 4, 2)
     corner_places = plane.places(
         corners[:, None] + corner_steps, np.broadcast_to(z[:, None, None], (len(tags), 17, 4))
@@ -177,8 +177,8 @@ def _misfits(plane: Plane, corners: Floats, squares: Floats, heights: Floats) ->
 def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: float) -> ObjectPose | None:
     """Return the pose of an object that may be above the plane; None if no pose fits.
 
-    Objects are taken as upright within a few degrees, also in the robot's hand. The tilt of a small tag is
-    hardly visible, and two poses that lean to opposite sides look alike.
+    Objects are assumed to be upright within a few degrees, also in the robot's hand. An image hardly shows
+    the tilt of a small tag, and poses that lean to opposite sides look alike.
 
     Args:
         corners: (4, 2), corners of the tag, pixels.
@@ -253,7 +253,7 @@ def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     if len(poses) == 1:
         return poses[0]
     first_yaw = poses[0].yaw
-    # yaws within half a turn of the first one, so that their mean is between them
+    # yaws are shifted to within half a turn of the first yaw, so that their mean lies between them
     pose_states = np.array(
         [[*pose.place, first_yaw + math.remainder(pose.yaw - first_yaw, 2 * math.pi)] for pose in poses]
     )
@@ -261,7 +261,7 @@ def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
     weights = [np.linalg.pinv(pose.spread, hermitian=True, rcond=1e-12) for pose in poses]
     spread = np.linalg.pinv(sum(weights, np.zeros((4, 4))), hermitian=True, rcond=1e-12)
     mean_state = spread @ sum((w @ x for w, x in zip(weights, pose_states, strict=True)), np.zeros(4))
-    # tags that contradict each other beyond noise are misplaced in the file: the spread covers that
+    # if tags contradict each other beyond noise, the file misplaces them: the spread covers their distance
     deviations = pose_states - mean_state
     reduced_chi_square = sum(float(x @ w @ x) for w, x in zip(weights, deviations, strict=True)) / max(
         3 * (len(poses) - 1), 1
@@ -303,8 +303,8 @@ def simultaneous(
 ) -> Iterator[tuple[Frame | None, ...]]:
     """Yield the frames of each time, one for each camera; None for a camera without a frame at that time.
 
-    Frames belong together if they are at most half of the shortest frame interval of all cameras apart. At
-    most two frames of a camera are read ahead. When one camera ends, the others continue.
+    Frames within half of the cameras' shortest frame interval belong together. At most two frames of a camera
+    are read ahead. When one camera ends, the other cameras continue.
 
     Args:
         cameras: frames of each camera, with increasing times.
@@ -315,7 +315,7 @@ def simultaneous(
         _shift(frames, offset_ns) for frames, offset_ns in zip(cameras, camera_offsets_ns, strict=True)
     ]
     if len(cameras) == 1:
-        # the frames of a single camera need no read ahead
+        # a single camera needs no read-ahead
         yield from ((frame,) for frame in shifted_cameras[0])
         return
     read_ahead = [_ReadAhead(frames) for frames in shifted_cameras]
@@ -347,18 +347,18 @@ class _ReadAhead:
 
     @property
     def gap_ns(self) -> int:
-        """Time between the next two frames; 0 if there are not two."""
+        """Time between the next two frames; 0 without a second frame."""
         return 0 if self._second_frame is None else self._second_frame.time_ns - self.time_ns
 
     def take(self) -> Frame | None:
-        """Return the next frame, and read another one."""
+        """Return the next frame, and read one more frame ahead."""
         frame, self.next_frame = self.next_frame, self._second_frame
         self._second_frame = next(self._frames, None)
         return frame
 
 
 def camera_names(cameras: Sequence[Any]) -> list[str]:
-    """Return the names of cameras: the topic, or else the name of the video; "" for frames without a name.
+    """Return the name of each camera: its topic, the name of its video, or "" for frames without a name.
 
     Raises:
         UsageError: there is no camera.
@@ -376,7 +376,7 @@ _MOST_AVERAGED: Final = 30
 _MOST_NAMED: Final = 8
 
 _LATE: Final = 8
-"""Number of latest frames whose largest misfit counts; one frame has only four degrees of freedom."""
+"""Number of frames whose largest misfit counts, because one frame has only four degrees of freedom."""
 
 _SHARED: Final = 1.2
 """Ratio of a pose's error to its misfit; a codec moves blocks of pixels, so corners share errors.
@@ -385,10 +385,10 @@ In videos with crf 23 to 36, the root mean square error of a pose was up to 1.2 
 """
 
 _BLURRED: Final = 2.0
-"""Ratio of a tag's error to the error of the reference tags, above which there is a remark."""
+"""Ratio of a tag's error to the reference tags' error; larger ratios give a remark."""
 
 _MOVED: Final = 2.0
-"""Median shift of the reference tags above which the camera has moved, pixels."""
+"""Largest median shift of the reference tags while the camera rests, pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -414,7 +414,7 @@ class CameraView:
         tags: tags file of this camera.
         fit: fit of the reference tags; None without reference tags.
         seen: number of frames with each tag.
-        twice: number of frames with a tag more than once, by tag.
+        twice: number of frames that show a tag more than once, by tag.
         moved: number of moves of the camera.
         frames: number of frames.
     """
@@ -543,8 +543,8 @@ class CameraView:
     def _with_misfits(self, plane: Plane, tag_id: int, pose: ObjectPose) -> ObjectPose:
         """Return the pose with a spread that covers the latest misfits of its tag.
 
-        Reference tags rest, and a codec sharpens resting parts of a video. So their misfits do not show the
-        errors of moving tags.
+        Reference tags rest, and a codec sharpens resting parts of a video. So the misfits of reference tags
+        do not show the errors of moving tags.
         """
         if self.tags.corner_error is not None or pose.doubt is not None:
             return pose
@@ -655,7 +655,7 @@ class TagObserver:
 
         Args:
             hold_ns: time that a hidden object is held; None for the time in the tags file.
-            cameras: names of the cameras, such as of their videos; by default, one camera.
+            cameras: names of the cameras, such as the names of their videos; by default, one camera.
 
         Raises:
             UsageError: a negative time, a camera that the tags file lacks, or OpenCV is not installed.
@@ -687,10 +687,10 @@ class TagObserver:
         """Return the observation of the frames of one time.
 
         The sample has the stamp of the first frame. Other frames may be earlier or later. An object that only
-        they show is less certain by its possible motion in between.
+        other frames show is less certain by its possible motion between the stamps.
 
         Args:
-            frames: a frame of each camera; None for a camera without a frame, but not for all cameras.
+            frames: one frame or None for each camera; at least one frame.
 
         Raises:
             UsageError: a frame that is not later than the previous one, a camera that is calibrated for
@@ -763,7 +763,7 @@ class TagObserver:
                 yield tagged.name, min(candidates, key=lambda tracked: tracked.uncertainty)
 
     def _compare(self, tagged: TaggedObject, poses: Sequence[ObjectPose]) -> None:
-        """Note an object if places from its tags are further apart than its size plus their uncertainty."""
+        """Record an object whose tags give places further apart than its size plus their uncertainty."""
         if len(poses) < 2:
             return
         outline = self._outlines[tagged.name]
@@ -790,7 +790,7 @@ class TagObserver:
         )
 
     def _hold(self, time_ns: int, objects: Mapping[str, TrackedObject]) -> dict[str, TrackedObject]:
-        """Return the held objects; store the places of visible objects and the names of unknown ones."""
+        """Return the held objects; store the places of visible objects and the names of unknown objects."""
         held_objects: dict[str, TrackedObject] = {}
         for tagged in self.tags.objects:
             if tagged.name in objects:
@@ -864,7 +864,7 @@ def observe_cameras(
 
 
 def _outline(footprint: Footprint) -> Floats:
-    """Return the vertices (K, 2) of a footprint, which move furthest in a turn; rounding does not matter."""
+    """Return the vertices (K, 2) of a footprint, the points that a turn moves furthest."""
     return np.concatenate([part.vertices for part in footprint.parts])
 
 

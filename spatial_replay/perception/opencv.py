@@ -1,7 +1,7 @@
 """Frames, detection of tags, camera poses and geometry; only this module imports OpenCV.
 
 Pixel coordinates are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down.
-Other detectors of AprilTags count from the outer corner of that pixel, half a pixel further;
+Other AprilTag detectors count from that pixel's outer corner, so their coordinates are half a pixel larger.
 `corners_from_apriltag` converts their corners.
 """
 
@@ -32,7 +32,7 @@ _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 NO_IMAGE: Final[Image] = np.zeros((0, 0), np.uint8)
-"""Image of a frame of which only the tags are stored."""
+"""Image of a frame whose log stores only the tags."""
 NO_IMAGE.setflags(write=False)
 
 
@@ -59,7 +59,7 @@ class Frame:
         time_ns: its stamp, on the clock of the samples.
         image: (height, width) grey, or (height, width, 3) blue, green, red.
         data: H.264 in Annex B form from a video, or the message from a topic; b"" if it cannot be copied.
-        detections: tags that a robot detected in an image that is not stored; None to detect the tags.
+        detections: tags that a robot detected, without their image; None to detect tags in `image`.
 
     Raises:
         UsageError: the image has another shape or type, or is empty.
@@ -83,7 +83,7 @@ class Frame:
 def encoded_size(data: bytes) -> tuple[int, int] | None:
     """Return the width and height in the header of a JPEG, PNG or WebP image; None for other data.
 
-    Nothing is decoded, so a too large image can be refused before it takes memory.
+    The image is not decoded, so a too large image can be refused before it takes memory.
     """
     try:
         if data.startswith(_PNG):
@@ -171,24 +171,24 @@ def rotations(vectors: Floats) -> Floats:
 # --------------------------------------------------------------------------- corners to a fraction of a pixel
 
 _ALONG: Final = 24
-"""Number of places along an edge at which its step of brightness is measured."""
+"""Number of places along an edge at which its brightness step is located."""
 
 _MARGIN: Final = 0.1
-"""Share of an edge that is left out at each end, close to the other edges."""
+"""Fraction of an edge that is skipped at each end, next to the other edges."""
 
 _APART: Final = 0.25
-"""Distance of two places across an edge, pixels."""
+"""Distance of two samples across an edge, pixels."""
 
 _CELLS: Final = 0.6
-"""Search range across an edge, cells of the tag; further away, there are other edges."""
+"""Search range across an edge, cells of the tag; other edges are further away."""
 
 _WIDEST: Final = 3.0
 _SECOND: Final = 0.5
-"""Largest search range, pixels; share of the range in the second pass, which starts close to the edge."""
+"""Largest search range, pixels, and fraction of the range in the second pass, which starts near the edge."""
 
 
 def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:
-    """Refine corners of tags; the corners of a tag whose edges are not found stay unchanged.
+    """Refine corners of tags. A tag whose edges are not found keeps its corners.
 
     Args:
         corners: (N, 4, 2), in pixels, in the order of a `Detection`, at most two pixels off.
@@ -205,7 +205,7 @@ def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Flo
     edge_vectors = np.roll(corners, -1, axis=1) - corners
     edge_lengths = np.linalg.norm(edge_vectors, axis=2)
     edge_directions = edge_vectors / edge_lengths[..., None]
-    # y points down in images, so this points out of a tag whose corners are in our order
+    # y points down in images, so the normals point out of a tag with our order of corners
     outward_normals = np.stack([-edge_directions[..., 1], edge_directions[..., 0]], axis=-1)
     search_ranges = np.minimum(_CELLS * edge_lengths.min(axis=1) / cells, _WIDEST) * range_share
     edge_shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
@@ -226,7 +226,7 @@ def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Flo
     with np.errstate(divide="ignore", invalid="ignore"):
         step_offsets = (step_weights * offsets).sum(axis=-1) / total_weights
     total_weights = np.where(np.isfinite(step_offsets), total_weights, 0.0)
-    # a line through the steps of each edge, offset = a + b * share, with little weight on faint steps
+    # fit a line to the steps of each edge, offset = a + b * share; faint steps have little weight
     line_weights = np.minimum(total_weights, np.median(total_weights, axis=-1, keepdims=True))
     weight_moments = [(line_weights * edge_shares**power).sum(axis=-1) for power in range(3)]
     step_offsets = np.nan_to_num(step_offsets)
@@ -248,9 +248,9 @@ def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Flo
 
 
 def _bilinear(grey: Image, points: Floats) -> Floats:
-    """Interpolate an image between its pixels; beyond its border, values are those at the border."""
+    """Interpolate an image between its pixels. Points beyond the border have the value at the border."""
     height, width = grey.shape
-    # below the last pixel, so that its next neighbour exists
+    # less than the last pixel, so that the next pixel exists
     x = np.clip(points[..., 0], 0, width - 1.001)
     y = np.clip(points[..., 1], 0, height - 1.001)
     columns, rows = x.astype(np.int64), y.astype(np.int64)
@@ -294,7 +294,7 @@ FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
         "36h11": "DICT_APRILTAG_36h11",
     }
 )
-"""Families of AprilTags, and OpenCV's names of them."""
+"""AprilTag families and their names in OpenCV."""
 
 FAMILY_SIZES: Final[Mapping[str, int]] = MappingProxyType(
     {"16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
@@ -358,14 +358,15 @@ class TagDetector:
         parameters = cv2.aruco.DetectorParameters()
         # OpenCV's own refinement is half a pixel off on small tags; see `refined_corners`
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        # at most two bits are corrected (36h11; three by default), as a wrong tag is worse than a hidden one
+        # at most two bits of a 36h11 tag are corrected (default three): a wrong tag is worse than a hidden
+        # tag
         parameters.errorCorrectionRate = 0.4
         dictionary = _dictionary(family)
         self._cells = dictionary.markerSize + 2
         self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
     def detect(self, image: Image) -> list[Detection]:
-        """Return the tags in a grey or coloured image, by id, then from left to right."""
+        """Return the tags in a grey or coloured image, sorted by id, then from left to right."""
         grey = image if image.ndim == 2 else _load().cvtColor(image, _load().COLOR_BGR2GRAY)
         grey = np.ascontiguousarray(grey)
         corners, ids, _ = self._detector.detectMarkers(grey)
@@ -483,7 +484,7 @@ def convert(pixels: Image, conversion: str) -> Image:
     """Return pixels (height, width, bytes) as blue, green, red, by a conversion of OpenCV.
 
     Raises:
-        LogError: the image is too small for it, or has an odd width.
+        LogError: the image is too small for the conversion, or has an odd width.
     """
     cv2 = _load()
     try:

@@ -1,8 +1,8 @@
 """The plane of the objects: conversion of pixels to places, and the uncertainty of places.
 
-A plane is a homography from reference tags, the view of a calibrated camera, or the image itself. The pose of
-the camera is given or from reference tags. A plane from reference tags has a covariance, so that a place far
-from all of them is less certain.
+A plane is a homography from reference tags, the view of a calibrated camera, or the image itself. The tags
+file states the pose of a camera, or reference tags determine it. A plane from reference tags has a
+covariance, so that a place far from all reference tags is less certain.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection, rotations
 from spatial_replay.perception.tags_file import MountedTag, TagsFile
 
-# with 0.1, 99.5 % of the outlines in 538 frames of a planned run held the truth; a larger value makes
-# lifted objects too uncertain to judge
+# with 0.1, 99.5 % of the outlines in 538 frames of a planned run contained the true outline; a larger value
+# makes lifted objects too uncertain to judge
 LEAST_CORNER_ERROR: Final = 0.1
-"""Least standard deviation of a corner, pixels, however well reference tags fit."""
+"""Least standard deviation of a corner, pixels, even if reference tags fit better."""
 
 USUAL_CORNER_ERROR: Final = 0.3
 """Standard deviation of a corner if reference tags do not measure it, pixels."""
 
 _WORST_RESIDUAL: Final = 3.0
-"""Largest error of a reference tag from noise, pixels; a larger error is a wrong place."""
+"""Largest error of a reference tag from noise, pixels; a larger error means a wrong place."""
 
 _LEAST_SLANT: Final = math.sin(math.radians(8.0))
-"""Sine of the angle to the plane below which it is seen edge-on; at lower angles, no tags are found."""
+"""Sine of the least angle between view and plane; at lower angles, no tags are detected."""
 
 _WIDEST: Final = 1.0
-"""Half of the image's diagonal of an uncalibrated camera, focal lengths: 90 degrees between corners."""
+"""Assumed half diagonal of an uncalibrated image, focal lengths: 90 degrees between opposite corners."""
 
 _STEP: Final = 1e-6
 
@@ -60,7 +60,7 @@ class Fit(NamedTuple):
     """Fit of a plane to reference tags.
 
     Attributes:
-        rms: root mean square error of their corners, pixels.
+        rms: root mean square error of the tags' corners, pixels.
         worst: tag with the largest error, and mean error of its corners, pixels.
     """
 
@@ -95,7 +95,7 @@ class HomographyPlane:
 
     Attributes:
         pixel_from_plane: (3, 3), homography with the last entry 1.
-        spread: (8, 8), covariance of the other entries.
+        spread: (8, 8), covariance of the other eight entries.
         size: (width, height) of the images, pixels; (0, 0) if it is not known.
     """
 
@@ -145,7 +145,7 @@ class HomographyPlane:
         greater_singulars, lesser_singulars = np.linalg.svd(local_jacobians, compute_uv=False).T
         size_px = np.array(self.size, np.float64)
         half_diagonal_px = float(np.linalg.norm(size_px)) / 2
-        # without images, the image is assumed to reach as far as the detections
+        # without images, the outermost detection is assumed to be in the image's corner
         focal_px = (half_diagonal_px or float(np.linalg.norm(pixels, axis=1).max()) / 2) / _WIDEST
         off_axis = (
             np.linalg.norm(pixels - (size_px - 1) / 2, axis=1) / focal_px if half_diagonal_px else _WIDEST
@@ -229,7 +229,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     _refuse_misfit(tags, references, tag_errors_px, seen_corners, known_corners)
     corner_error_px = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
     flat_derivative = derivative.reshape(-1, unknown_count)
-    # an error of a tag's place moves its corners by this many pixels per unit
+    # corners move by this many pixels for an error of one unit in a tag's place
     pixels_per_unit = _pixels_per_unit(seen_corners, known_corners)
     variance = corner_error_px**2 + (tags.reference_error * pixels_per_unit) ** 2
     # covariance of a least squares fit: variance (J^T J)^-1
@@ -244,7 +244,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
 
 
 def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
-    """Return the plane that a tags file determines without images; None if that takes reference tags.
+    """Return the plane that a tags file determines without images; None if reference tags must determine it.
 
     Args:
         size: (width, height) of the images in pixels.
@@ -285,7 +285,7 @@ def _cast(directions: Floats, rotation: Floats, shift: Floats, z: Floats) -> Flo
 
 
 def _homography_jacobian(matrix: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Map points (N, 2); return them and their derivative (N, 2, 8) by the first eight entries."""
+    """Return mapped points (N, 2), and their derivative (N, 2, 8) by the first eight matrix entries."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     u, v, w = homogeneous.T
     x, y = points.T
@@ -311,7 +311,7 @@ def _refuse_misfit(
     seen_corners: Floats,
     known_corners: Floats,
 ) -> None:
-    """Check that no tag's error in `off` (K,), pixels, exceeds noise and the stated error of places."""
+    """Check that no error of a tag, (K,), exceeds noise plus the stated error of places."""
     limit_px = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen_corners, known_corners)
     if tag_errors_px.max() <= limit_px:
         return
@@ -349,10 +349,10 @@ def _refuse_misfit(
 def _off_alone(
     tags: TagsFile, seen_corners: Floats, known_corners: Floats
 ) -> tuple[int, float, float] | None:
-    """Find the tag without which the other tags fit best; None if no fit exists.
+    """Find the tag whose removal gives the best fit of the other tags; None without any fit.
 
     Returns:
-        its index, its error in the fit of the others, and the largest error of the others, pixels.
+        index of the tag, its error in the fit of the other tags, and the largest error of these, pixels.
     """
     candidates: list[tuple[float, int, float]] = []
     for tag_index in range(len(known_corners) // 4):
@@ -370,7 +370,7 @@ def _off_alone(
 
 
 def _solve(known_corners: Floats, seen_corners: Floats, camera: Camera | None) -> Floats | None:
-    """Fit the homography (3, 3), or a camera's pose (6,), from places to pixels; None if there is none."""
+    """Fit the homography (3, 3), or a camera's pose (6,), from places to pixels; None without a solution."""
     if camera is not None:
         return fit_pose(_flat(known_corners), seen_corners, camera)
     homography = fit_homography(known_corners, seen_corners)

@@ -33,7 +33,7 @@ _ANGLE: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*deg")
 
 @dataclass(frozen=True, slots=True)
 class MountedTag:
-    """A tag on an object, in the object's frame, or a reference tag, in the plane.
+    """A tag in the frame of its object, or a reference tag in the frame of the plane.
 
     Attributes:
         id: number of the tag.
@@ -76,8 +76,8 @@ class TaggedObject:
     Attributes:
         footprint: footprint in the object's frame.
         height: (bottom, top) above the plane, or None.
-        is_lifted: whether it may leave the plane; then the poses of its tags are fitted in space.
-        fastest: highest speed, at which the uncertainty of a held object grows, units per second.
+        is_lifted: whether the object may leave the plane; its tags then have poses in space.
+        fastest: highest speed, footprint units per second; the uncertainty of a held object grows at it.
     """
 
     name: str
@@ -98,7 +98,7 @@ class TagsFile:
         family: family of all its tags.
         is_image: whether the plane is the image itself, in pixels.
         references: tags with known places.
-        camera: calibrated camera; None if it is not calibrated.
+        camera: model of the camera; None if it is not calibrated.
         pose: (6,), rotation vector and translation from the plane's frame to the camera's; None if it comes
             from reference tags.
         cameras: camera and pose of each of several cameras, by name or number; replaces `camera` and `pose`.
@@ -232,7 +232,6 @@ def _object(
     defaults: Mapping[str, Any],
     reference_height: float,
 ) -> TaggedObject:
-    """Return an object; `level` is the height of the reference tags."""
     height_entry = entry.get("height")
     heights = None if height_entry is None else (_length(height_entry[0]), _length(height_entry[1]))
     # an image has no heights; a tag on an object without a height is as high as the reference tags
@@ -428,7 +427,7 @@ def _reach(point_entries: Any) -> float:
 
 
 def _beyond(length_entry: Any, reach_m: float) -> str:
-    """Return the fault of a length without a unit that exceeds `reach`; "" for a smaller length."""
+    """Return the fault of a length without a unit that exceeds `reach_m`; "" without a fault."""
     length = max(_plain_numbers(length_entry), default=0.0)
     if length <= reach_m:
         return ""

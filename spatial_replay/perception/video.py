@@ -1,7 +1,8 @@
-"""Video files and H.264 frames: decoding, encoding and writing; the only module that imports PyAV.
+"""Video files and H.264 frames: decoding, encoding and writing. Only this module imports PyAV.
 
-A predicted frame depends on earlier frames. If one of them is missing or damaged, a decoder invents the
-missing parts: its images are outdated or incomplete until the next key frame. Such a frame is not true.
+A predicted frame depends on earlier frames. If an earlier frame is missing or damaged, a decoder invents the
+missing parts: images are outdated or incomplete until the next key frame. A frame with such an image is
+called not true.
 
 A log stores video as H.264 in Annex B form. `foxglove.CompressedVideo` demands one frame per message,
 parameter sets before each key frame, and no B frames.
@@ -93,7 +94,7 @@ class Decoder:
     """Decodes the packets of one stream to frames in display order."""
 
     def __init__(self, context: Any) -> None:
-        """Prepare a codec context that is not open yet; one thread, because several threads delay frames."""
+        """Prepare an unopened codec context for one thread, because several threads delay frames."""
         av = load_av()
         context.thread_type, context.thread_count = "NONE", 1
         context.options = dict(_OPTIONS)
@@ -110,7 +111,7 @@ class Decoder:
         """Decode a packet; return the finished frames, which may be frames of earlier packets.
 
         Args:
-            packet: packet; None for the frames that are held back, at the end of the stream.
+            packet: packet; None at the end of the stream, for the frames that the codec still holds.
             of: object that is returned with its frame.
 
         Raises:
@@ -158,7 +159,10 @@ class Decoder:
             self._pending.append(pending)
 
     def _skipped_frames(self, pts: int | None) -> Iterator[Decoded]:
-        """Yield empty frames for pending frames before a stamp; some decoders skip frames after a loss."""
+        """Yield empty frames for the pending packets before `pts`, or for all pending packets if it is None.
+
+        Some decoders skip frames after a loss.
+        """
         late_packets = [
             pending_packet
             for pending_packet in self._pending
@@ -219,7 +223,7 @@ class H264Decoder:
                 yield Shown(frame.of, picture(frame), frame.is_true)
 
     def rest(self) -> Iterator[Shown]:
-        """Yield the images that are held back, at the end of the stream."""
+        """Yield the images that the decoder still holds at the end of the stream."""
         if self._is_ready:
             with suppress(load_av().FFmpegError):
                 for frame in self._decoder.decode(None):
@@ -230,8 +234,8 @@ class Untrue:
     """Counts frames that are not true in one run.
 
     Attributes:
-        frames: number of these frames.
-        last: number of these frames after the last true frame.
+        frames: number of frames that are not true.
+        last: number of frames after the last true frame.
     """
 
     def __init__(self) -> None:
@@ -250,7 +254,7 @@ class Untrue:
         self.last += 1
 
     def faults(self, name: str) -> list[str]:
-        """Return the fault of these frames, if there are any."""
+        """Return one sentence on the frames that are not true; [] if all frames are true."""
         if not self.frames:
             return []
         where = f"after {self._first_ns / 1e9:.3f} s"
@@ -308,7 +312,7 @@ def load_av() -> Any:
     with importing("videos need PyAV", extra="vision"):
         import av
         import av.bitstream
-    # FFmpeg would print its messages; errors are raised, and `Decoder` reads the messages of decoders
+    # FFmpeg prints no messages: errors are raised, and `Decoder` reads the messages of codecs
     with suppress(AttributeError):
         av.logging.set_level(None)
         av.logging.set_skip_repeated(False)
@@ -327,7 +331,7 @@ _MOST_BOXES: Final = 1000
 
 
 class VideoFile:
-    """Frames of a video file, to iterate over once; stamps count from the first frame.
+    """Frames of a video file. It can be iterated once; stamps count from the first frame.
 
     Attributes:
         name: name of the file.
@@ -394,7 +398,7 @@ class VideoFile:
 
     @property
     def copy_fault(self) -> str | None:
-        """Reason why its frames cannot be copied into a log unchanged; None if they can."""
+        """Reason why a log cannot store the frames unchanged, or None."""
         context = self._stream.codec_context
         if context.name != "h264":
             return f"{self.name} holds {context.name}, not H.264"
@@ -404,9 +408,9 @@ class VideoFile:
 
     @property
     def remark(self) -> str | None:
-        """Remark that its own stamps are ignored; None without a rate, without stamps, or if they go back.
+        """Remark that the given rate replaces stamps of the file that look right, or None.
 
-        It is final after all frames are read.
+        It is final after all frames are read, because stamps that go back are not right.
         """
         if self._rate is None or not self._has_stamps or self._goes_back:
             return None
@@ -421,7 +425,7 @@ class VideoFile:
         last_ns = previous_ns = -1
         first_stamp_ns, frame_count, longest_gap_ns = None, 0, 0
         untrue = Untrue()
-        # a frame that is not true waits for the next one, because the last frame of a cut file is dropped
+        # a frame that is not true waits for the next frame, because the last frame of a cut file is dropped
         waiting_frame: Frame | None = None
         try:
             length_ns = self._length_ns()
@@ -450,7 +454,7 @@ class VideoFile:
                     yield frame
                 else:
                     waiting_frame = frame
-            # only the last frame is not true, so the file ends within it
+            # only the last frame is not true, so the file ends within that frame
             if untrue.last == untrue.frames == 1:
                 where = (
                     "in its first frame"
@@ -490,7 +494,8 @@ class VideoFile:
         if self.copy_fault is None:
             annex_b_filter = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
         for packet in self._container.demux(self._stream):
-            # FFmpeg guesses pts for an .avi: with B frames, they are out of order and up to 0.2 s late
+            # FFmpeg guesses the pts of an .avi: with B frames, its guesses are out of order and up to 0.2 s
+            # late
             if is_avi:
                 packet.pts = None if is_reordered else packet.dts
             slot = packet.dts if is_reordered and packet.size else None
@@ -519,7 +524,7 @@ class VideoFile:
                 yield decoded._replace(of=b"".join(copies))
 
     def _length_ns(self) -> int:
-        """Return the length of the video in the file's header; 0 if it has none."""
+        """Return the length of the video from the file's header; 0 without one."""
         if self._rate is not None:
             return 0
         stream, container = self._stream, self._container

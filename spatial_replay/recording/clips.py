@@ -1,4 +1,4 @@
-"""Clips, the parts of a run that a recorder writes around a trigger, and conditions of triggers."""
+"""Clips (parts of a run that a recorder writes around a trigger) and conditions of triggers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 
 
 class _Below(NamedTuple):
-    """Threshold below which a robustness falls: certainly, or possibly."""
+    """Threshold of a robustness. A possible condition compares its lower end, a certain one its upper end."""
 
     threshold: float
     is_possible: bool
@@ -96,7 +96,9 @@ class Trigger:
 
 
 def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[Monitor]) -> Condition:
-    """Return the function that checks a condition: from a sample's updates to the reason for firing, or None.
+    """Return the function that checks a condition.
+
+    The function maps a sample's updates to the reason for firing, or to None.
 
     Args:
         monitors: monitors of the specifications, which give the updates.
@@ -104,7 +106,6 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     Raises:
         UsageError: the text is no condition, or names no spec.
     """
-    # the target is a verdict, `EVENT`, `MANUAL` or a threshold
     name, target = _parse_condition(text)
     if target == MANUAL:
         return lambda updates, has_changed: None
@@ -142,7 +143,7 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
 
 
 def _parse_condition(text: str) -> tuple[str, str | _Below]:
-    """Parse a condition into the name of a spec, "" for none, and a verdict, `EVENT`, `MANUAL` or threshold.
+    """Return the spec of a condition, "" for none, and a verdict, `EVENT`, `MANUAL` or a threshold.
 
     Raises:
         UsageError: the text is no condition.
@@ -187,7 +188,7 @@ _MOST_STATIC: Final = 256
 _MOST_EVENTS: Final = 256
 """Maximum number of external events in memory."""
 _MOST_MISSED: Final = 2**18
-"""Maximum number of times of dropped samples in memory, and of dropped messages."""
+"""Maximum number of dropped samples whose times are in memory; dropped messages have the same limit."""
 _STATIC: Final = "tf_static"
 """Last part of the topics of static transforms; every clip needs these transforms regardless of their age."""
 
@@ -198,9 +199,9 @@ class TriggeredClip:
 
     Attributes:
         path: path of the log.
-        reason: condition that fired, the first one if several fired during the clip.
+        reason: first condition that fired during the clip.
         time_ns: time at which it fired.
-        held_s: time before the trigger that the clip has, s.
+        held_s: time before the trigger that the clip covers, s.
         dropped: number of samples in the clip's time that were dropped because the queue was full.
     """
 
@@ -228,7 +229,7 @@ class _ManualTrigger(NamedTuple):
 
 
 class _OpenClip:
-    """An unfinished clip: entries of the ring wait to be written, and later entries follow."""
+    """An unfinished clip with the entries that wait to be written."""
 
     def __init__(
         self,
@@ -313,8 +314,8 @@ class _OpenClip:
 class ClipLog(RecorderLog):
     """The ring of a recorder with a trigger, and its clips; see `RecorderLog`.
 
-    A trigger that fires during a clip extends the clip. If the ring has already evicted entries of the time
-    between, it begins another clip instead.
+    A trigger that fires during a clip extends the clip. If the ring has evicted entries between the clip and
+    the trigger, another clip begins instead.
 
     Attributes:
         held_bytes: memory of the ring, bytes.
@@ -510,7 +511,7 @@ class ClipLog(RecorderLog):
             clip.put(entry)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or extend the open clip if that leaves no gap in it."""
+        """Open a clip around a time, or extend the open clip if no entry between them is missing."""
         if self._open is not None:
             until_ns = self._open.until_ns
             if self._evicted_ns > until_ns or (at_ns > until_ns and self._is_past(until_ns)):

@@ -117,7 +117,7 @@ class Recording:
         Args:
             files: specifications to evaluate and to store in the log.
             about: further metadata, such as the origin of the samples, a seed, or the time zero of a clip.
-            known: compiled automata of specs of these files, which are not compiled again.
+            known: automata of specs in these files that are compiled already.
 
         Raises:
             UsageError: a specification has a template, whose objects are not yet known.
@@ -191,7 +191,7 @@ class Recording:
         self._hashes.add_results(blocks)
 
     def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
-        """Write the next samples without an evaluation; `evaluate` must later receive them in their order."""
+        """Write the next samples without an evaluation; `evaluate` must receive them later, in order."""
         self._sink.write_messages(self._count_messages(trace, beside))
 
     def evaluate(self, trace: Trace) -> None:
@@ -208,7 +208,7 @@ class Recording:
         self._sink.write_messages(merge(self._evaluation.annotator.occurrence(*event)))
 
     def _count_messages(self, trace: Trace, beside: Messages | None) -> Messages:
-        """Return samples and other messages in the form in which they are written; count and hash them."""
+        """Return the messages to write: samples and other messages. Count and hash them."""
         certified_messages = sample_messages(trace, self._sample_count)
         messages = certified_messages
         if beside is not None and len(beside):
@@ -472,7 +472,7 @@ class FileLog(RecorderLog):
 
 
 def encodable(samples: Sequence[Sample]) -> list[Sample]:
-    """Return the samples before the first one that cannot be encoded."""
+    """Return the samples before the first sample that cannot be encoded."""
     encodable_samples: list[Sample] = []
     with suppress(Exception):
         for sample in samples:
@@ -487,7 +487,7 @@ def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -
     With an empty compiler cache, code is interpreted until a child process has compiled it.
 
     Args:
-        automata: automata of the specifications, which are not compiled again.
+        automata: compiled automata of the specifications.
     """
     compiled.start("record and replay", partial(_record_trial, files, automata))
 

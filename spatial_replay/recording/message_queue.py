@@ -32,8 +32,7 @@ PAUSE_S = 0.001
 class MessageQueue:
     """Messages from any thread that wait for the writing thread.
 
-    Only the caller's threads take the lock, so that an interruption of one of them never blocks the writing
-    thread.
+    Only the caller's threads take the lock, so that an interrupted thread never blocks the writing thread.
 
     Attributes:
         newest_ns: latest time of a queued message, -1 before the first message.
@@ -198,8 +197,8 @@ class MessageChannel:
     def copy(self, time_ns: int, payload: bytes) -> None:
         """Queue a message of another program, which may arrive late.
 
-        Its publish time is `time_ns`. Its log time is `time_ns`, or the log time of the channel's previous
-        message if that is later.
+        The publish time is `time_ns`. The log time is the later of `time_ns` and the log time of the
+        channel's previous message.
         """
         with self._queue.lock:
             self._queue.require_open()

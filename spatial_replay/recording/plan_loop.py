@@ -19,7 +19,7 @@ MOST_WAITING_SAMPLES: Final = 150
 
 
 class Robot(Executor, Protocol):
-    """A robot that executes the steps of `plan`, and writes every sample to the recorder, also in motions."""
+    """A robot that executes the steps of `plan`, and records every sample, also during motions."""
 
     def look(self) -> None:
         """Write one more sample to the recorder, while nothing moves."""
@@ -30,8 +30,8 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = 
     """Run a planner and a robot until no step is left, and record the run.
 
     The log has the samples, the settings, and every decision with its maps and outcome, so that
-    `verify --decisions` can recompute it. The loop always ends. The number of attempts at the automaton's
-    edges limits the motions. The number of samples without a new state of the automaton limits a wait.
+    `verify --decisions` can recompute the run. The loop always ends: the planner tries each edge of the
+    automaton a limited number of times. A wait ends after a number of samples without a new automaton state.
 
     Args:
         planner: a planner that has observed nothing yet.
@@ -40,7 +40,7 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = 
         timings: also record the duration of each decision; the recorder must have no planner yet.
 
     Returns:
-        The last decision: "hold" if, by the planner's observations, the specification is satisfied.
+        The last decision; "hold" means that the planner's observations satisfy the specification.
 
     Raises:
         UsageError: the recorder does not record the planner's specification, or has another planner.
@@ -74,7 +74,7 @@ def run_plan(
             waited_samples, reached_states = 0, {planner.states}
         elif step.kind == "wait" and waited_samples < MOST_WAITING_SAMPLES:
             look()
-            # a wait for other agents is bounded by the planner; any other wait by samples without a new state
+            # the planner limits a wait for other agents; samples without a new state limit any other wait
             is_for_others = step.aim is not None and not step.ahead
             waited_samples += not is_for_others and (not step.ahead or planner.states in reached_states)
             reached_states.add(planner.states)

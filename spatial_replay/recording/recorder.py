@@ -40,7 +40,7 @@ FLUSH_S = 0.3
 """Interval between two flushes to the operating system, s."""
 
 MOST_LOST_S = 0.8
-"""Age of the oldest unflushed sample from which `write` waits, or drops samples if it may not wait, s.
+"""Largest age of an unflushed sample, s. From this age on, `write` waits or drops samples (see `block`).
 
 In a campaign, each of 2,468 kills lost at most 0.79 s of samples (docs/reliability.md).
 """
@@ -99,7 +99,7 @@ class SampleWriter:
 
     def reserve(self) -> bool:
         """Return whether the queue has room; the next `write` then accepts its sample without waiting."""
-        # after a failure the next `write` raises it at once
+        # after a failure, the next `write` raises the error at once
         self._is_reserved = self._messages.failure is not None or not self._is_behind()
         return self._is_reserved
 
@@ -296,7 +296,8 @@ class Recorder(SampleWriter):
     thread it raises SystemExit(143), unless the program handles SIGTERM. A signal that arrives during the
     closing is delayed until the log is closed.
 
-    With a trigger, samples wait in memory until it fires; each firing writes one log of the time around it.
+    With a trigger, samples wait in memory until the trigger fires. Each firing writes one log of the time
+    around it.
     With a planner, the log also has its decisions. Samples, decisions and outcomes then go through the
     recorder in their order, as in `plan(planner, robot, recorder)`.
 
@@ -488,7 +489,7 @@ class Recorder(SampleWriter):
     def trigger(self, reason: str = "by hand") -> None:
         """Fire the trigger now, regardless of its condition; any thread or signal handler may call it.
 
-        The clip is around the newest sample or message at the call, or around the first one to arrive.
+        The clip is around the newest sample or message at the call; before any, around the first to arrive.
 
         Raises:
             UsageError: the recorder has no trigger.

@@ -136,7 +136,7 @@ def recording_in(
     about: Mapping[str, str] | None,
     known: Sequence[SpecAutomaton] = (),
 ) -> Iterator[tuple[LogWriter, Recording]]:
-    """Begin a log, and always write its end after the block; after an error it is marked as interrupted."""
+    """Begin a log, and write its end after the block. After an error, the log is marked as interrupted."""
     is_interrupted = True
 
     def end() -> None:
