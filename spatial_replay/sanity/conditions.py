@@ -139,17 +139,19 @@ def exact(value: float) -> Fraction:
     return Fraction(repr(float(value)))
 
 
-def _add(first: Tree, second: Tree) -> Tree:
-    if isinstance(first, LeastOrGreatest):
-        return _least_or_greatest(first.kind, tuple(_add(option, second) for option in first.options))
-    if isinstance(second, LeastOrGreatest):
-        return _add(second, first)
-    total = dict(first.weights)
-    for quantity, weight in second.weights:
-        total[quantity] = total.get(quantity, Fraction(0)) + weight
+def _add(left: Tree, right: Tree) -> Tree:
+    if isinstance(left, LeastOrGreatest):
+        return _least_or_greatest(left.kind, tuple(_add(option, right) for option in left.options))
+    if isinstance(right, LeastOrGreatest):
+        return _add(right, left)
+    weight_by_quantity = dict(left.weights)
+    for quantity, weight in right.weights:
+        weight_by_quantity[quantity] = weight_by_quantity.get(quantity, Fraction(0)) + weight
     # in a fixed order, so that equal sums are equal values
-    weights = sorted(((key, value) for key, value in total.items() if value), key=lambda item: repr(item[0]))
-    return Linear(tuple(weights), first.constant + second.constant)
+    weights = sorted(
+        ((key, value) for key, value in weight_by_quantity.items() if value), key=lambda item: repr(item[0])
+    )
+    return Linear(tuple(weights), left.constant + right.constant)
 
 
 def _times(tree: Tree, factor: Fraction) -> Tree:
@@ -173,7 +175,7 @@ def _size(tree: Tree) -> int:
 def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
     """Return a measurement of unions as the minimum or maximum of the measurements of their members."""
     kind: Literal["min", "max"]
-    parts: list[Measurement]
+    member_measurements: list[Measurement]
     if all(isinstance(without_radius(plain(term)), RegionName) for term in measurement.terms):
         return _of_regions(measurement, regions)
     match measurement:
@@ -181,21 +183,21 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
             kind = "min"
             pairs = product(*map(members, measurement.terms))
             # both measurements are symmetric; a fixed order makes equal ones equal values
-            parts = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
+            member_measurements = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
             # an outer union is not split: the inner term may lie partly in one member and partly in another
             kind, outer = "max", plain(measurement.outer)
-            parts = [Protrusion(inner, outer) for inner in members(measurement.inner)]
+            member_measurements = [Protrusion(inner, outer) for inner in members(measurement.inner)]
         case Projection():
             kind, axis = measurement.side, measurement.axis
-            parts = [Projection(term, axis, kind) for term in members(measurement.term)]
+            member_measurements = [Projection(term, axis, kind) for term in members(measurement.term)]
         case CentroidProjection():
             kind, axis = measurement.side, measurement.axis
             terms = map(without_radius, members(measurement.term))
-            parts = [CentroidProjection(term, axis, kind) for term in terms]
+            member_measurements = [CentroidProjection(term, axis, kind) for term in terms]
         case _:
             return Linear(((measurement, Fraction(1)),))
-    return _least_or_greatest(kind, tuple(_shift(part, regions) for part in parts))
+    return _least_or_greatest(kind, tuple(_shift(part, regions) for part in member_measurements))
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
@@ -207,57 +209,65 @@ def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Lin
 def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outline]) -> list[Fraction | None]:
     """Return the numbers of measurements between regions; None for an unknown number."""
     # regions need no objects, so one empty sample is enough
-    nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
-    values = leaf_values(nothing, [Atom("", "", measurement) for measurement in measurements], {})[
+    empty_scene = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
+    bound_pairs = leaf_values(empty_scene, [Atom("", "", measurement) for measurement in measurements], {})[
         :, :, 0
     ].T.tolist()
-    return [exact(bounds[0]) if len(set(bounds)) == 1 and isfinite(bounds[0]) else None for bounds in values]
+    return [
+        exact(bounds[0]) if len(set(bounds)) == 1 and isfinite(bounds[0]) else None for bounds in bound_pairs
+    ]
 
 
 def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
     """Return the distances between separate regions, and the protrusion of each region from one around it."""
     terms = (term for atom in atoms for term in terms_of(atom.expression))
-    names = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
-    pairs = list(permutations(names, 2))
-    measured: list[Measurement] = [SignedDistance(*pair) for pair in pairs if repr(pair[0]) < repr(pair[1])]
-    measured += [Protrusion(*pair) for pair in pairs]
-    numbers = zip(measured, _numbers_of(measured, regions), strict=True) if measured else ()
+    region_terms = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
+    pairs = list(permutations(region_terms, 2))
+    measurements: list[Measurement] = [
+        SignedDistance(*pair) for pair in pairs if repr(pair[0]) < repr(pair[1])
+    ]
+    measurements += [Protrusion(*pair) for pair in pairs]
+    measurement_values = (
+        zip(measurements, _numbers_of(measurements, regions), strict=True) if measurements else ()
+    )
     return {
         measurement: value
-        for measurement, value in numbers
+        for measurement, value in measurement_values
         if value is not None and isinstance(measurement, SignedDistance) == (value > 0)
     }
 
 
 def _diameter(outline: Outline) -> Fraction:
     """Return the diameter of a region in the plane."""
-    widest = max((dist(*pair) for pair in combinations(outline.vertices, 2)), default=0.0)
-    return exact(widest + 2.0 * outline.radius)
+    vertex_diameter = max((dist(*pair) for pair in combinations(outline.vertices, 2)), default=0.0)
+    return exact(vertex_diameter + 2.0 * outline.radius)
 
 
 def is_about_heights(atoms: Iterable[Atom]) -> bool:
     """Return whether an atom compares coordinates along z."""
-    parts = (part for atom in atoms for part in iter_expressions(atom.expression))
-    return any(isinstance(part, Projection) and part.axis == "z" for part in parts)
+    expressions = (expression for atom in atoms for expression in iter_expressions(atom.expression))
+    return any(isinstance(expression, Projection) and expression.axis == "z" for expression in expressions)
 
 
 def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
     """Return a measurement of enlarged terms as that of the bare terms plus a constant, if this is exact."""
-    unit = Fraction(1)
+    unit_weight = Fraction(1)
     match measurement:
         case Projection() if measurement.axis != "z":
             radius = radius_of(measurement.term)
-            bare = Projection(without_radius(measurement.term), measurement.axis, measurement.side)
-            return Linear(((bare, unit),), radius if measurement.side == "max" else -radius)
+            bare_projection = Projection(without_radius(measurement.term), measurement.axis, measurement.side)
+            return Linear(((bare_projection, unit_weight),), radius if measurement.side == "max" else -radius)
         # with heights, enlarging in the plane can change a distance by less than the radius
         case SignedDistance() if is_flat(measurement.first, regions) or is_flat(measurement.second, regions):
             terms = measurement.first, measurement.second
-            bare_pair = SignedDistance(*sorted(map(without_radius, terms), key=repr))
-            return Linear(((bare_pair, unit),), -sum(map(radius_of, terms), Fraction(0)))
+            bare_distance = SignedDistance(*sorted(map(without_radius, terms), key=repr))
+            return Linear(((bare_distance, unit_weight),), -sum(map(radius_of, terms), Fraction(0)))
         case Protrusion() if is_flat(measurement.inner, regions) or is_flat(measurement.outer, regions):
-            bare_in = Protrusion(without_radius(measurement.inner), without_radius(measurement.outer))
-            return Linear(((bare_in, unit),), radius_of(measurement.inner) - radius_of(measurement.outer))
-    return Linear(((measurement, unit),))
+            bare_protrusion = Protrusion(without_radius(measurement.inner), without_radius(measurement.outer))
+            return Linear(
+                ((bare_protrusion, unit_weight),), radius_of(measurement.inner) - radius_of(measurement.outer)
+            )
+    return Linear(((measurement, unit_weight),))
 
 
 # -------------------------------------------------------------------------------------------- terms
@@ -278,12 +288,12 @@ def members(term: Term) -> tuple[Term, ...]:
         return (term,)
     if any(isinstance(name, Variable) for name in group.excluded):
         return (term,)
-    names = [TrackedName(name) for name in named_members(group)]
-    if not names:
+    tracked_members = [TrackedName(name) for name in named_members(group)]
+    if not tracked_members:
         return (term,)
     if isinstance(term, Earlier):
-        return tuple(Earlier(name, term.samples, term.duration_ns, term.rate) for name in names)
-    return tuple(names)
+        return tuple(Earlier(name, term.samples, term.duration_ns, term.rate) for name in tracked_members)
+    return tuple(tracked_members)
 
 
 def plain(term: Term) -> Term:
@@ -351,10 +361,10 @@ class Fact(NamedTuple):
 
     def inequality(self, value: bool, label: int) -> Inequality:
         """Return the inequality of the fact (`value` is True) or of its negation, with a label."""
-        rises = (self.side != "<=") == value
+        is_lower_limit = (self.side != "<=") == value
         # ">" leaves equality open, so the fact and its negation are both strict
         is_strict = self.side == ">" or not value
-        sign = -1 if rises else 1
+        sign = -1 if is_lower_limit else 1
         weights = tuple((quantity, sign * _whole(weight)) for quantity, weight in self.weights)
         return Inequality(weights, sign * self.threshold, is_strict, label)
 
@@ -377,14 +387,14 @@ class FactDiagrams:
         self.diagrams = Diagrams(MAX_DECISIONS)
         self.facts: list[Fact] = []
         self.regions = regions
-        self._numbers: dict[object, int] = {}
+        self._fact_numbers: dict[object, int] = {}
         self._trees: dict[Expression, Tree | None] = {}
-        self._known: dict[int, tuple[Formula, int]] = {}
-        self._written: dict[int, dict[str, None]] = {}
+        self._nodes_by_id: dict[int, tuple[Formula, int]] = {}
+        self._written_texts: dict[int, dict[str, None]] = {}
         self._shapes = Shapes()
         self._opaque_nodes: dict[int, int] = {}
         # sums that are compared with "==", usually modes and counts
-        self._compared: set[Weights] = set()
+        self._exact_sums: set[Weights] = set()
         atoms = [part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom)]
         # first all sums that "==" compares: they decide which facts are exact
         for atom in atoms:
@@ -400,10 +410,10 @@ class FactDiagrams:
 
     def of(self, formula: Formula) -> int:
         """Return the diagram of a formula without temporal operators."""
-        entry = self._known.get(id(formula))
+        entry = self._nodes_by_id.get(id(formula))
         if entry is None:
             # the formula is stored, because the id of a deleted object can be reused
-            entry = self._known[id(formula)] = formula, self._diagram(expand(formula))
+            entry = self._nodes_by_id[id(formula)] = formula, self._diagram(expand(formula))
         return entry[1]
 
     def _diagram(self, formula: Formula) -> int:
@@ -420,11 +430,11 @@ class FactDiagrams:
             case Boolean(operator="not"):
                 return diagrams.complement(self.of(formula.operands[0]))
             case Boolean():
-                result = self.of(formula.operands[0])
+                node = self.of(formula.operands[0])
                 join = diagrams.both if formula.operator == "and" else diagrams.either
                 for operand in formula.operands[1:]:
-                    result = join(result, self.of(operand))
-                return result
+                    node = join(node, self.of(operand))
+                return node
             case _:
                 return self._opaque(formula)
 
@@ -432,37 +442,37 @@ class FactDiagrams:
         if expression not in self._trees:
             tree = self._trees[expression] = tree_of(expression, self.regions)
             if tree is not None:
-                self._compared |= set(_equal_sums(tree))
+                self._exact_sums |= set(_equal_sums(tree))
         return self._trees[expression]
 
     def _condition(self, tree: Tree, atom: Atom) -> int:
         """Return the diagram of the condition that a number is at least 0."""
         if isinstance(tree, LeastOrGreatest):
-            parts = [self._condition(option, atom) for option in tree.options]
+            option_nodes = [self._condition(option, atom) for option in tree.options]
             join = self.diagrams.both if tree.kind == "min" else self.diagrams.either
-            result = parts[0]
-            for part in parts[1:]:
-                result = join(result, part)
-            return result
+            joint_node = option_nodes[0]
+            for option_node in option_nodes[1:]:
+                joint_node = join(joint_node, option_node)
+            return joint_node
         if not tree.weights:
             return YES if tree.constant >= 0 else NO
-        weights, threshold, is_least = _with_threshold(tree)
+        weights, threshold, is_lower_limit = _with_threshold(tree)
         is_whole = isinstance(self._trees[atom.expression], Linear)
-        texts = _texts(atom, is_whole, is_least, weights, threshold)
-        if weights in self._compared:
-            side: Literal[">=", "<="] = ">=" if is_least else "<="
+        texts = _texts(atom, is_whole, is_lower_limit, weights, threshold)
+        if weights in self._exact_sums:
+            side: Literal[">=", "<="] = ">=" if is_lower_limit else "<="
             texts = _exact_texts(weights, threshold, side) or texts
             return self._fact(Fact(weights, threshold, side, texts), atom.text)
-        node = self._fact(Fact(weights, threshold, ">", texts if is_least else texts[::-1]), atom.text)
-        return node if is_least else self.diagrams.complement(node)
+        node = self._fact(Fact(weights, threshold, ">", texts if is_lower_limit else texts[::-1]), atom.text)
+        return node if is_lower_limit else self.diagrams.complement(node)
 
     def equal_texts(self, number: int) -> Iterator[tuple[str, str]]:
         """Yield pairs of comparisons with the same robustness in a fact, such as "x > 1" and "x >= 1"."""
-        texts = dict.fromkeys((*self._written.get(number, ()), *self.facts[number].texts))
+        texts = dict.fromkeys((*self._written_texts.get(number, ()), *self.facts[number].texts))
         for strict in texts:
             for sign in (" > ", " < "):
                 lenient = strict.replace(sign, f"{sign.rstrip()}= ")
-                if lenient != strict and lenient in texts and strict in self._written[number]:
+                if lenient != strict and lenient in texts and strict in self._written_texts[number]:
                     yield strict, lenient
 
     def _opaque(self, formula: Formula) -> int:
@@ -475,26 +485,26 @@ class FactDiagrams:
 
     def _new_opaque(self, formula: Formula) -> int:
         text = format_formula(formula)
-        alone = None
+        empty_value = None
         if isinstance(formula, Quantified) and isinstance(formula.group, Group):
-            alone = formula.quantifier == "forall" if formula.group.class_name != ANY_CLASS else None
-        return self._fact(Fact((), Fraction(0), ">", (text, f"not ({text})"), alone))
+            empty_value = formula.quantifier == "forall" if formula.group.class_name != ANY_CLASS else None
+        return self._fact(Fact((), Fraction(0), ">", (text, f"not ({text})"), empty_value))
 
-    def _fact(self, fact: Fact, written: str = "") -> int:
-        key = (fact[:3]) if fact.weights else fact.texts
-        if key not in self._numbers:
-            self._numbers[key] = len(self.facts)
+    def _fact(self, fact: Fact, written_text: str = "") -> int:
+        fact_key = (fact[:3]) if fact.weights else fact.texts
+        if fact_key not in self._fact_numbers:
+            self._fact_numbers[fact_key] = len(self.facts)
             self.facts.append(fact)
-        number = self._numbers[key]
-        self._written.setdefault(number, {})[written] = None
-        existing = self.facts[number]
+        fact_number = self._fact_numbers[fact_key]
+        self._written_texts.setdefault(fact_number, {})[written_text] = None
+        existing = self.facts[fact_number]
         # several relations can have the same fact; its texts are those without "not"
-        first, second = (
+        true_text, false_text = (
             new if is_negated(old) and not is_negated(new) else old
             for old, new in zip(existing.texts, fact.texts, strict=True)
         )
-        self.facts[number] = existing._replace(texts=(first, second))
-        return self.diagrams.variable(number)
+        self.facts[fact_number] = existing._replace(texts=(true_text, false_text))
+        return self.diagrams.variable(fact_number)
 
 
 def is_negated(text: str) -> bool:
@@ -514,33 +524,35 @@ def _equal_sums(tree: Tree) -> Iterable[Weights]:
     """Yield the sums whose lower and upper limit are the same threshold."""
     if isinstance(tree, Linear):
         return
-    sums = [
+    comparisons = [
         _with_threshold(option) for option in tree.options if isinstance(option, Linear) and option.weights
     ]
     if tree.kind == "min":
         yield from (
-            comparison[0] for comparison in sums if comparison[2] and (*comparison[:2], False) in sums
+            comparison[0]
+            for comparison in comparisons
+            if comparison[2] and (*comparison[:2], False) in comparisons
         )
     for option in tree.options:
         yield from _equal_sums(option)
 
 
 def _texts(
-    atom: Atom, is_whole: bool, is_least: bool, weights: Weights, threshold: Fraction
+    atom: Atom, is_whole: bool, is_lower_limit: bool, weights: Weights, threshold: Fraction
 ) -> tuple[str, str]:
     """Return the texts of a condition of an atom: where it holds, and where it fails."""
     if is_whole:
         return atom.text, f"not ({atom.text})"
-    compared = _compared_texts(weights, threshold, (">=", "<=") if is_least else ("<=", ">="))
-    if compared is not None:
-        return compared
-    text = _relation_text(weights) if not threshold else None
-    if text is None:
+    comparison_texts = _compared_texts(weights, threshold, (">=", "<=") if is_lower_limit else ("<=", ">="))
+    if comparison_texts is not None:
+        return comparison_texts
+    relation_and_side = _relation_text(weights) if not threshold else None
+    if relation_and_side is None:
         return f"a part of {atom.text}", f"not a part of {atom.text}"
     # the relation limits a sum by 0 from below or from above
-    relation, holds_above = text
+    relation, holds_above = relation_and_side
     texts = relation, f"not ({relation})"
-    return texts if holds_above == is_least else texts[::-1]
+    return texts if holds_above == is_lower_limit else texts[::-1]
 
 
 def _exact_texts(weights: Weights, threshold: Fraction, side: Literal[">=", "<="]) -> tuple[str, str] | None:
@@ -549,16 +561,16 @@ def _exact_texts(weights: Weights, threshold: Fraction, side: Literal[">=", "<="
 
 
 def _compared_texts(weights: Weights, threshold: Fraction, signs: tuple[str, str]) -> tuple[str, str] | None:
-    (quantity, _), *others = weights
-    if others or not isinstance(quantity, SignedDistance | Signal):
+    (quantity, _), *other_weights = weights
+    if other_weights or not isinstance(quantity, SignedDistance | Signal):
         return None
-    name = (
+    quantity_text = (
         quantity.name
         if isinstance(quantity, Signal)
         else f"{format_term(quantity.first)} dist {format_term(quantity.second)}"
     )
     limit = format_number(float(threshold))
-    return f"{name} {signs[0]} {limit}", f"{name} {signs[1]} {limit}"
+    return f"{quantity_text} {signs[0]} {limit}", f"{quantity_text} {signs[1]} {limit}"
 
 
 def _relation_text(weights: Weights) -> tuple[str, bool] | None:
@@ -567,8 +579,11 @@ def _relation_text(weights: Weights) -> tuple[str, bool] | None:
         case ((Protrusion() as quantity, _),):
             return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False
         case ((Projection() as left, _), (Projection() as right, weight)) if weight == -1:
-            ends = {left.side: left, right.side: right}
-            if left.axis == right.axis and len(ends) == 2:
-                first, second = format_term(ends["max"].term), format_term(ends["min"].term)
-                return f"{first} prec[{left.axis}] {second}", left.side == "min"
+            projection_by_side = {left.side: left, right.side: right}
+            if left.axis == right.axis and len(projection_by_side) == 2:
+                before_text, after_text = (
+                    format_term(projection_by_side["max"].term),
+                    format_term(projection_by_side["min"].term),
+                )
+                return f"{before_text} prec[{left.axis}] {after_text}", left.side == "min"
     return None

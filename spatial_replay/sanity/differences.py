@@ -100,15 +100,15 @@ class Distinction(Printed):
 def _run_lines(accepting: str, rejecting: str, example: Example | None) -> Iterator[str]:
     if example is None:
         return
-    length = plural(len(example.sentences), "sample")
+    length_text = plural(len(example.sentences), "sample")
     note = f", in words only: {example.note}" if example.note else ""
     yield ""
-    yield f"accepted by {accepting}, rejected by {rejecting}: {length}{note}"
+    yield f"accepted by {accepting}, rejected by {rejecting}: {length_text}{note}"
     number = 0
     for sentence, samples in groupby(example.sentences):
-        last = number + len(list(samples)) - 1
-        yield f"  {number if number == last else f'{number}-{last}'}  {sentence}"
-        number = last + 1
+        last_number = number + len(list(samples)) - 1
+        yield f"  {number if number == last_number else f'{number}-{last_number}'}  {sentence}"
+        number = last_number + 1
 
 
 @named_arguments
@@ -129,28 +129,28 @@ def distinguish(first: Specification, second: Specification, *, rate_hz: float |
         require_specification(specification)
     if rate_hz is not None and not 1e-6 <= rate_hz <= 1e9:
         raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, from 1e-6 to 1e9")
-    together = _together(first, second)
-    names = _names(specifications)
-    formulas = tuple(spec.formula for spec in together.specs)
+    joint_specification = _together(first, second)
+    file_names = _names(specifications)
+    formulas = tuple(spec.formula for spec in joint_specification.specs)
     if format_formula(formulas[0]) == format_formula(formulas[1]):
-        return Distinction(*names, "same", reason="they are the same formula")
+        return Distinction(*file_names, "same", reason="they are the same formula")
     rates: Sequence[float | None] = (None,)
     if any(map(counts_seconds, formulas)):
         rates = _RATES_HZ if rate_hz is None else (rate_hz,)
     distinctions = []
     for rate in rates:
-        distinction = _Comparison(together, rate).distinction(*names)
+        distinction = _Comparison(joint_specification, rate).distinction(*file_names)
         if distinction.relation not in ("same", "unknown"):
             return distinction
         distinctions.append(distinction)
     # an undecided rate leaves the whole comparison undecided
-    *_, last = sorted(distinctions, key=lambda distinction: distinction.relation == "unknown")
-    return replace(last, rates_hz=tuple(rate for rate in rates if rate is not None))
+    *_, decisive = sorted(distinctions, key=lambda distinction: distinction.relation == "unknown")
+    return replace(decisive, rates_hz=tuple(rate for rate in rates if rate is not None))
 
 
 def _names(specifications: Sequence[Specification]) -> tuple[str, str]:
-    first, second = (specification.filename for specification in specifications)
-    return (first, second) if first != second else ("the first", "the second")
+    first_name, second_name = (specification.filename for specification in specifications)
+    return (first_name, second_name) if first_name != second_name else ("the first", "the second")
 
 
 def _together(first: Specification, second: Specification) -> Specification:
@@ -190,43 +190,43 @@ class _Comparison:
         self._readings = [reading_of(together, spec.name, spec.formula, rate_hz) for spec in together.specs]
 
     def distinction(self, first: str, second: str) -> Distinction:
-        ways = [self._difference(0, 1), self._difference(1, 0)]
-        runs = [way if isinstance(way, Example) else None for way in ways]
-        answers = [way for way in ways if isinstance(way, Answer)]
-        obstacles = [way for way in ways if isinstance(way, str)]
+        outcomes = [self._difference(0, 1), self._difference(1, 0)]
+        examples = [outcome if isinstance(outcome, Example) else None for outcome in outcomes]
+        answers = [outcome for outcome in outcomes if isinstance(outcome, Answer)]
+        obstacles = [outcome for outcome in outcomes if isinstance(outcome, str)]
         relation: Relation = "same"
-        if all(runs) or (any(runs) and obstacles):
+        if all(examples) or (any(examples) and obstacles):
             relation = "different"
-        elif any(runs):
-            relation = "weaker" if runs[0] else "stricter"
+        elif any(examples):
+            relation = "weaker" if examples[0] else "stricter"
         elif obstacles:
             relation = "unknown"
         reason = ""
         if obstacles:
             reason = obstacles[0]
-            if any(runs):
+            if any(examples):
                 # the other direction is undecided
-                accepting, rejecting = (second, first) if runs[0] else (first, second)
+                accepting, rejecting = (second, first) if examples[0] else (first, second)
                 reason = f"not decided is whether {accepting} accepts runs that {rejecting} rejects: {reason}"
         elif relation == "same":
             reason = reason_of(joint(answers))
         rates = () if self._rate_hz is None else (self._rate_hz,)
-        return Distinction(first, second, relation, runs[0], runs[1], rates, reason)
+        return Distinction(first, second, relation, examples[0], examples[1], rates, reason)
 
     def _difference(self, accepting: int, rejecting: int) -> Example | Answer | str:
         """Return a run that only one spec accepts, the answer that there is none, or the obstacle."""
-        accepted, rejected = self._readings[accepting], self._readings[rejecting]
-        obstacle = accepted.reason or rejected.reason
-        if accepted.satisfying is None or rejected.violating is None:
+        accepted_reading, rejected_reading = self._readings[accepting], self._readings[rejecting]
+        obstacle = accepted_reading.reason or rejected_reading.reason
+        if accepted_reading.satisfying is None or rejected_reading.violating is None:
             return obstacle
-        runs = accepted.satisfying, rejected.violating
+        run_sets = accepted_reading.satisfying, rejected_reading.violating
         try:
-            answer = self._search.shortest(*runs)
+            answer = self._search.shortest(*run_sets)
         except UndecidedError:
             return "it takes too many steps"
         if answer.word is None:
             return answer
-        length = len(answer.word)
+        word_length = len(answer.word)
         example = shortest_example(
             self._specification,
             NamedSpec("difference", self._difference_formula(accepting, rejecting)),
@@ -235,7 +235,7 @@ class _Comparison:
             True,
             is_exact=not obstacle,
             rate_hz=self._rate_hz,
-            another=lambda avoided: self._search.another(length, avoided, *runs),
+            another=lambda avoided: self._search.another(word_length, avoided, *run_sets),
         )
         return example or obstacle
 

@@ -124,25 +124,27 @@ class Examination(Printed):
             yield from str(finding.diagnostic).split("\n")
         if self.findings:
             yield ""
-        ends = {(finding.specs[0], _ENDS[finding.kind]) for finding in self.findings if finding.kind in _ENDS}
+        impossible_verdicts = {
+            (finding.specs[0], _ENDS[finding.kind]) for finding in self.findings if finding.kind in _ENDS
+        }
         for spec in self.specs:
             yield spec.name
             yield from (f"  {line}" for line in _remarks(spec))
             for verdict, example in (("satisfied", spec.satisfied), ("violated", spec.violated)):
-                if (spec.name, verdict) in ends:
+                if (spec.name, verdict) in impossible_verdicts:
                     yield f"  {verdict} by no run"
                 elif example is not None:
                     yield from (f"  {line}" for line in _example(example, files.get((spec.name, verdict))))
                 elif spec.reason:
-                    why = "without an automaton runs are guesses, and none was confirmed"
-                    yield f"  {verdict}: no run is shown, since {why}"
+                    reason = "without an automaton runs are guesses, and none was confirmed"
+                    yield f"  {verdict}: no run is shown, since {reason}"
             yield ""
         yield from self.notes
         if self.findings:
             yield f"{plural(len(self.findings), 'finding')} in {plural(len(self.specs), 'result')}"
         else:
-            whole = not any(spec.reason or spec.undecided for spec in self.specs)
-            yield "nothing found" if whole else "nothing found in what could be decided"
+            is_complete = not any(spec.reason or spec.undecided for spec in self.specs)
+            yield "nothing found" if is_complete else "nothing found in what could be decided"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -175,14 +177,14 @@ def _remarks(spec: SpecExamination) -> Iterator[str]:
 
 
 def _example(example: Example, file: Path | None) -> Iterator[str]:
-    length = plural(len(example.sentences), "sample")
+    length_text = plural(len(example.sentences), "sample")
     if example.robustness is None:
-        yield f"{example.verdict} by {length}, in words only: {example.note}"
+        yield f"{example.verdict} by {length_text}, in words only: {example.note}"
     else:
-        where = "" if file is None else f": {file}"
-        yield f"{example.verdict} by {length}, robustness {number_text(example.robustness)}{where}"
-    for number, sentence in enumerate(example.sentences):
-        yield f"  {number}  {sentence}"
+        file_suffix = "" if file is None else f": {file}"
+        yield f"{example.verdict} by {length_text}, robustness {number_text(example.robustness)}{file_suffix}"
+    for sample_number, sentence in enumerate(example.sentences):
+        yield f"  {sample_number}  {sentence}"
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
@@ -197,8 +199,8 @@ def example_document(example: Example | None) -> dict[str, Any] | None:
     """Return an example run as values for JSON; None without a run."""
     if example is None:
         return None
-    about = json_fields(example, "robustness", "note")
-    return {"samples": example.sentences, "tracks": example.rows, **about}
+    fields = json_fields(example, "robustness", "note")
+    return {"samples": example.sentences, "tracks": example.rows, **fields}
 
 
 @named_arguments
@@ -238,11 +240,11 @@ def refuse_constant_results(specification: Specification) -> None:
     _refuse(specification, [spec.name for spec in specification.results], [False, True])
 
 
-def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[bool]) -> None:
+def _refuse(specification: Specification, names: Sequence[str], outcomes: Sequence[bool]) -> None:
     """Raise an error for named specs that no run satisfies (True in `ends`) or violates (False in `ends`)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
-    findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in ends]
+    findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in outcomes]
     errors = [replace(finding.diagnostic, severity="error") for finding in findings if finding is not None]
     if errors:
         raise SpecificationError(errors)
@@ -251,19 +253,19 @@ def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[b
 def _subject(formula: Formula) -> frozenset[str]:
     """Return the names of the objects, regions and signals in a formula."""
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
-    computed = [atom for atom in atoms if atom.relation in ("signal", "sum")]
-    signals = {name for atom in computed for name in signals_in(atom.expression)}
-    named = {part.name for part in iter_formulas(formula) if part.name is not None}
-    return (other_names(formula) - named) | signals
+    numeric_atoms = [atom for atom in atoms if atom.relation in ("signal", "sum")]
+    signals = {name for atom in numeric_atoms for name in signals_in(atom.expression)}
+    formula_names = {part.name for part in iter_formulas(formula) if part.name is not None}
+    return (other_names(formula) - formula_names) | signals
 
 
 def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
     """Yield the named conjuncts of a spec; the spec itself if some conjunct has no name."""
-    formula, names = spec.formula, list[str]()
+    formula, conjunct_names = spec.formula, list[str]()
     if isinstance(formula, Boolean) and formula.operator in ("and", "spec"):
-        names = [operand.name or "" for operand in formula.operands]
-    if names and all(name in specs for name in names):
-        for name in names:
+        conjunct_names = [operand.name or "" for operand in formula.operands]
+    if conjunct_names and all(name in specs for name in conjunct_names):
+        for name in conjunct_names:
             yield from _parts(specs[name], specs)
     else:
         yield spec
@@ -286,21 +288,21 @@ class _Examiner:
     def examination(self, examples: bool) -> Examination:
         specs = {spec.name: spec for spec in self._specification.specs}
         results = self._specification.results
-        parts = {part.name: part for spec in results for part in _parts(spec, specs)}
+        parts_by_name = {part.name: part for spec in results for part in _parts(spec, specs)}
         for spec in results:
             self._examine(spec)
             if not self._is_empty(spec, True):
                 self._antecedents(spec)
-        for part in parts.values():
+        for part in parts_by_name.values():
             if part.name not in {spec.name for spec in results}:
                 self._examine(part)
-        self._pairs(tuple(parts.values()), results)
+        self._pairs(tuple(parts_by_name.values()), results)
         self._notes += seam_texts((spec.formula for spec in results), self._specification.regions)
-        described = tuple(self._describe(spec, examples) for spec in results)
-        places = sorted(
+        spec_examinations = tuple(self._describe(spec, examples) for spec in results)
+        findings = sorted(
             self._findings, key=lambda finding: (finding.diagnostic.line, finding.diagnostic.column)
         )
-        return Examination(tuple(places), described, tuple(self._notes))
+        return Examination(tuple(findings), spec_examinations, tuple(self._notes))
 
     def why_empty(self, part: NamedSpec, satisfied: bool) -> Finding | None:
         """Return the finding that no run satisfies, or violates, a part; None if such a run may exist."""
@@ -320,22 +322,22 @@ class _Examiner:
         if key not in self._answers:
             reading = self._reading(part)
             runs = reading.satisfying if satisfied else reading.violating
-            what = "whether a run satisfies it" if satisfied else "whether a run violates it"
+            question = "whether a run satisfies it" if satisfied else "whether a run violates it"
             known_runs = [] if runs is None else [runs]
-            self._answers[key] = self._ask(part.name, what, *known_runs, whole=(part, satisfied))
+            self._answers[key] = self._ask(part.name, question, *known_runs, whole_part=(part, satisfied))
         return self._answers[key]
 
     def _ask(
-        self, name: str, what: str, *runs: Runs, whole: tuple[NamedSpec, bool] | None = None
+        self, name: str, question: str, *runs: Runs, whole_part: tuple[NamedSpec, bool] | None = None
     ) -> Answer | None:
         try:
             if runs:
                 return self._search.shortest(*runs)
         except UndecidedError:
             # one automaton of the whole part needs no product of several
-            if whole is not None and (answer := self._of_whole(*whole)) is not None:
+            if whole_part is not None and (answer := self._of_whole(*whole_part)) is not None:
                 return answer
-        self._undecided.setdefault(name, []).append(what)
+        self._undecided.setdefault(name, []).append(question)
         return None
 
     def _of_whole(self, part: NamedSpec, satisfied: bool) -> Answer | None:
@@ -369,30 +371,38 @@ class _Examiner:
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }
-        if (count := len(implications)) > MAX_ANTECEDENTS:
-            self._notes.append(f"of {count} implications of {part.name}, {MAX_ANTECEDENTS} were examined")
-        possible: dict[Boolean, Runs] = {}
+        if (implication_count := len(implications)) > MAX_ANTECEDENTS:
+            self._notes.append(
+                f"of {implication_count} implications of {part.name}, {MAX_ANTECEDENTS} were examined"
+            )
+        runs_by_implication: dict[Boolean, Runs] = {}
         for node in list(implications.values())[:MAX_ANTECEDENTS]:
-            if (ever := self._sometime(part, node.operands[0])) is None:
+            if (holding_runs := self._sometime(part, node.operands[0])) is None:
                 continue
             text = shortened_formula(format_formula(node.operands[0]))
-            alone = self._ask(part.name, f"whether `{text}` ever holds", ever)
-            if alone is not None and alone.word is None:
-                self._add_idle(part, node, alone, "")
-            elif alone is not None and satisfying is not None:
-                possible[node] = ever
-        if satisfying is None or not possible:
+            answer_alone = self._ask(part.name, f"whether `{text}` ever holds", holding_runs)
+            if answer_alone is not None and answer_alone.word is None:
+                self._add_idle(part, node, answer_alone, "")
+            elif answer_alone is not None and satisfying is not None:
+                runs_by_implication[node] = holding_runs
+        if satisfying is None or not runs_by_implication:
             return
         # a run in which all antecedents hold in one sample answers the question for each of them
-        once = self._sometime(part, Boolean("and", tuple(node.operands[0] for node in possible)))
-        if len(possible) > 1 and once is not None and self._search.is_found(satisfying, once):
+        joint_runs = self._sometime(
+            part, Boolean("and", tuple(node.operands[0] for node in runs_by_implication))
+        )
+        if (
+            len(runs_by_implication) > 1
+            and joint_runs is not None
+            and self._search.is_found(satisfying, joint_runs)
+        ):
             return
-        for node, ever in possible.items():
+        for node, holding_runs in runs_by_implication.items():
             text = shortened_formula(format_formula(node.operands[0]))
-            what = f"whether `{text}` holds in a run that satisfies it"
-            within = self._ask(part.name, what, satisfying, ever)
-            if within is not None and within.word is None:
-                self._add_idle(part, node, within, f" in a run that satisfies {part.name}")
+            question = f"whether `{text}` holds in a run that satisfies it"
+            joint_answer = self._ask(part.name, question, satisfying, holding_runs)
+            if joint_answer is not None and joint_answer.word is None:
+                self._add_idle(part, node, joint_answer, f" in a run that satisfies {part.name}")
 
     def _add_idle(self, part: NamedSpec, node: Boolean, answer: Answer, where: str) -> None:
         text = shortened_formula(format_formula(node.operands[0]))
@@ -409,11 +419,13 @@ class _Examiner:
 
     def _pairs(self, parts: Sequence[NamedSpec], results: Sequence[NamedSpec]) -> None:
         """Compare specs that share an object, region or signal; faulty specs are left out."""
-        sound = [part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))]
-        subjects = {part.name: _subject(part.formula) for part in sound}
+        faultless_parts = [
+            part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))
+        ]
+        subjects = {part.name: _subject(part.formula) for part in faultless_parts}
         pairs = [
             (first, second)
-            for first, second in combinations(sound, 2)
+            for first, second in combinations(faultless_parts, 2)
             if subjects[first.name] & subjects[second.name]
         ]
         if len(pairs) > MAX_PAIRS:
@@ -421,27 +433,38 @@ class _Examiner:
         for first, second in pairs[:MAX_PAIRS]:
             satisfying = [self._reading(part).satisfying for part in (first, second)]
             violating = [self._reading(part).violating for part in (first, second)]
-            both = self._compare(first, "contradicts", second, *satisfying)
-            if both is not None and both.word is None:
+            joint_answer = self._compare(first, "contradicts", second, *satisfying)
+            if joint_answer is not None and joint_answer.word is None:
                 message = f"no run satisfies both {first.name} and {second.name}"
                 self._add(
-                    "contradiction", (first.name, second.name), second.span, both, message, _CONTRADICTION
+                    "contradiction",
+                    (first.name, second.name),
+                    second.span,
+                    joint_answer,
+                    message,
+                    _CONTRADICTION,
                 )
                 continue
-            after = self._compare(first, "implies", second, satisfying[0], violating[1])
-            before = self._compare(second, "implies", first, satisfying[1], violating[0])
-            follows = after is not None and after.word is None
-            leads = before is not None and before.word is None
-            if follows and leads:
+            forward_answer = self._compare(first, "implies", second, satisfying[0], violating[1])
+            backward_answer = self._compare(second, "implies", first, satisfying[1], violating[0])
+            is_second_implied = forward_answer is not None and forward_answer.word is None
+            is_first_implied = backward_answer is not None and backward_answer.word is None
+            if is_second_implied and is_first_implied:
                 message = f"{second.name} says the same as {first.name}"
-                both_ways = joint([answer for answer in (after, before) if answer is not None])
-                self._add("implied", (second.name, first.name), second.span, both_ways, message, _SAME)
-            elif follows:
+                merged_answer = joint(
+                    [answer for answer in (forward_answer, backward_answer) if answer is not None]
+                )
+                self._add("implied", (second.name, first.name), second.span, merged_answer, message, _SAME)
+            elif is_second_implied:
                 message = f"{second.name} follows from {first.name}"
-                self._add("implied", (second.name, first.name), second.span, after, message, _IMPLIED)
-            elif leads:
+                self._add(
+                    "implied", (second.name, first.name), second.span, forward_answer, message, _IMPLIED
+                )
+            elif is_first_implied:
                 message = f"{first.name} follows from {second.name}"
-                self._add("implied", (first.name, second.name), first.span, before, message, _IMPLIED)
+                self._add(
+                    "implied", (first.name, second.name), first.span, backward_answer, message, _IMPLIED
+                )
 
     def _compare(self, first: NamedSpec, verb: str, second: NamedSpec, *runs: Runs | None) -> Answer | None:
         known_runs = [options for options in runs if options is not None]
@@ -455,8 +478,8 @@ class _Examiner:
         if answer is None:
             return
         reason = reason_of(answer)
-        loose = [name for name in specs if name in self._readings and self._readings[name].reason]
-        if loose:
+        loose_specs = [name for name in specs if name in self._readings and self._readings[name].reason]
+        if loose_specs:
             reason += ", however its bounds and past operators are read"
         diagnostic = self._source.diagnostic("warning", span, f"{message}: {reason}", hint)
         self._findings.append(Finding(kind, specs, reason, answer.exclusions, diagnostic))
@@ -475,14 +498,20 @@ class _Examiner:
         )
 
     def _describe(self, spec: NamedSpec, examples: bool) -> SpecExamination:
-        runs: list[Example | None] = []
+        shortest_runs: list[Example | None] = []
         for satisfied in (True, False):
             answer = self._answer(spec, satisfied)
             word = None if answer is None else answer.word
-            runs.append(self._example(spec, satisfied, word) if word is not None and examples else None)
+            shortest_runs.append(
+                self._example(spec, satisfied, word) if word is not None and examples else None
+            )
         undecided = tuple(self._undecided.get(spec.name, ()))
         return SpecExamination(
-            spec.name, self._reading(spec).reason, undecided, tuple(_unrelated_texts(spec.formula)), *runs
+            spec.name,
+            self._reading(spec).reason,
+            undecided,
+            tuple(_unrelated_texts(spec.formula)),
+            *shortest_runs,
         )
 
 
@@ -497,23 +526,23 @@ _SAME: Final = "leave one of them out"
 def reason_of(answer: Answer) -> str:
     """Return the reason of an answer without a run."""
     if answer.by_logic or not answer.exclusions:
-        opposites = "".join(
+        opposites_text = "".join(
             f"; `{text}` and `{opposite}` are opposites" for text, opposite in answer.opposites[:_SHOWN]
         )
-        equals = "".join(
+        equals_text = "".join(
             f"; `{text}` has the robustness of `{equal}`" for text, equal in answer.equals[:_SHOWN]
         )
-        return f"by logic alone, whatever is measured{opposites}{equals}"
+        return f"by logic alone, whatever is measured{opposites_text}{equals_text}"
     texts = [_exclusion_text(exclusion) for exclusion in answer.exclusions[:_SHOWN]]
-    more = len(answer.exclusions) - len(texts)
-    return "; ".join(texts) + (f"; and {more} more" if more else "")
+    hidden_count = len(answer.exclusions) - len(texts)
+    return "; ".join(texts) + (f"; and {hidden_count} more" if hidden_count else "")
 
 
 def _exclusion_text(texts: Sequence[str]) -> str:
     if len(texts) == 1:
         return f"`{texts[0]}` never holds"
-    *most, last = (f"`{text}`" for text in texts)
-    return f"{', '.join(most)} and {last} exclude each other"
+    *first_texts, last_text = (f"`{text}`" for text in texts)
+    return f"{', '.join(first_texts)} and {last_text} exclude each other"
 
 
 def _unrelated_texts(formula: Formula) -> Iterator[str]:

@@ -73,17 +73,19 @@ def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
     """Return the largest box in a part that has the part's centroid and the shape of its bounding box."""
     x, y = centre_of(Footprint((part,)))
     if len(part.vertices) < 3:
-        half = part.radius / math.sqrt(2.0)
-        return (x - half, x + half), (y - half, y + half)
+        half_side = part.radius / math.sqrt(2.0)
+        return (x - half_side, x + half_side), (y - half_side, y + half_side)
     width, height = np.ptp(part.vertices, axis=0).tolist()
-    after = np.roll(part.vertices, -1, axis=0)
+    next_vertices = np.roll(part.vertices, -1, axis=0)
     # the corners are in counter-clockwise order, so these normals point outwards
-    normals = np.column_stack([after[:, 1] - part.vertices[:, 1], part.vertices[:, 0] - after[:, 0]])
-    room = (normals * (part.vertices - (x, y))).sum(axis=1)
-    share = float((room / (np.abs(normals) @ (width / 2.0, height / 2.0))).min())
-    return (x - share * width / 2.0, x + share * width / 2.0), (
-        y - share * height / 2.0,
-        y + share * height / 2.0,
+    normals = np.column_stack(
+        [next_vertices[:, 1] - part.vertices[:, 1], part.vertices[:, 0] - next_vertices[:, 0]]
+    )
+    edge_distances = (normals * (part.vertices - (x, y))).sum(axis=1)
+    scale = float((edge_distances / (np.abs(normals) @ (width / 2.0, height / 2.0))).min())
+    return (x - scale * width / 2.0, x + scale * width / 2.0), (
+        y - scale * height / 2.0,
+        y + scale * height / 2.0,
     )
 
 
@@ -186,18 +188,22 @@ def placements(
         CannotPlaceError: a fact mentions something that cannot be placed.
     """
     unit = _unit(setting, facts)
-    turns = [_turns(setting, sample_facts) for sample_facts in facts]
-    places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
+    yaws_by_sample = [_turns(setting, sample_facts) for sample_facts in facts]
+    fact_positions = [
+        (sample_index, fact_index)
+        for sample_index, sample_facts in enumerate(facts)
+        for fact_index in range(len(sample_facts))
+    ]
     # margins and sizes in units: easy to see at first, then less so
     for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
         attempt = _Attempt(setting, unit, margin * unit, spread)
         required: list[Inequality] = list(attempt.sizes())
         choices: list[Ways] = []
-        for label, (index, place) in enumerate(places):
-            fact, value = facts[index][place]
+        for label, (sample_index, fact_index) in enumerate(fact_positions):
+            fact, value = facts[sample_index][fact_index]
             ways = [
                 [inequality._replace(label=label) for inequality in way]
-                for way in attempt.ways(fact, value, index)
+                for way in attempt.ways(fact, value, sample_index)
             ]
             if len(ways) == 1:
                 required += ways[0]
@@ -205,9 +211,18 @@ def placements(
                 choices.append(ways)
         solution = attempt.solve(required, choices, len(facts))
         if not isinstance(solution, frozenset):
-            yield tuple(attempt.sample(solution, at, turn, period_ns) for at, turn in enumerate(turns)), None
+            yield (
+                tuple(
+                    attempt.sample(solution, number, yaws, period_ns)
+                    for number, yaws in enumerate(yaws_by_sample)
+                ),
+                None,
+            )
         else:
-            yield None, frozenset(places[label] for label in solution) if attempt.is_finished else None
+            yield (
+                None,
+                frozenset(fact_positions[label] for label in solution) if attempt.is_finished else None,
+            )
 
 
 def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
@@ -219,8 +234,8 @@ def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> flo
         return min(lengths) / 4.0 or 1.0
     thresholds = [
         abs(float(fact.threshold))
-        for sample in facts
-        for fact, _ in sample
+        for sample_facts in facts
+        for fact, _ in sample_facts
         if any(isinstance(quantity, (SignedDistance, Protrusion)) for quantity, _ in fact.weights)
     ]
     return max(thresholds, default=0.0) or 1.0
@@ -234,7 +249,7 @@ class _Attempt:
         self._unit = unit
         self._margin = margin
         self._spread = spread
-        self._left = MAX_SOLUTIONS
+        self._solutions_left = MAX_SOLUTIONS
 
     def sizes(self) -> Iterator[Inequality]:
         """Yield limits of the sizes of boxes, so that no box is too small or too large to see."""
@@ -254,34 +269,34 @@ class _Attempt:
             if fact.alone is value:
                 return []
             raise CannotPlaceError(f"objects are not placed for `{fact.texts[0]}`")
-        rises = (fact.side != "<=") == value
+        is_lower_limit = (fact.side != "<=") == value
         margin = 0.0 if value and fact.side != ">" else self._margin
-        bound = float(fact.threshold) + (margin if rises else -margin)
+        bound = float(fact.threshold) + (margin if is_lower_limit else -margin)
         quantities = [quantity for quantity, _ in fact.weights]
         if isinstance(quantities[0], Misalignment):
             # `_turns` decided the orientations before
             return []
         if all(isinstance(quantity, (Projection, CentroidProjection, Signal)) for quantity in quantities):
-            total = _Amount({})
+            weighted_sum = _Amount({})
             for quantity, weight in fact.weights:
-                total = total.plus(self._amount(quantity, index), float(weight))
-            return [[total.at_least(bound) if rises else total.at_most(bound)]]
+                weighted_sum = weighted_sum.plus(self._amount(quantity, index), float(weight))
+            return [[weighted_sum.at_least(bound) if is_lower_limit else weighted_sum.at_most(bound)]]
         if len(quantities) == 1:
-            return self._relation(quantities[0], rises, bound, index)
+            return self._relation(quantities[0], is_lower_limit, bound, index)
         if len(quantities) == 2 and fact.weights[1][1] == -1:
             # d1 - d2 >= bound follows from d1 >= middle + bound and d2 <= middle
             return [
                 [*first_way, *second_way]
                 for middle in (0.0, self._unit, 3.0 * self._unit)
-                for first_way in self._relation(quantities[0], rises, middle + bound, index)
-                for second_way in self._relation(quantities[1], not rises, middle, index)
+                for first_way in self._relation(quantities[0], is_lower_limit, middle + bound, index)
+                for second_way in self._relation(quantities[1], not is_lower_limit, middle, index)
             ]
         raise CannotPlaceError(f"`{fact.texts[0]}` compares several distances")
 
     @property
     def is_finished(self) -> bool:
         """Whether the search ended before its limit."""
-        return self._left > 0
+        return self._solutions_left > 0
 
     def solve(
         self, required: list[Inequality], choices: Sequence[Ways], samples: int
@@ -291,28 +306,28 @@ class _Attempt:
         The search branches on the first choice that the current values do not fulfil. A conflict without
         that choice ends the branch, because it excludes all alternatives of the choice.
         """
-        self._left -= 1
-        start = self._start(samples)
-        solution = solve(required, exact=False, start=start)
+        self._solutions_left -= 1
+        start_values = self._start(samples)
+        solution = solve(required, exact=False, start=start_values)
         if solution.values is None:
             if solution.conflict is None:
-                self._left = 0
+                self._solutions_left = 0
             return solution.conflict or frozenset()
-        values = {**start, **{key: float(value) for key, value in solution.values.items()}}
+        values = {**start_values, **{key: float(value) for key, value in solution.values.items()}}
         ways = next((ways for ways in choices if not any(_all_hold(way, values) for way in ways)), None)
         if ways is None:
             return values
         label = ways[0][0].label
-        conflicts: frozenset[int] = frozenset()
+        conflict_labels: frozenset[int] = frozenset()
         # the alternative with the least violation comes first
         for way in sorted(ways, key=lambda way: _missing(way, values)):
-            if self._left <= 0:
+            if self._solutions_left <= 0:
                 break
-            outcome = self.solve([*required, *way], choices, samples)
-            if not isinstance(outcome, frozenset) or label not in outcome:
-                return outcome
-            conflicts |= outcome
-        return conflicts
+            result = self.solve([*required, *way], choices, samples)
+            if not isinstance(result, frozenset) or label not in result:
+                return result
+            conflict_labels |= result
+        return conflict_labels
 
     def sample(
         self, values: Mapping[Any, float], index: int, turns: Mapping[str, float], period_ns: int
@@ -336,43 +351,47 @@ class _Attempt:
     def _start(self, samples: int) -> dict[Any, float]:
         """Return the initial values of the unknowns: objects in a row below all regions, signals at 0."""
         boxes = [self._setting.region_box(name, outer=True) for name in self._setting.regions]
-        left = min((box[0][0] for box in boxes), default=0.0)
+        left_edge = min((box[0][0] for box in boxes), default=0.0)
         bottom = min((box[1][0] for box in boxes), default=0.0) - 2.0 * self._unit
-        start: dict[Any, float] = {}
-        for number, name in enumerate(self._setting.objects):
-            place = {"x": left + 2.0 * number * self._unit, "y": bottom, "z": 0.0}
+        start_values: dict[Any, float] = {}
+        for object_index, name in enumerate(self._setting.objects):
+            position = {"x": left_edge + 2.0 * object_index * self._unit, "y": bottom, "z": 0.0}
             for axis in self._setting.axes:
-                start["size", name, axis] = self._unit
-                start.update({("at", name, axis, index): place[axis] for index in range(samples)})
-        start.update(
+                start_values["size", name, axis] = self._unit
+                start_values.update({("at", name, axis, index): position[axis] for index in range(samples)})
+        start_values.update(
             {("signal", name, index): 0.0 for name in self._setting.signals for index in range(samples)}
         )
-        return start
+        return start_values
 
-    def _relation(self, quantity: Quantity, rises: bool, bound: float, index: int) -> Ways:
+    def _relation(self, quantity: Quantity, is_lower_limit: bool, bound: float, index: int) -> Ways:
         """Return the alternatives that bound a distance or a protrusion from below (`rises`) or above."""
         if isinstance(quantity, SignedDistance):
-            first, second = plain(quantity.first), plain(quantity.second)
-            bound += float(radius_of(first) + radius_of(second))
+            first_term, second_term = plain(quantity.first), plain(quantity.second)
+            bound += float(radius_of(first_term) + radius_of(second_term))
         elif isinstance(quantity, Protrusion):
-            first, second = plain(quantity.inner), plain(quantity.outer)
-            bound += float(radius_of(second) - radius_of(first))
+            first_term, second_term = plain(quantity.inner), plain(quantity.outer)
+            bound += float(radius_of(second_term) - radius_of(first_term))
         else:
             raise CannotPlaceError("it compares quantities of several kinds")
         # a box replaces a region so that the relation gets harder: around it to be far, inside it to be near
-        outers = (rises, rises) if isinstance(quantity, SignedDistance) else (not rises, rises)
-        a = self._sides(first, index, outer=outers[0])
-        b = self._sides(second, index, outer=outers[1])
+        use_outer_boxes = (
+            (is_lower_limit, is_lower_limit)
+            if isinstance(quantity, SignedDistance)
+            else (not is_lower_limit, is_lower_limit)
+        )
+        first_sides = self._sides(first_term, index, outer=use_outer_boxes[0])
+        second_sides = self._sides(second_term, index, outer=use_outer_boxes[1])
         gaps: list[_Amount] = []
-        for (a_low, a_high), (b_low, b_high) in zip(a, b, strict=False):
+        for (a_low, a_high), (b_low, b_high) in zip(first_sides, second_sides, strict=False):
             if isinstance(quantity, SignedDistance):
                 gaps += [b_low.plus(a_high, -1.0), a_low.plus(b_high, -1.0)]
             else:
                 gaps += [a_high.plus(b_high, -1.0), b_low.plus(a_low, -1.0)]
-        if rises:
+        if is_lower_limit:
             return [[gap.at_least(bound)] for gap in gaps]
-        share = _SHARES[min(len(a), len(b))] if bound > 0.0 else 1.0
-        return [[gap.at_most(share * bound) for gap in gaps]]
+        gap_share = _SHARES[min(len(first_sides), len(second_sides))] if bound > 0.0 else 1.0
+        return [[gap.at_most(gap_share * bound) for gap in gaps]]
 
     def _sides(self, term: Term, index: int, *, outer: bool) -> list[tuple[_Amount, _Amount]]:
         """Return the least and the greatest coordinate of a term along each axis."""
@@ -384,11 +403,11 @@ class _Attempt:
             sides = self._sides(term.term, index, outer=outer)
             middles = [_Amount({}).plus(low, 0.5).plus(high, 0.5) for low, high in sides]
             return [(middle, middle) for middle in middles]
-        name, at = _object(term, index)
+        object_name, sample_index = _object(term, index)
         sides = []
         for axis in self._setting.axes:
-            low = _Amount({("at", name, axis, at): 1.0})
-            sides.append((low, low.plus(_Amount({("size", name, axis): 1.0}))))
+            low = _Amount({("at", object_name, axis, sample_index): 1.0})
+            sides.append((low, low.plus(_Amount({("size", object_name, axis): 1.0}))))
         return sides
 
     def _amount(self, quantity: Quantity, index: int) -> _Amount:
@@ -397,15 +416,15 @@ class _Attempt:
         if isinstance(quantity, Signal):
             return _Amount({("signal", quantity.name, index): 1.0})
         assert isinstance(quantity, (Projection, CentroidProjection))
-        axis = "xyz".index(quantity.axis)
+        axis_index = "xyz".index(quantity.axis)
         if isinstance(quantity, CentroidProjection) and isinstance(quantity.term, RegionName):
             footprint = footprint_from_outline(self._setting.regions[quantity.term.name])
-            centres = [centre_of(Footprint((part,)))[axis] for part in footprint.parts]
-            return _Amount({}, min(centres) if quantity.side == "min" else max(centres))
+            centre_coordinates = [centre_of(Footprint((part,)))[axis_index] for part in footprint.parts]
+            return _Amount({}, min(centre_coordinates) if quantity.side == "min" else max(centre_coordinates))
         sides = self._sides(quantity.term, index, outer=True)
-        if axis >= len(sides):
+        if axis_index >= len(sides):
             raise CannotPlaceError("a region without a height is compared along z")
-        low, high = sides[axis]
+        low, high = sides[axis_index]
         if isinstance(quantity, CentroidProjection):
             return _Amount({}).plus(low, 0.5).plus(high, 0.5)
         return low if quantity.side == "min" else high
@@ -428,7 +447,7 @@ def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, fl
     Raises:
         CannotPlaceError: there are no such yaws, or too many objects.
     """
-    asked = [
+    orientation_facts = [
         (fact, value)
         for fact, value in facts
         if fact.weights and isinstance(fact.weights[0][0], Misalignment)
@@ -436,16 +455,14 @@ def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, fl
     if len(setting.turned) > MAX_TURNED:
         raise CannotPlaceError(f"more than {MAX_TURNED} objects have orientations")
     for quarters in product(range(4), repeat=len(setting.turned)):
-        turns = {
-            name: math.pi / 2.0 * quarter for name, quarter in zip(setting.turned, quarters, strict=True)
-        }
-        if all(_is_turned(fact, value, turns) for fact, value in asked):
-            return turns
+        yaws = {name: math.pi / 2.0 * quarter for name, quarter in zip(setting.turned, quarters, strict=True)}
+        if all(_is_turned(fact, value, yaws) for fact, value in orientation_facts):
+            return yaws
     raise CannotPlaceError("no turns by quarters fit")
 
 
-def _is_turned(fact: Fact, value: bool, turns: Mapping[str, float]) -> bool:
-    total = 0.0
+def _is_turned(fact: Fact, value: bool, yaws: Mapping[str, float]) -> bool:
+    weighted_sum = 0.0
     for quantity, weight in fact.weights:
         if not isinstance(quantity, Misalignment):
             raise CannotPlaceError("it compares quantities of several kinds")
@@ -455,9 +472,9 @@ def _is_turned(fact: Fact, value: bool, turns: Mapping[str, float]) -> bool:
         )
         if first_index or second_index:
             raise CannotPlaceError("it compares orientations over time")
-        total += float(weight) * (1.0 - math.cos(turns[first_name] - turns[second_name]))
-    rises = (fact.side != "<=") == value
-    return total > float(fact.threshold) if rises else total < float(fact.threshold)
+        weighted_sum += float(weight) * (1.0 - math.cos(yaws[first_name] - yaws[second_name]))
+    is_lower_limit = (fact.side != "<=") == value
+    return weighted_sum > float(fact.threshold) if is_lower_limit else weighted_sum < float(fact.threshold)
 
 
 def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
@@ -466,11 +483,11 @@ def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
 
 def _missing(way: Sequence[Inequality], values: Mapping[Any, float]) -> float:
     """Return the greatest violation of some inequalities; 0 if all hold."""
-    sums = (
+    excesses = (
         sum(weight * values[key] for key, weight in inequality.coefficients) - inequality.bound
         for inequality in way
     )
-    return float(max(0.0, *sums)) if len(way) > 1 else float(max(0.0, next(sums)))
+    return float(max(0.0, *excesses)) if len(way) > 1 else float(max(0.0, next(excesses)))
 
 
 def _round(value: float) -> float:
@@ -543,7 +560,7 @@ def shortest_example(
     periods_ns = (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS)
     if rate_hz is not None:
         periods_ns = (round(_SECOND_NS / rate_hz),)
-    first: Example | None = None
+    first_example: Example | None = None
     avoided: list[Word] = []
     while len(avoided) < MAX_WORDS:
         facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
@@ -559,21 +576,27 @@ def shortest_example(
             placement, note, core = None, str(reason), None
         if placement is not None:
             return Example(verdict, sentences, *placement)
-        first = first or Example(verdict, sentences, note=note)
+        first_example = first_example or Example(verdict, sentences, note=note)
         if core is None:
             break
-        numbers = [sorted(cube) for cube in word]
-        blamed = tuple(
-            {numbers[index][place]: word[index][numbers[index][place]] for at, place in core if at == index}
+        fact_numbers = [sorted(cube) for cube in word]
+        conflict_word = tuple(
+            {
+                fact_numbers[index][fact_index]: word[index][fact_numbers[index][fact_index]]
+                for sample_index, fact_index in core
+                if sample_index == index
+            }
             for index in range(len(word))
         )
         # a conflict within one sample excludes its facts in every sample
-        avoided.append(tuple(filter(None, blamed)) if sum(map(bool, blamed)) == 1 else blamed)
-        following = another(avoided)
-        if following is None:
+        avoided.append(
+            tuple(filter(None, conflict_word)) if sum(map(bool, conflict_word)) == 1 else conflict_word
+        )
+        next_word = another(avoided)
+        if next_word is None:
             break
-        word = following
-    return first if is_exact else None
+        word = next_word
+    return first_example if is_exact else None
 
 
 def _place(
@@ -599,8 +622,8 @@ def _place(
     setting, note = _setting(specification, spec), ""
     core: Core | None = None
     for period_ns in periods_ns:
-        for samples, excluded in placements(setting, facts, period_ns):
-            core = excluded
+        for samples, conflict in placements(setting, facts, period_ns):
+            core = conflict
             if samples is None:
                 continue
             try:
@@ -634,16 +657,16 @@ def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tu
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
     """Return the setting of a spec, with the objects and signals of all specs, so that all are evaluated."""
     own_atoms = _atoms(spec)
-    every = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
-    upright = is_about_heights(every)
-    turned = dict.fromkeys(_turned_names(own_atoms))
-    if len({*turned, *_turned_names(every)}) <= MAX_TURNED:
-        turned.update(dict.fromkeys(_turned_names(every)))
+    all_atoms = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
+    is_upright = is_about_heights(all_atoms)
+    turned_names = dict.fromkeys(_turned_names(own_atoms))
+    if len({*turned_names, *_turned_names(all_atoms)}) <= MAX_TURNED:
+        turned_names.update(dict.fromkeys(_turned_names(all_atoms)))
     bases = [base_of(term) for atom in own_atoms for term in terms_of(atom.expression)]
-    regions = [base.name for base in bases if isinstance(base, RegionName)]
-    named = {name: specification.regions[name] for name in dict.fromkeys(regions)}
+    region_names = [base.name for base in bases if isinstance(base, RegionName)]
+    regions_by_name = {name: specification.regions[name] for name in dict.fromkeys(region_names)}
     objects, signals = object_names(specification), signal_names(specification)
-    return Setting(objects, signals, named, upright, tuple(turned))
+    return Setting(objects, signals, regions_by_name, is_upright, tuple(turned_names))
 
 
 def _atoms(spec: NamedSpec) -> list[Atom]:
@@ -659,14 +682,14 @@ def _turned_names(atoms: Iterable[Atom]) -> list[str]:
 
 
 def _row(sample: Sample) -> dict[str, Any]:
-    objects = []
-    for name, tracked in sample.objects.items():
-        (part,) = tracked.footprint.parts
+    object_rows = []
+    for name, tracked_object in sample.objects.items():
+        (part,) = tracked_object.footprint.parts
         row: dict[str, Any] = {"name": name, "polygon": part.vertices.tolist()}
-        if tracked.yaw is not None:
-            row["yaw"] = tracked.yaw
-        if tracked.height is not None:
-            row["height"] = list(tracked.height)
-        objects.append(row)
+        if tracked_object.yaw is not None:
+            row["yaw"] = tracked_object.yaw
+        if tracked_object.height is not None:
+            row["height"] = list(tracked_object.height)
+        object_rows.append(row)
     signals = {"signals": dict(sample.signals)} if sample.signals else {}
-    return {"time_ns": sample.time_ns, "objects": objects, **signals}
+    return {"time_ns": sample.time_ns, "objects": object_rows, **signals}

@@ -54,43 +54,47 @@ def laws(
         between: distances of regions that are apart, and protrusions of regions from enclosing ones.
         diameters: diameters of regions by name, for objects without a gap in height; empty if heights matter.
     """
-    used = list(dict.fromkeys(quantities))
-    present = set(terms_in(used))
+    all_quantities = list(dict.fromkeys(quantities))
+    present_terms = set(terms_in(all_quantities))
     between = {
-        measurement: value for measurement, value in between.items() if present.issuperset(measurement.terms)
+        measurement: value
+        for measurement, value in between.items()
+        if present_terms.issuperset(measurement.terms)
     }
-    used += [measurement for measurement in between if measurement not in used]
-    terms = [term for term in terms_in(used) if is_solid(term)]
-    inequalities = [*_single(used), *_region_laws(between)]
-    extents = _Extents(used, terms, regions)
-    distances = [quantity for quantity in used if isinstance(quantity, SignedDistance)]
-    protrusions = [quantity for quantity in used if isinstance(quantity, Protrusion)]
+    all_quantities += [measurement for measurement in between if measurement not in all_quantities]
+    solid_terms = [term for term in terms_in(all_quantities) if is_solid(term)]
+    inequalities = [*_single(all_quantities), *_region_laws(between)]
+    extents = _Extents(all_quantities, solid_terms, regions)
+    distances = [quantity for quantity in all_quantities if isinstance(quantity, SignedDistance)]
+    protrusions = [quantity for quantity in all_quantities if isinstance(quantity, Protrusion)]
     inequalities += _enlargement(distances, protrusions)
     # in text order (a set has no order), so that equal questions take equal steps
-    bare = dict.fromkeys(
+    bare_distances = dict.fromkeys(
         _distance(without_radius(distance.first), without_radius(distance.second)) for distance in distances
     )
-    outside = dict.fromkeys(_bare(protrusion) for protrusion in protrusions)
-    held: set[object] = {*inside, *between}
-    within = dict.fromkeys(protrusion for protrusion in outside if protrusion in held)
-    inequalities += _transitive(outside, within, regions)
-    inequalities += _nesting(bare, within, regions)
-    inequalities += _across(bare, outside, diameters)
-    inequalities += _centres(outside, regions)
+    bare_protrusions = dict.fromkeys(_bare(protrusion) for protrusion in protrusions)
+    known_inside: set[object] = {*inside, *between}
+    inside_protrusions = dict.fromkeys(
+        protrusion for protrusion in bare_protrusions if protrusion in known_inside
+    )
+    inequalities += _transitive(bare_protrusions, inside_protrusions, regions)
+    inequalities += _nesting(bare_distances, inside_protrusions, regions)
+    inequalities += _across(bare_distances, bare_protrusions, diameters)
+    inequalities += _centres(bare_protrusions, regions)
     if extents.matter:
         # protrusions between regions are already measured and rounded, so exact extents add nothing
         inequalities += extents.laws(
-            bare, [protrusion for protrusion in outside if protrusion not in between]
+            bare_distances, [protrusion for protrusion in bare_protrusions if protrusion not in between]
         )
     return inequalities
 
 
 def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequality:
     """Return the law that a weighted sum of quantities is at most a bound."""
-    total: dict[Quantity, int] = {}
+    weight_by_quantity: dict[Quantity, int] = {}
     for quantity, weight in weights:
-        total[quantity] = total.get(quantity, 0) + weight
-    return Inequality(tuple((key, value) for key, value in total.items() if value), bound)
+        weight_by_quantity[quantity] = weight_by_quantity.get(quantity, 0) + weight
+    return Inequality(tuple((key, value) for key, value in weight_by_quantity.items() if value), bound)
 
 
 def _distance(a: Term, b: Term) -> SignedDistance:
@@ -99,9 +103,9 @@ def _distance(a: Term, b: Term) -> SignedDistance:
     return SignedDistance(first, second)
 
 
-def _single(used: Iterable[Quantity]) -> Iterator[Inequality]:
+def _single(quantities: Iterable[Quantity]) -> Iterator[Inequality]:
     """Yield the laws of single measurements."""
-    for quantity in used:
+    for quantity in quantities:
         match quantity:
             case Misalignment():
                 yield _law((quantity, -1))
@@ -120,53 +124,63 @@ def _region_laws(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality
 
 
 def _across(
-    distances: Iterable[SignedDistance], outside: Mapping[Protrusion, None], diameters: Mapping[str, Fraction]
+    distances: Iterable[SignedDistance],
+    bare_protrusions: Mapping[Protrusion, None],
+    diameters: Mapping[str, Fraction],
 ) -> Iterator[Inequality]:
     """Yield: two objects are at most the diameter of a region apart, plus their protrusions from it."""
-    for pair, (name, diameter) in product(distances, diameters.items()):
+    for distance, (name, diameter) in product(distances, diameters.items()):
         region = RegionName(name)
-        rooms = [Protrusion(pair.first, region), Protrusion(pair.second, region)]
-        if pair.first != pair.second and all(protrusion in outside for protrusion in rooms):
-            law = _law((pair, 1), *((protrusion, -1) for protrusion in rooms), bound=diameter)
+        pair_protrusions = [Protrusion(distance.first, region), Protrusion(distance.second, region)]
+        if distance.first != distance.second and all(
+            protrusion in bare_protrusions for protrusion in pair_protrusions
+        ):
+            law = _law((distance, 1), *((protrusion, -1) for protrusion in pair_protrusions), bound=diameter)
             yield law._replace(label=LEVEL)
 
 
-def _centres(outside: Mapping[Protrusion, None], regions: Mapping[str, Outline]) -> Iterator[Inequality]:
+def _centres(
+    bare_protrusions: Mapping[Protrusion, None], regions: Mapping[str, Outline]
+) -> Iterator[Inequality]:
     """Yield: the protrusion of a centre from a convex region is at most that of the whole footprint."""
-    for protrusion in outside:
+    for protrusion in bare_protrusions:
         inner, outer = protrusion.inner, protrusion.outer
         if not isinstance(inner, Centre) or not isinstance(outer, RegionName):
             continue
-        whole, outline = Protrusion(inner.term, outer), regions.get(outer.name)
-        if whole in outside and outline is not None and len(footprint_from_outline(outline).parts) == 1:
-            yield _law((protrusion, 1), (whole, -1))
+        whole_protrusion, outline = Protrusion(inner.term, outer), regions.get(outer.name)
+        if (
+            whole_protrusion in bare_protrusions
+            and outline is not None
+            and len(footprint_from_outline(outline).parts) == 1
+        ):
+            yield _law((protrusion, 1), (whole_protrusion, -1))
 
 
 def _enlargement(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
     """Yield the greatest change of a measurement by enlargement; the change is less if heights decide it."""
-    for first, second in _variants(
+    for first_distance, second_distance in _variants(
         distances, lambda distance: _distance(*map(without_radius, (distance.first, distance.second)))
     ):
-        change = _reach(first) - _reach(second)
-        yield _law((first, 1), (second, -1), bound=max(-change, Fraction(0)))
-        yield _law((second, 1), (first, -1), bound=max(change, Fraction(0)))
-    for inner, outer in _variants(protrusions, _bare):
-        change = _growth(inner) - _growth(outer)
-        yield _law((inner, 1), (outer, -1), bound=max(change, Fraction(0)))
-        yield _law((outer, 1), (inner, -1), bound=max(-change, Fraction(0)))
+        change = _reach(first_distance) - _reach(second_distance)
+        yield _law((first_distance, 1), (second_distance, -1), bound=max(-change, Fraction(0)))
+        yield _law((second_distance, 1), (first_distance, -1), bound=max(change, Fraction(0)))
+    for first_protrusion, second_protrusion in _variants(protrusions, _bare):
+        change = _growth(first_protrusion) - _growth(second_protrusion)
+        yield _law((first_protrusion, 1), (second_protrusion, -1), bound=max(change, Fraction(0)))
+        yield _law((second_protrusion, 1), (first_protrusion, -1), bound=max(-change, Fraction(0)))
 
 
 _Measured = TypeVar("_Measured", SignedDistance, Protrusion)
 
 
 def _variants(
-    measured: list[_Measured], bare_of: Callable[[_Measured], _Measured]
+    measurements: list[_Measured], bare_of: Callable[[_Measured], _Measured]
 ) -> Iterator[tuple[_Measured, _Measured]]:
     """Yield pairs of measurements of the same terms with different enlargements."""
-    alike: dict[_Measured, dict[_Measured, None]] = {}
-    for measurement in measured:
-        alike.setdefault(bare_of(measurement), {})[measurement] = None
-    for bare, variants in alike.items():
+    variants_by_bare: dict[_Measured, dict[_Measured, None]] = {}
+    for measurement in measurements:
+        variants_by_bare.setdefault(bare_of(measurement), {})[measurement] = None
+    for bare, variants in variants_by_bare.items():
         yield from combinations({**variants, bare: None}, 2)
 
 
@@ -183,85 +197,99 @@ def _growth(protrusion: Protrusion) -> Fraction:
 
 
 def _transitive(
-    protrusions: dict[Protrusion, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
+    protrusions: dict[Protrusion, None],
+    inside_protrusions: dict[Protrusion, None],
+    regions: Mapping[str, Outline],
 ) -> Iterator[Inequality]:
     """Yield: the protrusion of a from c is at most that of a from b plus that of b from c."""
-    outers: dict[Term, dict[Term, Protrusion]] = {}
+    protrusions_by_term: dict[Term, dict[Term, Protrusion]] = {}
     for protrusion in protrusions:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):
-            outers.setdefault(protrusion.inner, {})[protrusion.outer] = protrusion
-    beyond = {term: _reachable(term, outers) for term in outers}
-    waiting = [protrusion for by_outer in outers.values() for protrusion in by_outer.values()]
+            protrusions_by_term.setdefault(protrusion.inner, {})[protrusion.outer] = protrusion
+    reachable_by_term = {term: _reachable(term, protrusions_by_term) for term in protrusions_by_term}
+    pending_protrusions = [
+        protrusion for by_outer in protrusions_by_term.values() for protrusion in by_outer.values()
+    ]
     # the loop appends further protrusions to its list
-    for first in waiting:
-        a, b = first.inner, first.outer
-        for c, second in outers.get(b, {}).items():
+    for first_step in pending_protrusions:
+        a, b = first_step.inner, first_step.outer
+        for c, second_step in protrusions_by_term.get(b, {}).items():
             if a == c:
                 # if a is inside b with a margin, b protrudes from a by at least this margin
-                yield _law((first, -1), (second, -1))
+                yield _law((first_step, -1), (second_step, -1))
             # heights matter between a and c, but not in steps over a region b without a height
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
             # a chain that leads to no measured protrusion of a adds nothing to its single steps
             is_nested = isinstance(b, RegionName) and isinstance(c, RegionName)
-            leads = is_nested or c in outers[a] or not beyond.get(c, frozenset()).isdisjoint(outers[a])
-            if a == c or is_gap or not (leads or is_flat(a, regions)):
+            is_useful = (
+                is_nested
+                or c in protrusions_by_term[a]
+                or not reachable_by_term.get(c, frozenset()).isdisjoint(protrusions_by_term[a])
+            )
+            if a == c or is_gap or not (is_useful or is_flat(a, regions)):
                 continue
-            whole = Protrusion(a, c)
-            yield _law((whole, 1), (first, -1), (second, -1))
-            if first in within and second in within:
-                within[whole] = None
-            if whole not in protrusions:
-                protrusions[whole] = None
-                waiting.append(whole)
+            whole_protrusion = Protrusion(a, c)
+            yield _law((whole_protrusion, 1), (first_step, -1), (second_step, -1))
+            if first_step in inside_protrusions and second_step in inside_protrusions:
+                inside_protrusions[whole_protrusion] = None
+            if whole_protrusion not in protrusions:
+                protrusions[whole_protrusion] = None
+                pending_protrusions.append(whole_protrusion)
 
 
-def _reachable(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
+def _reachable(term: Term, protrusions_by_term: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
     """Return the terms that chains of protrusions reach from a term."""
-    waiting, reached = [term], set[Term]()
-    while waiting:
-        more = outers.get(waiting.pop(), {}).keys() - reached
-        reached |= more
-        waiting += more
-    return frozenset(reached)
+    pending_terms, reachable_terms = [term], set[Term]()
+    while pending_terms:
+        new_terms = protrusions_by_term.get(pending_terms.pop(), {}).keys() - reachable_terms
+        reachable_terms |= new_terms
+        pending_terms += new_terms
+    return frozenset(reachable_terms)
 
 
 def _nesting(
-    distances: dict[SignedDistance, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
+    distances: dict[SignedDistance, None],
+    inside_protrusions: dict[Protrusion, None],
+    regions: Mapping[str, Outline],
 ) -> Iterator[Inequality]:
     """Yield: a nested term overlaps its outer term, and is at least as far from any third term."""
-    inside: dict[Term, list[Protrusion]] = {}
-    for protrusion in within:
+    protrusions_by_term: dict[Term, list[Protrusion]] = {}
+    for protrusion in inside_protrusions:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):
             for term in (protrusion.inner, protrusion.outer):
-                inside.setdefault(term, []).append(protrusion)
-    waiting = list(distances)
+                protrusions_by_term.setdefault(term, []).append(protrusion)
+    pending_distances = list(distances)
     # the loop appends further distances to its list
-    for pair in waiting:
-        for end, c in ((pair.first, pair.second), (pair.second, pair.first)):
-            for protrusion in inside.get(end, ()):
+    for pair in pending_distances:
+        for end_term, c in ((pair.first, pair.second), (pair.second, pair.first)):
+            for protrusion in protrusions_by_term.get(end_term, ()):
                 a, b = protrusion.inner, protrusion.outer
-                if c in (a, b) and c != end:
+                if c in (a, b) and c != end_term:
                     yield _law((pair, 1), (protrusion, -1))
                 elif not (is_flat(a, regions) and not is_flat(b, regions)):
                     near, far = _distance(b, c), _distance(a, c)
                     yield _law((near, 1), (far, -1), (protrusion, -1))
-                    more = [distance for distance in (near, far) if distance not in distances]
-                    distances.update(dict.fromkeys(more))
-                    waiting += more
+                    new_distances = [distance for distance in (near, far) if distance not in distances]
+                    distances.update(dict.fromkeys(new_distances))
+                    pending_distances += new_distances
 
 
 class _Extents:
     """Least and greatest coordinates of terms along the axes."""
 
-    def __init__(self, used: Iterable[Quantity], terms: list[Term], regions: Mapping[str, Outline]) -> None:
-        along = [quantity for quantity in used if isinstance(quantity, (Projection, CentroidProjection))]
+    def __init__(
+        self, quantities: Iterable[Quantity], terms: list[Term], regions: Mapping[str, Outline]
+    ) -> None:
+        projections = [
+            quantity for quantity in quantities if isinstance(quantity, (Projection, CentroidProjection))
+        ]
         self._terms = terms
         self._regions = regions
-        self._upright = {quantity.term for quantity in along if quantity.axis == "z"}
+        self._upright = {quantity.term for quantity in projections if quantity.axis == "z"}
         self._centroids = dict.fromkeys(
-            quantity for quantity in along if isinstance(quantity, CentroidProjection)
+            quantity for quantity in projections if isinstance(quantity, CentroidProjection)
         )
-        self.matter = bool(along) or any(isinstance(term, RegionName) for term in terms)
+        self.matter = bool(projections) or any(isinstance(term, RegionName) for term in terms)
 
     def laws(
         self, distances: Iterable[SignedDistance], protrusions: Iterable[Protrusion]
@@ -275,9 +303,13 @@ class _Extents:
         for centroid in self._centroids:
             yield _law((Projection(centroid.term, centroid.axis, "min"), 1), (centroid, -1))
             yield _law((centroid, 1), (Projection(centroid.term, centroid.axis, "max"), -1))
-        for first, second in combinations(self._centroids, 2):
-            if (first.term, first.axis) == (second.term, second.axis):
-                low, high = (first, second) if first.side == "min" else (second, first)
+        for first_centroid, second_centroid in combinations(self._centroids, 2):
+            if (first_centroid.term, first_centroid.axis) == (second_centroid.term, second_centroid.axis):
+                low, high = (
+                    (first_centroid, second_centroid)
+                    if first_centroid.side == "min"
+                    else (second_centroid, first_centroid)
+                )
                 yield _law((low, 1), (high, -1))
         for pair in distances:
             if not (is_solid(pair.first) and is_solid(pair.second)) or pair.first == pair.second:
@@ -286,13 +318,17 @@ class _Extents:
                 for axis in self._axes(a, b):
                     gap = (Projection(b, axis, "min"), 1), (Projection(a, axis, "max"), -1)
                     yield _law(*gap, (pair, -1))
-        for inside in protrusions:
-            a, b = inside.inner, inside.outer
+        for protrusion in protrusions:
+            a, b = protrusion.inner, protrusion.outer
             if not (is_solid(a) and is_solid(b)) or a == b:
                 continue
             for axis in self._axes(a, b):
-                yield _law((Projection(a, axis, "max"), 1), (Projection(b, axis, "max"), -1), (inside, -1))
-                yield _law((Projection(b, axis, "min"), 1), (Projection(a, axis, "min"), -1), (inside, -1))
+                yield _law(
+                    (Projection(a, axis, "max"), 1), (Projection(b, axis, "max"), -1), (protrusion, -1)
+                )
+                yield _law(
+                    (Projection(b, axis, "min"), 1), (Projection(a, axis, "min"), -1), (protrusion, -1)
+                )
 
     def _axes(self, *terms: Term) -> tuple[Axis, ...]:
         is_upright = all(term in self._upright for term in terms)

@@ -70,19 +70,19 @@ def solve(
         start: initial values of quantities, which only inequalities change; 0 by default.
     """
     tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
-    added, waiting = list(inequalities), list(laws)
-    conflict = tableau.extend(added, 0)
+    active_inequalities, pending_laws = list(inequalities), list(laws)
+    conflict = tableau.extend(active_inequalities, 0)
     while conflict is None:
-        keeps = [tableau.keeps(law) for law in waiting]
-        if all(keeps):
+        kept_flags = [tableau.keeps(law) for law in pending_laws]
+        if all(kept_flags):
             return Solution(tableau.values(), None)
-        broken = list(compress(waiting, map(not_, keeps)))
-        waiting = list(compress(waiting, keeps))
-        added += broken
-        conflict = tableau.extend(broken, len(added) - len(broken))
+        violated_laws = list(compress(pending_laws, map(not_, kept_flags)))
+        pending_laws = list(compress(pending_laws, kept_flags))
+        active_inequalities += violated_laws
+        conflict = tableau.extend(violated_laws, len(active_inequalities) - len(violated_laws))
     if not conflict:
         return Solution(None, None)
-    labels = (added[index].label for index in conflict)
+    labels = (active_inequalities[index].label for index in conflict)
     return Solution(None, frozenset(label for label in labels if label is not None))
 
 
@@ -102,25 +102,27 @@ class _Tableau:
         self.conflict: set[int] | None = None
         self._start = start
         self._tolerance = tolerance
-        self._numbers: dict[Hashable, int] = {}
-        self._quantities: dict[Hashable, int] = {}
+        self._sum_variables: dict[Hashable, int] = {}
+        self._quantity_variables: dict[Hashable, int] = {}
         # for each variable that is a sum, the factors of its summands
         self._rows: dict[int, dict[int, Real]] = {}
-        self._value: list[_Pair] = []
+        self._values: list[_Pair] = []
         self._lower: list[tuple[_Pair, int] | None] = []
         self._upper: list[tuple[_Pair, int] | None] = []
 
-    def extend(self, inequalities: Sequence[Inequality], first: int) -> set[int] | None:
-        """Add bounds with numbers from `first` on and search again; return the result of `search`."""
-        for index, inequality in enumerate(inequalities, first):
+    def extend(self, inequalities: Sequence[Inequality], first_index: int) -> set[int] | None:
+        """Add bounds with numbers from `first_index` on and search again; return the result of `search`."""
+        for index, inequality in enumerate(inequalities, first_index):
             if not self.add(inequality, index):
                 return self.conflict
         return self.search()
 
     def keeps(self, inequality: Inequality) -> bool:
         """Return whether the current values keep an inequality that is not strict."""
-        whole, small = self._sum({self._quantity(key): factor for key, factor in inequality.coefficients})
-        return not self._below((inequality.bound, 0), (whole, small))
+        real_part, epsilon_part = self._sum(
+            {self._quantity(key): factor for key, factor in inequality.coefficients}
+        )
+        return not self._below((inequality.bound, 0), (real_part, epsilon_part))
 
     def add(self, inequality: Inequality, index: int) -> bool:
         """Add a bound; return False if it contradicts the opposite bound."""
@@ -130,16 +132,16 @@ class _Tableau:
                 self.conflict = {index}
             return self.conflict is None
         factor = coefficients[0][1]
-        normal = tuple((key, _ratio(value, factor)) for key, value in coefficients)
-        variable = self._variable(normal)
+        normal_coefficients = tuple((key, _ratio(value, factor)) for key, value in coefficients)
+        variable = self._variable(normal_coefficients)
         limit = (_ratio(bound, factor), (-1 if factor > 0 else 1) if is_strict else 0)
         if factor > 0:
-            before = self._upper[variable]
-            if before is None or limit < before[0]:
+            previous_bound = self._upper[variable]
+            if previous_bound is None or limit < previous_bound[0]:
                 self._upper[variable] = limit, index
         else:
-            before = self._lower[variable]
-            if before is None or limit > before[0]:
+            previous_bound = self._lower[variable]
+            if previous_bound is None or limit > previous_bound[0]:
                 self._lower[variable] = limit, index
         lower, upper = self._lower[variable], self._upper[variable]
         if lower is not None and upper is not None and self._below(upper[0], lower[0]):
@@ -153,129 +155,136 @@ class _Tableau:
             None if all are in their bounds, the numbers of conflicting inequalities otherwise; an empty set
             after `MAX_PIVOTS` steps.
         """
-        for variable in range(len(self._value)):
+        for variable in range(len(self._values)):
             if variable not in self._rows:
                 self._enter(variable)
         for variable, row in self._rows.items():
-            self._value[variable] = self._sum(row)
+            self._values[variable] = self._sum(row)
         for _ in range(MAX_PIVOTS):
             violated = self._violation()
             if violated is None:
                 return None
-            variable, rises = violated
-            goal = self._lower[variable] if rises else self._upper[variable]
-            if goal is None:
+            variable, must_rise = violated
+            violated_bound = self._lower[variable] if must_rise else self._upper[variable]
+            if violated_bound is None:
                 return set()
             row = self._rows[variable]
             # the lowest number first (Bland's rule)
-            entering = next(
-                (candidate for candidate in sorted(row) if self._can_move(candidate, row[candidate], rises)),
+            entering_variable = next(
+                (
+                    candidate
+                    for candidate in sorted(row)
+                    if self._can_move(candidate, row[candidate], must_rise)
+                ),
                 None,
             )
-            if entering is None:
-                bounds = [
-                    self._upper[candidate] if (factor > 0) == rises else self._lower[candidate]
+            if entering_variable is None:
+                blocking_bounds = [
+                    self._upper[candidate] if (factor > 0) == must_rise else self._lower[candidate]
                     for candidate, factor in row.items()
                 ]
-                return {goal[1], *(bound[1] for bound in bounds if bound is not None)}
-            self._pivot(variable, entering, goal[0])
+                return {violated_bound[1], *(bound[1] for bound in blocking_bounds if bound is not None)}
+            self._pivot(variable, entering_variable, violated_bound[0])
         return set()
 
     def values(self) -> dict[Hashable, Real]:
         """Return the values of the quantities, without infinitesimals."""
-        return {key: self._value[number][0] for key, number in self._quantities.items()}
+        return {key: self._values[number][0] for key, number in self._quantity_variables.items()}
 
     def _variable(self, normal: Coefficients) -> int:
         """Return the variable of a normalized sum: its first factor is 1."""
         if len(normal) == 1:
             return self._quantity(normal[0][0])
-        number = self._numbers.get(normal)
-        if number is None:
+        sum_variable = self._sum_variables.get(normal)
+        if sum_variable is None:
             # quantities get their numbers before the sums of them
-            terms = [(self._quantity(key), factor) for key, factor in normal]
-            number = self._numbers[normal] = self._new()
+            summands = [(self._quantity(key), factor) for key, factor in normal]
+            sum_variable = self._sum_variables[normal] = self._new()
             row: dict[int, Real] = {}
-            for quantity, factor in terms:
+            for quantity_variable, factor in summands:
                 # a quantity that a pivot turned into a sum is replaced by this sum
-                whole: dict[int, Real] = self._rows.get(quantity, {quantity: 1})
-                for variable, weight in whole.items():
+                summand_row: dict[int, Real] = self._rows.get(quantity_variable, {quantity_variable: 1})
+                for variable, weight in summand_row.items():
                     row[variable] = row.get(variable, 0) + factor * weight
-            self._rows[number] = {
+            self._rows[sum_variable] = {
                 variable: weight
                 for variable, weight in row.items()
                 if weight > self._tolerance or weight < -self._tolerance
             }
-        return number
+        return sum_variable
 
     def _quantity(self, key: Hashable) -> int:
-        if key not in self._quantities:
-            self._quantities[key] = self._new(self._start.get(key, 0))
-        return self._quantities[key]
+        if key not in self._quantity_variables:
+            self._quantity_variables[key] = self._new(self._start.get(key, 0))
+        return self._quantity_variables[key]
 
     def _new(self, value: Real = 0) -> int:
-        self._value.append((value, 0))
+        self._values.append((value, 0))
         self._lower.append(None)
         self._upper.append(None)
-        return len(self._value) - 1
+        return len(self._values) - 1
 
     def _enter(self, variable: int) -> None:
         """Move a variable that is not a sum into its bounds."""
         lower, upper = self._lower[variable], self._upper[variable]
-        if lower is not None and self._value[variable] < lower[0]:
-            self._value[variable] = lower[0]
-        elif upper is not None and self._value[variable] > upper[0]:
-            self._value[variable] = upper[0]
+        if lower is not None and self._values[variable] < lower[0]:
+            self._values[variable] = lower[0]
+        elif upper is not None and self._values[variable] > upper[0]:
+            self._values[variable] = upper[0]
 
     def _sum(self, row: Mapping[int, Real]) -> _Pair:
-        whole: Real = 0
-        small: Real = 0
+        real_part: Real = 0
+        epsilon_part: Real = 0
         for variable, factor in row.items():
-            value = self._value[variable]
-            whole += factor * value[0]
-            small += factor * value[1]
-        return whole, small
+            value = self._values[variable]
+            real_part += factor * value[0]
+            epsilon_part += factor * value[1]
+        return real_part, epsilon_part
 
-    def _below(self, first: _Pair, second: _Pair) -> bool:
-        return first[0] < second[0] - self._tolerance if self._tolerance else first < second
+    def _below(self, left: _Pair, right: _Pair) -> bool:
+        return left[0] < right[0] - self._tolerance if self._tolerance else left < right
 
     def _violation(self) -> tuple[int, bool] | None:
         """Return the first sum outside of its bounds, and whether it must rise; None if there is none."""
         # the lowest number first (Bland's rule), so that the pivots cannot cycle
         for variable in sorted(self._rows):
-            value, lower, upper = self._value[variable], self._lower[variable], self._upper[variable]
+            value, lower, upper = self._values[variable], self._lower[variable], self._upper[variable]
             if lower is not None and self._below(value, lower[0]):
                 return variable, True
             if upper is not None and self._below(upper[0], value):
                 return variable, False
         return None
 
-    def _can_move(self, variable: int, factor: Real, rises: bool) -> bool:
+    def _can_move(self, variable: int, factor: Real, must_rise: bool) -> bool:
         """Return whether a variable can move so that a sum with it rises (`rises`) or falls."""
-        up = (factor > 0) == rises
-        bound = self._upper[variable] if up else self._lower[variable]
-        value = self._value[variable]
-        return bound is None or (self._below(value, bound[0]) if up else self._below(bound[0], value))
+        is_upward = (factor > 0) == must_rise
+        bound = self._upper[variable] if is_upward else self._lower[variable]
+        value = self._values[variable]
+        return bound is None or (self._below(value, bound[0]) if is_upward else self._below(bound[0], value))
 
-    def _pivot(self, leaving: int, entering: int, goal: _Pair) -> None:
+    def _pivot(self, leaving: int, entering: int, bound: _Pair) -> None:
         """Set a sum to a bound by changing one of its variables; the sum and the variable exchange roles."""
         row = self._rows.pop(leaving)
         factor = row.pop(entering)
-        step = tuple(_ratio(to - at, factor) for to, at in zip(goal, self._value[leaving], strict=True))
-        self._value[leaving] = goal
-        before = self._value[entering]
-        self._value[entering] = (before[0] + step[0], before[1] + step[1])
-        solved = {variable: _ratio(-value, factor) for variable, value in row.items()}
-        solved[leaving] = _ratio(1, factor)
-        for dependent, content in self._rows.items():
-            weight = content.pop(entering, 0)
+        change = tuple(_ratio(to - at, factor) for to, at in zip(bound, self._values[leaving], strict=True))
+        self._values[leaving] = bound
+        old_value = self._values[entering]
+        self._values[entering] = (old_value[0] + change[0], old_value[1] + change[1])
+        entering_row = {variable: _ratio(-value, factor) for variable, value in row.items()}
+        entering_row[leaving] = _ratio(1, factor)
+        for sum_variable, sum_row in self._rows.items():
+            weight = sum_row.pop(entering, 0)
             if weight:
-                was = self._value[dependent]
-                self._value[dependent] = (was[0] + weight * step[0], was[1] + weight * step[1])
-                for variable, value in solved.items():
-                    total = content.get(variable, 0) + weight * value
+                old_sum = self._values[sum_variable]
+                self._values[sum_variable] = (
+                    old_sum[0] + weight * change[0],
+                    old_sum[1] + weight * change[1],
+                )
+                for variable, value in entering_row.items():
+                    new_factor = sum_row.get(variable, 0) + weight * value
                     # with floats, factors that cancel leave tiny remainders
-                    if total > self._tolerance or total < -self._tolerance:
-                        content[variable] = total
+                    if new_factor > self._tolerance or new_factor < -self._tolerance:
+                        sum_row[variable] = new_factor
                     else:
-                        content.pop(variable, None)
-        self._rows[entering] = solved
+                        sum_row.pop(variable, None)
+        self._rows[entering] = entering_row

@@ -95,22 +95,24 @@ def word_of_length(
         TooManyConflictsError: geometry excludes too many combinations of facts.
     """
     runs = _Runs(length, facts, diagrams)
-    whole = YES
+    agreeing_node = YES
     for side in sides:
-        whole = runs.diagrams.both(whole, runs.agreeing_runs(side, condition_of(side.automaton)))
-    allowed = whole
+        agreeing_node = runs.diagrams.both(
+            agreeing_node, runs.agreeing_runs(side, condition_of(side.automaton))
+        )
+    allowed_node = agreeing_node
     for word in avoided:
-        allowed = runs.without(allowed, word)
+        allowed_node = runs.without(allowed_node, word)
     for _ in range(MAX_CONFLICTS_OF_A_LENGTH):
-        if allowed == NO:
+        if allowed_node == NO:
             return None
         # requirements are those of the sides alone (`whole`), without the exclusions
-        word = runs.split(necessary(runs.diagrams, whole, first_cube(runs.diagrams, allowed)))
-        excluded = [conflict for cube in word for conflict in conflicts(cube)]
-        if not excluded:
+        word = runs.split(necessary(runs.diagrams, agreeing_node, first_cube(runs.diagrams, allowed_node)))
+        new_conflicts = [conflict for cube in word for conflict in conflicts(cube)]
+        if not new_conflicts:
             return word
-        for conflict in excluded:
-            allowed = runs.without(allowed, [conflict])
+        for conflict in new_conflicts:
+            allowed_node = runs.without(allowed_node, [conflict])
     raise TooManyConflictsError
 
 
@@ -132,9 +134,15 @@ def agreements(
         for index, sample_cube in enumerate(word)
         for fact, value in sample_cube.items()
     }
-    never = clause(diagrams, cube)
-    nodes = [runs.agreeing_runs(side, condition_of(side.automaton)) for side in sides]
-    return [(diagrams.either(never, node) != never, diagrams.either(never, node) == YES) for node in nodes]
+    differing_node = clause(diagrams, cube)
+    agreeing_nodes = [runs.agreeing_runs(side, condition_of(side.automaton)) for side in sides]
+    return [
+        (
+            diagrams.either(differing_node, node) != differing_node,
+            diagrams.either(differing_node, node) == YES,
+        )
+        for node in agreeing_nodes
+    ]
 
 
 class _Runs:
@@ -142,15 +150,15 @@ class _Runs:
 
     def __init__(self, length: int, facts: Diagrams, diagrams: Diagrams) -> None:
         self.diagrams, self._length, self._facts = diagrams, length, facts
-        self._at: dict[tuple[int, int], int] = {}
+        self._nodes_in_samples: dict[tuple[int, int], int] = {}
 
     def variable(self, fact: int, index: int) -> int:
         """Return the variable of a fact in a sample."""
         return fact * self._length + index
 
-    def clause(self, word: Sequence[Cube], first: int = 0) -> int:
-        """Return the diagram of the runs that differ from a word, which begins at sample `first`."""
-        cubes = enumerate(word, first)
+    def clause(self, word: Sequence[Cube], first_sample: int = 0) -> int:
+        """Return the diagram of the runs that differ from a word, which begins at sample `first_sample`."""
+        cubes = enumerate(word, first_sample)
         return clause(
             self.diagrams,
             {self.variable(fact, index): value for index, cube in cubes for fact, value in cube.items()},
@@ -158,8 +166,8 @@ class _Runs:
 
     def without(self, node: int, word: Sequence[Cube]) -> int:
         """Return the runs of a diagram without those that contain a word."""
-        for first in range(self._length - len(word) + 1):
-            node = self.diagrams.both(node, self.clause(word, first))
+        for first_sample in range(self._length - len(word) + 1):
+            node = self.diagrams.both(node, self.clause(word, first_sample))
         return node
 
     def split(self, cube: Cube) -> tuple[Cube, ...]:
@@ -182,12 +190,12 @@ class _Runs:
                 return NO
             return decision_node(automaton.entries[state], index)
 
-        def decision_node(place: int, index: int) -> int:
-            if place < 0:
-                return after(~place, index + 1)
-            key = place, index
+        def decision_node(decision_index: int, index: int) -> int:
+            if decision_index < 0:
+                return after(~decision_index, index + 1)
+            key = decision_index, index
             if key not in nodes:
-                proposition, low, high = automaton.decisions[place]
+                proposition, low, high = automaton.decisions[decision_index]
                 condition = self._in_sample(conditions[proposition], index)
                 nodes[key] = self.diagrams.choose(
                     condition, decision_node(high, index), decision_node(low, index)
@@ -199,16 +207,16 @@ class _Runs:
     def _in_sample(self, node: int, index: int) -> int:
         """Return the diagram of a condition in one sample of the run."""
         key = node, index
-        if key not in self._at:
+        if key not in self._nodes_in_samples:
             fact, low, high = self._facts[node]
-            self._at[key] = (
+            self._nodes_in_samples[key] = (
                 node
                 if fact == LEAF
                 else self.diagrams.decide(
                     self.variable(fact, index), self._in_sample(low, index), self._in_sample(high, index)
                 )
             )
-        return self._at[key]
+        return self._nodes_in_samples[key]
 
 
 def first_cube(diagrams: Diagrams, node: int) -> Cube:
@@ -224,27 +232,27 @@ def first_cube(diagrams: Diagrams, node: int) -> Cube:
 def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
     """Return facts of a cube that make a condition true; without any of them it could be false."""
     for fact in sorted(cube, reverse=True):
-        less = {number: value for number, value in cube.items() if number != fact}
-        if _is_certain(diagrams, condition, less):
-            cube = less
+        smaller_cube = {number: value for number, value in cube.items() if number != fact}
+        if _is_certain(diagrams, condition, smaller_cube):
+            cube = smaller_cube
     return cube
 
 
 def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
     """Return whether a condition is true for all values of the facts that are not in a cube."""
-    waiting, visited = [node], {node}
-    while waiting:
-        current = waiting.pop()
-        if current == NO:
+    pending_nodes, visited_nodes = [node], {node}
+    while pending_nodes:
+        current_node = pending_nodes.pop()
+        if current_node == NO:
             return False
-        if current == YES:
+        if current_node == YES:
             continue
-        variable, low, high = diagrams[current]
+        variable, low, high = diagrams[current_node]
         value = cube.get(variable)
-        for after in (low, high) if value is None else (high,) if value else (low,):
-            if after not in visited:
-                visited.add(after)
-                waiting.append(after)
+        for next_node in (low, high) if value is None else (high,) if value else (low,):
+            if next_node not in visited_nodes:
+                visited_nodes.add(next_node)
+                pending_nodes.append(next_node)
     return True
 
 
@@ -321,13 +329,13 @@ class WordSearch:
         self._diagrams = conditions.diagrams
         self._moves: dict[tuple[int, int], int] = {}
         self._automata: dict[int, Automaton] = {}
-        self._numbers: dict[tuple[int, ...], int] = {}
-        self._tuples: list[tuple[int, ...]] = []
+        self._state_numbers: dict[tuple[int, ...], int] = {}
+        self._state_tuples: list[tuple[int, ...]] = []
         self._exclusions: list[frozenset[tuple[int, bool]]] = []
         self._allowed = YES
-        self._possible: dict[frozenset[tuple[int, bool]], frozenset[int] | None] = {}
-        self._terms: dict[int, frozenset[object]] = {}
-        self._open: dict[tuple[int, int], set[int]] = {}
+        self._conflicts_by_cube: dict[frozenset[tuple[int, bool]], frozenset[int] | None] = {}
+        self._terms_by_fact: dict[int, frozenset[object]] = {}
+        self._leaves_by_moves: dict[tuple[int, int], set[int]] = {}
         self._steps = self._all_steps = 0
 
     def shortest(self, *runs: Runs) -> Answer:
@@ -337,16 +345,16 @@ class WordSearch:
             UndecidedError: the search takes too many steps.
         """
         self._steps = 0
-        options = _together(runs)
+        alternatives = _together(runs)
         try:
-            word = self._short(options)
+            word = self._short(alternatives)
             if word is not None and any(word):
                 return Answer(word)
-            answers = [self._refine(sides) for sides in options]
+            answers = [self._refine(sides) for sides in alternatives]
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
-        words = [answer for answer in answers if answer.word is not None]
-        return min(words, key=lambda answer: len(answer.word or ()), default=joint(answers))
+        answers_with_word = [answer for answer in answers if answer.word is not None]
+        return min(answers_with_word, key=lambda answer: len(answer.word or ()), default=joint(answers))
 
     def is_found(self, *runs: Runs) -> bool:
         """Return whether a short run in the intersection is found; False does not exclude longer runs."""
@@ -378,28 +386,28 @@ class WordSearch:
 
     def _short(self, options: Sequence[Sequence[Side]]) -> Word | None:
         """Return the shortest run among runs of a few samples; None if none is found."""
-        least = [
+        least_lengths = [
             max([1, *(side.least_remaining(side.automaton.initial) for side in sides)])
             for sides in options
             if all(side.may_agree(side.automaton.initial) for side in sides)
         ]
-        first, left = min(least, default=MAX_SHORT), list(options)
-        lengths = 1 if self._all_steps > MAX_ALL_STEPS else MAX_LENGTHS
-        for length in range(first, min(first + lengths, MAX_SHORT + 1)):
-            anything = None
-            for sides in tuple(left):
+        first_length, open_options = min(least_lengths, default=MAX_SHORT), list(options)
+        length_count = 1 if self._all_steps > MAX_ALL_STEPS else MAX_LENGTHS
+        for length in range(first_length, min(first_length + length_count, MAX_SHORT + 1)):
+            empty_word = None
+            for sides in tuple(open_options):
                 try:
                     word = self._of_length(sides, length)
                 except (NoAutomatonError, RecursionError, TooManyConflictsError):
                     # longer runs need even more nodes
-                    left.remove(sides)
+                    open_options.remove(sides)
                     continue
                 # a run with requirements is preferred to an empty word, which stands for any run
                 if word is not None and any(word):
                     return word
-                anything = anything or word
-            if anything is not None or not left:
-                return anything
+                empty_word = empty_word or word
+            if empty_word is not None or not open_options:
+                return empty_word
         return None
 
     def _refine(self, sides: Sequence[Side]) -> Answer:
@@ -411,21 +419,23 @@ class WordSearch:
         for pair in islice(pairs, MAX_PAIRS):
             if self._short([pair]) is None and (answer := self._decide(pair)).word is None:
                 return answer
-        subset = list(sides[-1:])
+        chosen_sides = list(sides[-1:])
         while True:
-            answer = self._decide(subset)
-            missing = None if answer.word is None else self._disagreeing(sides, answer.word)
-            if missing is None:
+            answer = self._decide(chosen_sides)
+            disagreeing_side = None if answer.word is None else self._disagreeing(sides, answer.word)
+            if disagreeing_side is None:
                 return answer
-            subset.append(missing)
+            chosen_sides.append(disagreeing_side)
 
     def _disagreeing(self, sides: Sequence[Side], word: Word) -> Side | None:
         """Return a side that may disagree with a run, preferably one that must; None if all agree."""
         diagrams = Diagrams(MAX_NODES)
         agreement_flags = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
-        partly = [side for side, (_, is_whole) in zip(sides, agreement_flags, strict=True) if not is_whole]
-        wholly = [side for side, (is_any, _) in zip(sides, agreement_flags, strict=True) if not is_any]
-        return next(iter([*wholly, *partly]), None)
+        uncertain_sides = [
+            side for side, (_, is_whole) in zip(sides, agreement_flags, strict=True) if not is_whole
+        ]
+        opposed_sides = [side for side, (is_any, _) in zip(sides, agreement_flags, strict=True) if not is_any]
+        return next(iter([*opposed_sides, *uncertain_sides]), None)
 
     def _decide(self, sides: Sequence[Side]) -> Answer:
         word = self._search(sides, geometry=True)
@@ -435,13 +445,13 @@ class WordSearch:
             return Answer(
                 None, exclusions=tuple(self._texts_of(exclusion) for exclusion in self._about(sides))
             )
-        numbers = sorted(self._read(sides))
-        facts = [self.fact(number) for number in numbers]
+        fact_numbers = sorted(self._read(sides))
+        facts = [self.fact(number) for number in fact_numbers]
         # opposites of exact comparisons and of negated relations need no explanation
         opposites = [
             fact.texts for fact in facts if fact.side == ">" and not any(map(is_negated, fact.texts))
         ]
-        equals = [pair for number in numbers for pair in self._conditions.equal_texts(number)]
+        equals = [pair for number in fact_numbers for pair in self._conditions.equal_texts(number)]
         return Answer(None, True, opposites=tuple(opposites), equals=tuple(equals))
 
     def _conditions_of(self, automaton: Automaton) -> list[int]:
@@ -453,35 +463,37 @@ class WordSearch:
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
         """Return the shortest run by A*; the automata give the lower bound of the remaining samples."""
-        before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
+        predecessors: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
         # the number breaks ties, so that heapq compares nothing behind it
-        order = count()
+        tie_breaker = count()
         # geometry is checked when a move leaves the queue, because most moves never leave it
-        waiting: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
+        queue: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
 
-        def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
+        def put_in(
+            moves: int, leaves: Sequence[int], length: int, previous_states: tuple[int, ...] | None
+        ) -> None:
             for leaf in leaves:
-                after = self._tuples[leaf]
-                if after not in before and all(map(Side.may_agree, sides, after)):
+                next_states = self._state_tuples[leaf]
+                if next_states not in predecessors and all(map(Side.may_agree, sides, next_states)):
                     # among equal bounds, moves near the end of the last side come first, then long runs
-                    left = tuple(map(Side.least_remaining, sides, after))
-                    key = length + max(left), left[::-1], -length
-                    heappush(waiting, (key, next(order), moves, leaf, source))
+                    remaining_samples = tuple(map(Side.least_remaining, sides, next_states))
+                    priority = length + max(remaining_samples), remaining_samples[::-1], -length
+                    heappush(queue, (priority, next(tie_breaker), moves, leaf, previous_states))
 
         put_in(*self._join(sides, tuple(side.automaton.initial for side in sides)), 1, None)
-        while waiting:
-            (_, _, length), _, moves, leaf, source = heappop(waiting)
-            after = self._tuples[leaf]
+        while queue:
+            (_, _, length), _, moves, leaf, previous_states = heappop(queue)
+            next_states = self._state_tuples[leaf]
             is_closed = geometry and self._allowed != YES and leaf not in self._open_leaves(moves)
-            if after in before or is_closed:
+            if next_states in predecessors or is_closed:
                 continue
             cube = self._cube(self._leading(moves, leaf)) if geometry else {}
             if cube is None:
                 continue
-            before[after] = source, cube
-            if all(map(Side.agrees, sides, after)):
-                return tuple(reversed(list(_back(after, before))))
-            put_in(*self._join(sides, after), 1 - length, after)
+            predecessors[next_states] = previous_states, cube
+            if all(map(Side.agrees, sides, next_states)):
+                return tuple(reversed(list(_back(next_states, predecessors))))
+            put_in(*self._join(sides, next_states), 1 - length, next_states)
         return None
 
     def _spend(self, steps: int) -> None:
@@ -512,35 +524,37 @@ class WordSearch:
                     joined_nodes[key] = self._diagrams.decide(variable, low, high)
             return joined_nodes[key]
 
-        whole = join(tuple(nodes))
+        root = join(tuple(nodes))
         self._spend(len(joined_nodes))
         decisions = [self._diagrams[node] for node in joined_nodes.values()]
-        return whole, list(dict.fromkeys(decision.low for decision in decisions if decision.variable == LEAF))
+        return root, list(dict.fromkeys(decision.low for decision in decisions if decision.variable == LEAF))
 
     def _open_leaves(self, moves: int) -> set[int]:
         """Return the leaves of a diagram that can be reached without a known exclusion."""
         key = moves, self._allowed
-        if key not in self._open:
-            leaves, waiting, visited = set(), [key], {key}
-            while waiting:
-                node, allowed = waiting.pop()
-                variable = min(self._diagrams[node].variable, self._diagrams[allowed].variable)
-                if allowed != NO and self._diagrams[node].variable == LEAF:
+        if key not in self._leaves_by_moves:
+            leaves, pending_pairs, visited_pairs = set(), [key], {key}
+            while pending_pairs:
+                node, allowed_node = pending_pairs.pop()
+                variable = min(self._diagrams[node].variable, self._diagrams[allowed_node].variable)
+                if allowed_node != NO and self._diagrams[node].variable == LEAF:
                     leaves.add(self._diagrams[node].low)
-                elif allowed != NO:
-                    branches = [self._diagrams.branches(diagram, variable) for diagram in (node, allowed)]
-                    more = set(zip(*branches, strict=True)) - visited
-                    visited |= more
-                    waiting += more
-            self._spend(len(visited))
-            self._open[key] = leaves
-        return self._open[key]
+                elif allowed_node != NO:
+                    branches = [
+                        self._diagrams.branches(diagram, variable) for diagram in (node, allowed_node)
+                    ]
+                    new_pairs = set(zip(*branches, strict=True)) - visited_pairs
+                    visited_pairs |= new_pairs
+                    pending_pairs += new_pairs
+            self._spend(len(visited_pairs))
+            self._leaves_by_moves[key] = leaves
+        return self._leaves_by_moves[key]
 
     def _number(self, states: tuple[int, ...]) -> int:
-        if states not in self._numbers:
-            self._numbers[states] = len(self._tuples)
-            self._tuples.append(states)
-        return self._numbers[states]
+        if states not in self._state_numbers:
+            self._state_numbers[states] = len(self._state_tuples)
+            self._state_tuples.append(states)
+        return self._state_numbers[states]
 
     def _compose(self, automaton: Automaton, state: int) -> int:
         """Return the moves from a state as a diagram over facts, with states as leaves."""
@@ -548,12 +562,12 @@ class WordSearch:
         self._automata[id(automaton)] = automaton
         conditions = self._conditions_of(automaton)
 
-        def node(place: int) -> int:
-            if place < 0:
-                return self._diagrams.leaf(~place)
-            key = (id(automaton), place)
+        def node(decision_index: int) -> int:
+            if decision_index < 0:
+                return self._diagrams.leaf(~decision_index)
+            key = (id(automaton), decision_index)
             if key not in self._moves:
-                proposition, low, high = automaton.decisions[place]
+                proposition, low, high = automaton.decisions[decision_index]
                 self._moves[key] = self._diagrams.choose(conditions[proposition], node(high), node(low))
             return self._moves[key]
 
@@ -563,27 +577,27 @@ class WordSearch:
         """Return the condition under which a diagram leads to a leaf."""
         nodes: dict[int, int] = {}
 
-        def to(inner: int) -> int:
-            if inner not in nodes:
-                variable, low, high = self._diagrams[inner]
+        def to(inner_node: int) -> int:
+            if inner_node not in nodes:
+                variable, low, high = self._diagrams[inner_node]
                 if variable == LEAF:
-                    nodes[inner] = YES if low == leaf else NO
+                    nodes[inner_node] = YES if low == leaf else NO
                 else:
-                    nodes[inner] = self._diagrams.decide(variable, to(low), to(high))
-            return nodes[inner]
+                    nodes[inner_node] = self._diagrams.decide(variable, to(low), to(high))
+            return nodes[inner_node]
 
-        result = to(node)
+        condition = to(node)
         self._spend(len(nodes))
-        return result
+        return condition
 
     def _cube(self, condition: int) -> Cube | None:
         """Return a cube that makes a condition true and that geometry allows; None if there is none."""
         for _ in range(MAX_CONFLICTS):
             self._spend(_STEPS_OF_GEOMETRY)
-            open_ = self._diagrams.both(condition, self._allowed)
-            if open_ == NO:
+            open_condition = self._diagrams.both(condition, self._allowed)
+            if open_condition == NO:
                 return None
-            cube = necessary(self._diagrams, condition, first_cube(self._diagrams, open_))
+            cube = necessary(self._diagrams, condition, first_cube(self._diagrams, open_condition))
             conflicts = self._conflicts(cube)
             if not conflicts:
                 return cube
@@ -594,51 +608,51 @@ class WordSearch:
 
     def _conflict(self, cube: Cube) -> Cube | None:
         """Return a minimal combination of facts in a cube that geometry excludes; None if there is none."""
-        numbers = self._impossible(cube)
-        if numbers is None:
+        conflict_numbers = self._impossible(cube)
+        if conflict_numbers is None:
             return None
-        core = {number: cube[number] for number in sorted(numbers - {LEVEL})}
+        core = {number: cube[number] for number in sorted(conflict_numbers - {LEVEL})}
         for number in tuple(core):
-            less = {fact: value for fact, value in core.items() if fact != number}
-            if less and self._impossible(less) is not None:
-                core = less
+            smaller_core = {fact: value for fact, value in core.items() if fact != number}
+            if smaller_core and self._impossible(smaller_core) is not None:
+                core = smaller_core
         return core
 
     def _impossible(self, cube: Cube) -> frozenset[int] | None:
         """Return facts of a cube that exclude each other by geometry; None if it allows them all."""
         key = frozenset(cube.items())
-        if key not in self._possible:
-            self._possible[key] = self._ask_geometry(cube)
-        return self._possible[key]
+        if key not in self._conflicts_by_cube:
+            self._conflicts_by_cube[key] = self._ask_geometry(cube)
+        return self._conflicts_by_cube[key]
 
     def _parts(self, cube: Cube) -> list[Cube]:
         """Split a cube into parts without common terms or signals, so that no law connects two parts."""
-        parts: list[tuple[frozenset[object], Cube]] = []
+        parts_with_terms: list[tuple[frozenset[object], Cube]] = []
         for number, value in cube.items():
-            about, part = self._about_of(number), {number: value}
-            apart = []
-            for terms, other_cube in parts:
-                if terms.isdisjoint(about):
-                    apart.append((terms, other_cube))
+            part_terms, part = self._about_of(number), {number: value}
+            unrelated_parts = []
+            for other_terms, other_cube in parts_with_terms:
+                if other_terms.isdisjoint(part_terms):
+                    unrelated_parts.append((other_terms, other_cube))
                 else:
-                    about, part = terms | about, {**other_cube, **part}
-            parts = [*apart, (about, part)]
-        return [part for _, part in parts]
+                    part_terms, part = other_terms | part_terms, {**other_cube, **part}
+            parts_with_terms = [*unrelated_parts, (part_terms, part)]
+        return [part for _, part in parts_with_terms]
 
     def _about_of(self, number: int) -> frozenset[object]:
         """Return the terms and signals of a fact."""
-        if number not in self._terms:
+        if number not in self._terms_by_fact:
             quantities = [quantity for quantity, _ in self._conditions.facts[number].weights]
             signals = [quantity for quantity in quantities if isinstance(quantity, Signal)]
-            self._terms[number] = frozenset([*signals, *terms_in(quantities)])
-        return self._terms[number]
+            self._terms_by_fact[number] = frozenset([*signals, *terms_in(quantities)])
+        return self._terms_by_fact[number]
 
     def _ask_geometry(self, cube: Cube) -> frozenset[int] | None:
         facts = self._conditions.facts
         inequalities = [
             facts[number].inequality(value, number) for number, value in cube.items() if facts[number].weights
         ]
-        inside = {
+        inside_protrusions = {
             quantity
             for inequality in inequalities
             if len(inequality.coefficients) == 1 and inequality.bound <= 0
@@ -647,33 +661,41 @@ class WordSearch:
         }
         weights = [facts[number].weights for number in cube]
         quantities = dict.fromkeys(quantity for fact_weights in weights for quantity, _ in fact_weights)
-        geometry = [quantity for quantity in quantities if not isinstance(quantity, Signal)]
+        measurements = [quantity for quantity in quantities if not isinstance(quantity, Signal)]
         conditions = self._conditions
-        geometry_laws = laws(geometry, inside, conditions.regions, conditions.between, conditions.diameters)
+        geometry_laws = laws(
+            measurements, inside_protrusions, conditions.regions, conditions.between, conditions.diameters
+        )
         return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
         """Return the exclusions between facts of the automata or, without any, those with one such fact."""
         facts = self._read(sides)
-        about = [(exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions]
-        within = [exclusion for exclusion, read in about if facts >= read]
-        return within or [exclusion for exclusion, read in about if facts & read]
+        exclusions_with_facts = [
+            (exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions
+        ]
+        inner_exclusions = [
+            exclusion for exclusion, exclusion_facts in exclusions_with_facts if facts >= exclusion_facts
+        ]
+        return inner_exclusions or [
+            exclusion for exclusion, exclusion_facts in exclusions_with_facts if facts & exclusion_facts
+        ]
 
     def _read(self, sides: Sequence[Side]) -> set[int]:
         """Return the facts in the conditions of the automata."""
         facts: set[int] = set()
-        waiting = [
+        pending_nodes = [
             self._conditions.of(proposition.formula)
             for side in sides
             for proposition in side.automaton.propositions
         ]
-        visited = set(waiting)
-        while waiting:
-            variable, low, high = self._diagrams[waiting.pop()]
+        visited_nodes = set(pending_nodes)
+        while pending_nodes:
+            variable, low, high = self._diagrams[pending_nodes.pop()]
             if variable != LEAF:
                 facts.add(variable)
-                waiting += {low, high} - visited
-                visited |= {low, high}
+                pending_nodes += {low, high} - visited_nodes
+                visited_nodes |= {low, high}
         return facts
 
     def _texts_of(self, exclusion: frozenset[tuple[int, bool]]) -> tuple[str, ...]:
@@ -702,12 +724,12 @@ def joint(answers: Sequence[Answer]) -> Answer:
 
 
 def _back(
-    states: tuple[int, ...], before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]]
+    states: tuple[int, ...], predecessors: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]]
 ) -> Iterator[Cube]:
     """Yield the cubes of a run from its last sample back to its first."""
-    at: tuple[int, ...] | None = states
-    while at is not None:
-        at, cube = before[at]
+    current_states: tuple[int, ...] | None = states
+    while current_states is not None:
+        current_states, cube = predecessors[current_states]
         yield cube
 
 
@@ -742,22 +764,22 @@ def reading_of(
     reasons: list[str] = []
     satisfying: list[Side] = []
     violating: list[Side | None] = []
-    for part in conjuncts(formula):
+    for conjunct in conjuncts(formula):
         try:
-            exact_automaton = automaton_of(specification, name, part, rate_hz)
+            exact_automaton = automaton_of(specification, name, conjunct, rate_hz)
         except NoAutomatonError as error:
             reasons.append(error.reason)
-            looser = _loosely(specification, name, part, positive=True)
-            satisfying += [] if looser is None else [looser]
-            violating.append(_loosely(specification, name, part, positive=False))
+            loose_side = _loosely(specification, name, conjunct, positive=True)
+            satisfying += [] if loose_side is None else [loose_side]
+            violating.append(_loosely(specification, name, conjunct, positive=False))
         else:
             satisfying.append(Side(exact_automaton))
             violating.append(Side(exact_automaton, False))
 
-    options = tuple((side,) for side in violating if side is not None)
+    violating_options = tuple((side,) for side in violating if side is not None)
     return SpecReading(
         (tuple(satisfying),) if satisfying else None,
-        options if len(options) == len(violating) else None,
+        violating_options if len(violating_options) == len(violating) else None,
         reasons[0] if reasons else "",
     )
 
@@ -791,19 +813,19 @@ def automaton_of(
     Raises:
         NoAutomatonError: the formula has no automaton (see `automaton`).
     """
-    alone = replace(specification, specs=(NamedSpec(name, formula),), source="")
-    return automaton(alone, name, rate_hz=rate_hz, compiler="own")
+    single_specification = replace(specification, specs=(NamedSpec(name, formula),), source="")
+    return automaton(single_specification, name, rate_hz=rate_hz, compiler="own")
 
 
 def _loosely(specification: Specification, name: str, formula: Formula, *, positive: bool) -> Side | None:
-    signed = formula if positive else Boolean("not", (formula,))
+    signed_formula = formula if positive else Boolean("not", (formula,))
     for bounds in ("seconds", "all"):
-        looser = loosen(signed, bounds)
-        if looser is signed:
+        loose_formula = loosen(signed_formula, bounds)
+        if loose_formula is signed_formula:
             # the unchanged formula has no automaton
             continue
         try:
-            return Side(automaton_of(specification, name, looser))
+            return Side(automaton_of(specification, name, loose_formula))
         except NoAutomatonError:
             continue
     return None
