@@ -69,7 +69,7 @@ from spatial_replay.trace.trace import Sample, Trace
 # ------------------------------------------------------------------------------------------------------- sums
 
 MAX_INEQUALITIES: Final = 64
-"""Maximum number of inequalities of one relation; a relation with more is an opaque proposition."""
+"""Maximum number of inequalities of one relation; with more, the relation is an opaque proposition."""
 
 Quantity: TypeAlias = Measurement | Signal
 Weights: TypeAlias = tuple[tuple[Quantity, Fraction], ...]
@@ -109,7 +109,7 @@ def _build(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
         case Sum():
             return _add(_build(expression.first, regions), _build(expression.second, regions))
         case Negative(Equality()):
-            # `!=` excludes one number, which inequalities that include their limits cannot express
+            # `!=` excludes one number, but inequalities here include their limits
             raise OverflowError("an excluded number")
         case Negative():
             return _times(_build(expression.operand, regions), Fraction(-1))
@@ -173,7 +173,7 @@ def _size(tree: Tree) -> int:
 
 
 def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
-    """Return a measurement of unions as the minimum or maximum of the measurements of their members."""
+    """Return a measurement of unions as the minimum or maximum over their members."""
     kind: Literal["min", "max"]
     member_measurements: list[Measurement]
     if all(isinstance(without_radius(plain(term)), RegionName) for term in measurement.terms):
@@ -182,7 +182,7 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
         case SignedDistance() | Misalignment():
             kind = "min"
             pairs = product(*map(members, measurement.terms))
-            # both measurements are symmetric; a fixed order makes equal ones equal values
+            # both kinds are symmetric; a fixed order of terms makes equal measurements equal values
             member_measurements = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
         case Protrusion():
             # an outer union is not split: the inner term may lie partly in one member and partly in another
@@ -201,7 +201,7 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
-    """Return a measurement between regions as a constant, as they never move; as a quantity if unknown."""
+    """Return a measurement between regions as a constant, or as a quantity if its value is unknown."""
     (value,) = _numbers_of([measurement], regions)
     return Linear(((measurement, Fraction(1)),)) if value is None else Linear((), value)
 
@@ -219,7 +219,7 @@ def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outli
 
 
 def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
-    """Return the distances between separate regions, and the protrusion of each region from one around it."""
+    """Return the distances of disjoint regions, and the protrusions of regions from enclosing regions."""
     terms = (term for atom in atoms for term in terms_of(atom.expression))
     region_terms = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
     pairs = list(permutations(region_terms, 2))
@@ -250,7 +250,7 @@ def is_about_heights(atoms: Iterable[Atom]) -> bool:
 
 
 def _shift(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
-    """Return a measurement of enlarged terms as that of the bare terms plus a constant, if this is exact."""
+    """Return a measurement of enlarged terms as the bare terms' measurement plus a constant, if exact."""
     unit_weight = Fraction(1)
     match measurement:
         case Projection() if measurement.axis != "z":
@@ -344,7 +344,7 @@ class Fact(NamedTuple):
     """Condition of a diagram: an inequality between quantities, or an opaque proposition.
 
     Attributes:
-        weights: factors of a sum of quantities, the first one 1; empty for an opaque proposition.
+        weights: quantities of a sum with their factors, the first factor 1; empty for an opaque proposition.
         threshold: limit of the sum.
         side: comparison of the sum with the threshold. ">" is true above the threshold and false below.
             It leaves equality open, because a relation between footprints is marginal there. ">=" and "<="
@@ -380,7 +380,7 @@ class FactDiagrams:
         diagrams: diagrams of all conditions; their variables are numbers of facts.
         facts: facts by number.
         diameters: diameters of regions by name; empty if a formula or a region has heights.
-        between: distances of regions that are apart, and protrusions of regions from enclosing ones.
+        between: distances of disjoint regions, and protrusions of regions from enclosing regions.
     """
 
     def __init__(self, formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> None:
@@ -404,7 +404,7 @@ class FactDiagrams:
         )
         self.diameters = {} if is_upright else {name: _diameter(outline) for name, outline in regions.items()}
         self.between = _between(atoms, regions)
-        # `necessary` drops high numbers first: atoms get low ones, because opaque facts cannot be placed
+        # atoms get low numbers: `necessary` drops high numbers first, and opaque facts cannot be placed
         for atom in atoms:
             self.of(atom)
 
@@ -498,7 +498,7 @@ class FactDiagrams:
         fact_number = self._fact_numbers[fact_key]
         self._written_texts.setdefault(fact_number, {})[written_text] = None
         existing = self.facts[fact_number]
-        # several relations can have the same fact; its texts are those without "not"
+        # several relations can have the same fact; texts without "not" are preferred
         true_text, false_text = (
             new if is_negated(old) and not is_negated(new) else old
             for old, new in zip(existing.texts, fact.texts, strict=True)
@@ -513,7 +513,7 @@ def is_negated(text: str) -> bool:
 
 
 def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
-    """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether it is a lower limit."""
+    """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether the limit is a lower one."""
     # divided by the first factor, so that 2 x >= 2 and x >= 1 are one fact
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
@@ -521,7 +521,7 @@ def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
 
 
 def _equal_sums(tree: Tree) -> Iterable[Weights]:
-    """Yield the sums whose lower and upper limit are the same threshold."""
+    """Yield the sums with equal lower and upper limits."""
     if isinstance(tree, Linear):
         return
     comparisons = [
@@ -540,7 +540,7 @@ def _equal_sums(tree: Tree) -> Iterable[Weights]:
 def _texts(
     atom: Atom, is_whole: bool, is_lower_limit: bool, weights: Weights, threshold: Fraction
 ) -> tuple[str, str]:
-    """Return the texts of a condition of an atom: where it holds, and where it fails."""
+    """Return the texts of an atom's condition and of its negation."""
     if is_whole:
         return atom.text, f"not ({atom.text})"
     comparison_texts = _compared_texts(weights, threshold, (">=", "<=") if is_lower_limit else ("<=", ">="))

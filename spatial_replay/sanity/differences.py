@@ -58,7 +58,7 @@ class Distinction(Printed):
         only_first: shortest run that only the first accepts; None if none was found.
         only_second: shortest run that only the second accepts; None if none was found.
         rates_hz: sample rates of the comparison, Hz; empty if no bound is in seconds.
-        reason: reason why no run distinguishes them, or why this is not decided; "" otherwise.
+        reason: reason of a missing run: no such run exists, or the search is undecided; "" otherwise.
     """
 
     first: str
@@ -214,7 +214,7 @@ class _Comparison:
         return Distinction(first, second, relation, examples[0], examples[1], rates, reason)
 
     def _difference(self, accepting: int, rejecting: int) -> Example | Answer | str:
-        """Return a run that only one spec accepts, the answer that there is none, or the obstacle."""
+        """Return a run that only one spec accepts, an answer without a run, or the reason for indecision."""
         accepted_reading, rejected_reading = self._readings[accepting], self._readings[rejecting]
         obstacle = accepted_reading.reason or rejected_reading.reason
         if accepted_reading.satisfying is None or rejected_reading.violating is None:

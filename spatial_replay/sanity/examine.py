@@ -65,7 +65,7 @@ class Finding:
 
     Attributes:
         kind: kind of the fault.
-        specs: names of the affected specs; for "implied", the implied spec and then the implying one.
+        specs: names of the affected specs; for "implied", the implied spec, then the implying spec.
         reason: cause of the fault: "by logic alone", or relations that geometry excludes.
         exclusions: relations that exclude each other in one sample and so cause the fault.
         diagnostic: warning with the place of the fault.
@@ -84,12 +84,12 @@ class SpecExamination:
 
     Attributes:
         name: name of the spec.
-        reason: reason why the spec has no automaton, so that only a looser reading was examined; "" if it
-            has one.
+        reason: reason why the spec has no automaton, so that only a looser reading was examined; ""
+            with an automaton.
         undecided: undecided questions as sentences.
         unrelated: formulas without laws of geometry, which may hold or fail independently of all others:
             quantifiers over open groups, relations to earlier samples.
-        satisfied, violated: shortest run with that verdict; None if there is none or none was found.
+        satisfied, violated: shortest run with that verdict; None if no such run exists or was found.
     """
 
     name: str
@@ -208,9 +208,9 @@ def doctor(specification: Specification, *, examples: bool = True) -> Examinatio
     """Find faults of a specification without evaluating a run.
 
     A spec is reported if no run satisfies it with a margin (a robustness above 0), or no run violates it with
-    a margin. Specs that follow from another spec or contradict it are reported, too. So are implications with
-    an antecedent that never holds. The search uses automata and laws of geometry, which exclude runs that
-    footprints cannot have.
+    a margin. Specs that follow from another spec or contradict it are reported, too. Implications are
+    reported if their antecedent never holds. The search uses automata and laws of geometry, which exclude
+    runs that footprints cannot have.
 
     Args:
         examples: whether to search for the shortest runs that satisfy and violate each spec.
@@ -235,13 +235,13 @@ def refuse_constant_results(specification: Specification) -> None:
     """Raise an error for results that no run can satisfy, or violate, with a margin.
 
     Raises:
-        SpecificationError: there are such results; one error reports all of them.
+        SpecificationError: a result is constant; one error reports all constant results.
     """
     _refuse(specification, [spec.name for spec in specification.results], [False, True])
 
 
 def _refuse(specification: Specification, names: Sequence[str], outcomes: Sequence[bool]) -> None:
-    """Raise an error for named specs that no run satisfies (True in `ends`) or violates (False in `ends`)."""
+    """Raise an error for named specs that no run satisfies (True in `outcomes`) or violates (False)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
     findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in outcomes]
@@ -334,7 +334,7 @@ class _Examiner:
             if runs:
                 return self._search.shortest(*runs)
         except UndecidedError:
-            # one automaton of the whole part needs no product of several
+            # one automaton of the whole part needs no product of automata
             if whole_part is not None and (answer := self._of_whole(*whole_part)) is not None:
                 return answer
         self._undecided.setdefault(name, []).append(question)
@@ -367,7 +367,7 @@ class _Examiner:
     def _antecedents(self, part: NamedSpec) -> None:
         satisfying = self._reading(part).satisfying
         nodes = (node for _, _, node in iter_nodes(part.formula))
-        # by place, because expanded macros and quantifiers repeat an implication
+        # keyed by place, because expanded macros and quantifiers repeat an implication
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }
@@ -387,7 +387,7 @@ class _Examiner:
                 runs_by_implication[node] = holding_runs
         if satisfying is None or not runs_by_implication:
             return
-        # a run in which all antecedents hold in one sample answers the question for each of them
+        # a run in which all antecedents hold in one sample answers the question for each antecedent
         joint_runs = self._sometime(
             part, Boolean("and", tuple(node.operands[0] for node in runs_by_implication))
         )

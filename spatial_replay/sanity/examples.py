@@ -58,6 +58,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 
 def around(outline: Outline) -> tuple[tuple[float, float], ...]:
+    """Return the bounding box of an outline: (least, greatest) along x and y."""
     vertices, radius = np.array(outline.vertices, np.float64), outline.radius
     limits = zip(vertices.min(axis=0) - radius, vertices.max(axis=0) + radius, strict=True)
     return tuple((float(low), float(high)) for low, high in limits)
@@ -70,7 +71,7 @@ def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
 
 
 def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
-    """Return the largest box in a part that has the part's centroid and the shape of its bounding box."""
+    """Return the largest box in a part with the centroid and the proportions of the part."""
     x, y = centre_of(Footprint((part,)))
     if len(part.vertices) < 3:
         half_side = part.radius / math.sqrt(2.0)
@@ -176,7 +177,7 @@ Core: TypeAlias = frozenset[tuple[int, int]]
 def placements(
     setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
 ) -> Iterator[tuple[tuple[Sample, ...] | None, Core | None]]:
-    """Yield placements in which facts have given values, those with the widest margins first.
+    """Yield placements in which facts have given values, from wide to narrow margins.
 
     Each item has the samples of a placement, or the facts that exclude each other. Both are None if an
     attempt reaches its limit.
@@ -194,7 +195,7 @@ def placements(
         for sample_index, sample_facts in enumerate(facts)
         for fact_index in range(len(sample_facts))
     ]
-    # margins and sizes in units: easy to see at first, then less so
+    # margins and sizes in units: from easy to hard to see
     for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
         attempt = _Attempt(setting, unit, margin * unit, spread)
         required: list[Inequality] = list(attempt.sizes())
@@ -259,7 +260,7 @@ class _Attempt:
             yield size.at_most(self._unit * self._spread)
 
     def ways(self, fact: Fact, value: bool, index: int) -> Ways:
-        """Return the alternatives that give a fact its value in a sample; none if it needs no inequality.
+        """Return the alternatives that give a fact its value in a sample; [] if no inequality is needed.
 
         Raises:
             CannotPlaceError: the fact mentions something that cannot be placed.
@@ -274,7 +275,7 @@ class _Attempt:
         bound = float(fact.threshold) + (margin if is_lower_limit else -margin)
         quantities = [quantity for quantity, _ in fact.weights]
         if isinstance(quantities[0], Misalignment):
-            # `_turns` decided the orientations before
+            # `_turns` has already decided the orientations
             return []
         if all(isinstance(quantity, (Projection, CentroidProjection, Signal)) for quantity in quantities):
             weighted_sum = _Amount({})
@@ -365,7 +366,7 @@ class _Attempt:
         return start_values
 
     def _relation(self, quantity: Quantity, is_lower_limit: bool, bound: float, index: int) -> Ways:
-        """Return the alternatives that bound a distance or a protrusion from below (`rises`) or above."""
+        """Return alternatives that bound a distance or protrusion from below (`is_lower_limit`) or above."""
         if isinstance(quantity, SignedDistance):
             first_term, second_term = plain(quantity.first), plain(quantity.second)
             bound += float(radius_of(first_term) + radius_of(second_term))
@@ -374,7 +375,7 @@ class _Attempt:
             bound += float(radius_of(second_term) - radius_of(first_term))
         else:
             raise CannotPlaceError("it compares quantities of several kinds")
-        # a box replaces a region so that the relation gets harder: around it to be far, inside it to be near
+        # a box replaces a region and makes the relation harder: around the region for far, inside it for near
         use_outer_boxes = (
             (is_lower_limit, is_lower_limit)
             if isinstance(quantity, SignedDistance)
@@ -552,8 +553,8 @@ def shortest_example(
         is_exact: whether the word certainly has the verdict; if not, the result is None without a placement
             that confirms it.
         rate_hz: sample rate of the run, Hz.
-        another: function that returns another word of the same length, without the given words that cannot
-            be placed.
+        another: function from words that cannot be placed to another word of the same length that avoids
+            them; None without such a word.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
     # a guess about bounds in seconds may be right at only one rate
@@ -638,7 +639,7 @@ def _place(
 
 
 def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:
-    """Return verdict and robustness of a spec; a spec that is too deeply nested is evaluated by conjuncts."""
+    """Return verdict and robustness of a spec; a spec that is too deeply nested is evaluated per conjunct."""
 
     def evaluation_of(*formulas: Formula) -> Evaluation:
         specs = [
@@ -655,7 +656,7 @@ def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tu
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
-    """Return the setting of a spec, with the objects and signals of all specs, so that all are evaluated."""
+    """Return the setting of a spec, with the objects and signals of all specs, which are all evaluated."""
     own_atoms = _atoms(spec)
     all_atoms = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
     is_upright = is_about_heights(all_atoms)

@@ -1,7 +1,7 @@
 """Laws of geometry: linear inequalities between measurements that hold for all footprints.
 
-Each law holds for unions of convex parts, with and without heights. Laws of the plane alone are left out,
-except for those with the label `LEVEL`.
+Each law holds for unions of convex parts, with and without heights. Laws that hold only in the plane are
+left out, except laws with the label `LEVEL`.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def laws(
     between: Mapping[Measurement, Fraction],
     diameters: Mapping[str, Fraction],
 ) -> list[Inequality]:
-    """Return the laws of some quantities and of further measurements of their terms.
+    """Return the laws between some quantities and further measurements of their terms.
 
     Args:
         inside: protrusions that are at most 0.
-        between: distances of regions that are apart, and protrusions of regions from enclosing ones.
+        between: distances of disjoint regions, and protrusions of regions from enclosing regions.
         diameters: diameters of regions by name, for objects without a gap in height; empty if heights matter.
     """
     all_quantities = list(dict.fromkeys(quantities))
@@ -98,7 +98,7 @@ def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequ
 
 
 def _distance(a: Term, b: Term) -> SignedDistance:
-    # the distance is symmetric; a fixed order makes equal ones equal values
+    # the distance is symmetric; a fixed order makes equal distances equal values
     first, second = sorted((a, b), key=repr)
     return SignedDistance(first, second)
 
@@ -128,7 +128,7 @@ def _across(
     bare_protrusions: Mapping[Protrusion, None],
     diameters: Mapping[str, Fraction],
 ) -> Iterator[Inequality]:
-    """Yield: two objects are at most the diameter of a region apart, plus their protrusions from it."""
+    """Yield: a distance is at most a region's diameter plus both protrusions from the region."""
     for distance, (name, diameter) in product(distances, diameters.items()):
         region = RegionName(name)
         pair_protrusions = [Protrusion(distance.first, region), Protrusion(distance.second, region)]
@@ -142,7 +142,7 @@ def _across(
 def _centres(
     bare_protrusions: Mapping[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
-    """Yield: the protrusion of a centre from a convex region is at most that of the whole footprint."""
+    """Yield: a centre's protrusion from a convex region is at most the whole footprint's protrusion."""
     for protrusion in bare_protrusions:
         inner, outer = protrusion.inner, protrusion.outer
         if not isinstance(inner, Centre) or not isinstance(outer, RegionName):
@@ -157,7 +157,7 @@ def _centres(
 
 
 def _enlargement(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
-    """Yield the greatest change of a measurement by enlargement; the change is less if heights decide it."""
+    """Yield limits of a measurement's change by enlargement; the change is less if heights decide."""
     for first_distance, second_distance in _variants(
         distances, lambda distance: _distance(*map(without_radius, (distance.first, distance.second)))
     ):
@@ -201,7 +201,7 @@ def _transitive(
     inside_protrusions: dict[Protrusion, None],
     regions: Mapping[str, Outline],
 ) -> Iterator[Inequality]:
-    """Yield: the protrusion of a from c is at most that of a from b plus that of b from c."""
+    """Yield: protrusion(a, c) <= protrusion(a, b) + protrusion(b, c)."""
     protrusions_by_term: dict[Term, dict[Term, Protrusion]] = {}
     for protrusion in protrusions:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):
@@ -219,7 +219,7 @@ def _transitive(
                 yield _law((first_step, -1), (second_step, -1))
             # heights matter between a and c, but not in steps over a region b without a height
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
-            # a chain that leads to no measured protrusion of a adds nothing to its single steps
+            # a chain that leads to no measured protrusion of a adds no information
             is_nested = isinstance(b, RegionName) and isinstance(c, RegionName)
             is_useful = (
                 is_nested

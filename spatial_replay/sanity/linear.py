@@ -87,7 +87,7 @@ def solve(
 
 
 def _ratio(value: Real, factor: Real) -> Real:
-    """Return the quotient, exact for exact numbers; integers stay integers for ±1, which is faster."""
+    """Return the quotient, exact for exact numbers; division by ±1 keeps integers, which is faster."""
     if factor in (1, -1):
         return value * factor
     if isinstance(value, float) or isinstance(factor, float):
@@ -152,8 +152,8 @@ class _Tableau:
         """Move all variables into their bounds.
 
         Returns:
-            None if all are in their bounds, the numbers of conflicting inequalities otherwise; an empty set
-            after `MAX_PIVOTS` steps.
+            None if all variables are in their bounds, else the indexes of conflicting inequalities. The set
+            is empty after `MAX_PIVOTS` steps.
         """
         for variable in range(len(self._values)):
             if variable not in self._rows:
@@ -197,7 +197,7 @@ class _Tableau:
             return self._quantity(normal[0][0])
         sum_variable = self._sum_variables.get(normal)
         if sum_variable is None:
-            # quantities get their numbers before the sums of them
+            # quantities get their numbers before their sums
             summands = [(self._quantity(key), factor) for key, factor in normal]
             sum_variable = self._sum_variables[normal] = self._new()
             row: dict[int, Real] = {}
@@ -256,7 +256,7 @@ class _Tableau:
         return None
 
     def _can_move(self, variable: int, factor: Real, must_rise: bool) -> bool:
-        """Return whether a variable can move so that a sum with it rises (`rises`) or falls."""
+        """Return whether a variable can move so that a sum with it rises (`must_rise`) or falls."""
         is_upward = (factor > 0) == must_rise
         bound = self._upper[variable] if is_upward else self._lower[variable]
         value = self._values[variable]

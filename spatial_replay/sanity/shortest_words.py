@@ -43,7 +43,7 @@ MAX_NODES: Final = 100_000
 """Maximum number of nodes in the diagrams of runs of one length."""
 
 MAX_CONFLICTS_OF_A_LENGTH: Final = 400
-"""Maximum number of combinations of facts that geometry excludes before a length is given up."""
+"""Maximum number of excluded combinations of facts before the search skips a length."""
 
 
 class TooManyConflictsError(Exception):
@@ -78,15 +78,15 @@ def word_of_length(
     conflicts: Callable[[Cube], Iterable[Cube]],
     avoided: Sequence[Sequence[Cube]] = (),
 ) -> tuple[Cube, ...] | None:
-    """Return the requirements on each sample of a run of given length with the outcomes of all sides.
+    """Return a run of given length with the outcomes of all sides; None if there is no such run.
 
-    The result is None if there is no such run.
+    The run is given by its requirements on each sample.
 
     Args:
         facts: diagrams of the conditions.
         diagrams: empty diagrams for the runs, with room for `MAX_NODES` nodes.
         condition_of: function that returns the conditions of an automaton's propositions.
-        conflicts: function that returns combinations of facts in one sample that geometry excludes.
+        conflicts: function from the facts of one sample to combinations that geometry excludes.
         avoided: words that the run must not contain; a word of one cube is excluded in every sample.
 
     Raises:
@@ -106,7 +106,7 @@ def word_of_length(
     for _ in range(MAX_CONFLICTS_OF_A_LENGTH):
         if allowed_node == NO:
             return None
-        # requirements are those of the sides alone (`whole`), without the exclusions
+        # requirements come from the sides alone (`agreeing_node`), not from the exclusions
         word = runs.split(necessary(runs.diagrams, agreeing_node, first_cube(runs.diagrams, allowed_node)))
         new_conflicts = [conflict for cube in word for conflict in conflicts(cube)]
         if not new_conflicts:
@@ -123,7 +123,7 @@ def agreements(
     diagrams: Diagrams,
     condition_of: Callable[[Automaton], Sequence[int]],
 ) -> list[tuple[bool, bool]]:
-    """Return two flags for each side: whether some run with a word has its outcome, and whether all have it.
+    """Return for each side whether some run with a word, and whether every such run, has its outcome.
 
     Raises:
         NoAutomatonError: the diagrams need too many nodes.
@@ -165,7 +165,7 @@ class _Runs:
         )
 
     def without(self, node: int, word: Sequence[Cube]) -> int:
-        """Return the runs of a diagram without those that contain a word."""
+        """Return the diagram of the runs in `node` that do not contain a word."""
         for first_sample in range(self._length - len(word) + 1):
             node = self.diagrams.both(node, self.clause(word, first_sample))
         return node
@@ -220,7 +220,7 @@ class _Runs:
 
 
 def first_cube(diagrams: Diagrams, node: int) -> Cube:
-    """Return decisions on a path to true; a fact is true only if false leads nowhere."""
+    """Return decisions on a path to YES; a fact is true only if its false branch is NO."""
     cube: Cube = {}
     while node != YES:
         variable, low, high = diagrams[node]
@@ -230,7 +230,7 @@ def first_cube(diagrams: Diagrams, node: int) -> Cube:
 
 
 def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
-    """Return facts of a cube that make a condition true; without any of them it could be false."""
+    """Return an irreducible part of a cube that makes a condition true."""
     for fact in sorted(cube, reverse=True):
         smaller_cube = {number: value for number, value in cube.items() if number != fact}
         if _is_certain(diagrams, condition, smaller_cube):
@@ -239,7 +239,7 @@ def necessary(diagrams: Diagrams, condition: int, cube: Cube) -> Cube:
 
 
 def _is_certain(diagrams: Diagrams, node: int, cube: Cube) -> bool:
-    """Return whether a condition is true for all values of the facts that are not in a cube."""
+    """Return whether a cube makes a condition true for all values of the other facts."""
     pending_nodes, visited_nodes = [node], {node}
     while pending_nodes:
         current_node = pending_nodes.pop()
@@ -279,7 +279,7 @@ _STEPS_OF_GEOMETRY: Final = 50
 """Steps that one check of geometry counts as."""
 
 MAX_CONFLICTS: Final = 2000
-"""Maximum number of combinations of facts that geometry excludes before a question is given up."""
+"""Maximum number of excluded combinations of facts before a question is undecided."""
 
 
 MAX_LENGTHS: Final = 4
@@ -289,7 +289,7 @@ MAX_SHORT: Final = 12
 """Longest run that is searched for without a product, samples."""
 
 _ON_ONE_LEVEL: Final = "no gap in height"
-"""Text that is added to an exclusion that does not hold for objects above each other."""
+"""Note on an exclusion that does not hold for objects above each other."""
 
 MAX_PAIRS: Final = 200
 """Maximum number of pairs of automata that are tested for excluding each other."""
@@ -339,7 +339,7 @@ class WordSearch:
         self._steps = self._all_steps = 0
 
     def shortest(self, *runs: Runs) -> Answer:
-        """Return the answer on the shortest run in the intersection of some sets of runs.
+        """Return the shortest run in the intersection of sets of runs, or the reason why it is empty.
 
         Raises:
             UndecidedError: the search takes too many steps.
@@ -411,9 +411,9 @@ class WordSearch:
         return None
 
     def _refine(self, sides: Sequence[Side]) -> Answer:
-        """Return the answer for all sides by questions about few of them.
+        """Return the answer for all sides from searches with few sides.
 
-        A side that disagrees with the run of these few sides is added to them.
+        A side that disagrees with the run of the chosen sides is added to them.
         """
         pairs = combinations(sides, 2) if len(sides) > 2 else ()
         for pair in islice(pairs, MAX_PAIRS):
@@ -428,7 +428,7 @@ class WordSearch:
             chosen_sides.append(disagreeing_side)
 
     def _disagreeing(self, sides: Sequence[Side], word: Word) -> Side | None:
-        """Return a side that may disagree with a run, preferably one that must; None if all agree."""
+        """Return a side that may disagree with a run, preferably a side that must; None if all agree."""
         diagrams = Diagrams(MAX_NODES)
         agreement_flags = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
         uncertain_sides = [
@@ -464,7 +464,7 @@ class WordSearch:
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
         """Return the shortest run by A*; the automata give the lower bound of the remaining samples."""
         predecessors: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
-        # the number breaks ties, so that heapq compares nothing behind it
+        # the counter breaks ties, so that heapq never compares the later entries
         tie_breaker = count()
         # geometry is checked when a move leaves the queue, because most moves never leave it
         queue: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
@@ -503,7 +503,7 @@ class WordSearch:
             raise UndecidedError
 
     def _join(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
-        """Return the moves of all sides in one sample as a diagram over facts, and its leaves.
+        """Return the moves of all sides in one sample as a diagram over facts, and the leaves of the diagram.
 
         A leaf is a tuple with the next state of each side.
         """
@@ -619,7 +619,7 @@ class WordSearch:
         return core
 
     def _impossible(self, cube: Cube) -> frozenset[int] | None:
-        """Return facts of a cube that exclude each other by geometry; None if it allows them all."""
+        """Return facts of a cube that exclude each other by geometry; None if geometry allows the cube."""
         key = frozenset(cube.items())
         if key not in self._conflicts_by_cube:
             self._conflicts_by_cube[key] = self._ask_geometry(cube)
@@ -669,7 +669,7 @@ class WordSearch:
         return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
-        """Return the exclusions between facts of the automata or, without any, those with one such fact."""
+        """Return the exclusions with all facts in the automata, else those with at least one such fact."""
         facts = self._read(sides)
         exclusions_with_facts = [
             (exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions
@@ -715,7 +715,7 @@ def _together(runs: Sequence[Runs]) -> list[tuple[Side, ...]]:
 
 
 def joint(answers: Sequence[Answer]) -> Answer:
-    """Merge the answers to several questions without a run into one."""
+    """Merge several answers without a run into one answer."""
     exclusions = dict.fromkeys(exclusion for answer in answers for exclusion in answer.exclusions)
     opposites = dict.fromkeys(opposite for answer in answers for opposite in answer.opposites)
     equals = dict.fromkeys(equal for answer in answers for equal in answer.equals)
@@ -738,7 +738,7 @@ def _back(
 
 @dataclass(frozen=True)
 class SpecReading:
-    """Runs that satisfy a formula and runs that violate it; without an automaton, supersets of these.
+    """Runs that satisfy a formula and runs that violate it; without an automaton, supersets of these runs.
 
     Attributes:
         satisfying, violating: sets of runs; None if not even a looser reading has an automaton.
@@ -835,7 +835,7 @@ def loosen(formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, l
     """Return a looser formula, without past operators and bounds; the given formula implies it.
 
     Args:
-        bounds: bounds to drop, those in seconds or all.
+        bounds: bounds to drop: bounds in seconds, or all bounds.
         loose: whether the result is looser; if not, it is stricter and implies the given formula.
     """
     if not any(_is_obstacle(part, bounds) for part in iter_formulas(formula)):
