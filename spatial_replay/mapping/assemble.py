@@ -127,7 +127,7 @@ class _Assembling:
         self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
-        self._recorded = 0
+        self._message_count = 0
         self._channel_by_topic: dict[str, int] = {}
         self.jump: Sentence | None = None
         """Jump of time that ended the log; None without one."""
@@ -156,34 +156,38 @@ class _Assembling:
         if not self._is_live:
             self._remarks.add_pauses()
             self._remarks.add_silences()
-        others = " and ".join(sorted(self._plan.fallback_topics))
-        for text in self._silences.remarks(self._plan.sampled_topic or "", others):
+        fallback_names = " and ".join(sorted(self._plan.fallback_topics))
+        for text in self._silences.remarks(self._plan.sampled_topic or "", fallback_names):
             self._remarks.add(text)
         for text in self._tree.remarks():
             self._remarks.add(text)
         # a running system has no log that the user could cut
         if self.jump is not None and not self._is_live:
-            what_follows = ": the log is taken to end there; cut it to evaluate what comes after"
-            self._remarks.add(Sentence(self.jump, what_follows))
+            consequence = ": the log is taken to end there; cut it to evaluate what comes after"
+            self._remarks.add(Sentence(self.jump, consequence))
         for reader in self._readers.values():
             reader.finish()
-            for signal, texts in reader.unnamed.items():
-                unnamed = ", ".join(map(repr, texts))
-                what = f"`names` of the signal {signal!r} lacks {unnamed}; it is unknown there"
-                self._remarks.add(f"{reader.name}: {what}")
-            if (step := reader.pending.first_step) is not None:
-                how = "are sorted by time, as if of two senders; if a clock was set back, cut the log there"
-                if not step.is_sorted:
-                    how = "are numbered on, so those recorded later count later; cut the log there"
-                back = f"{(step.from_ns - step.to_ns) / 1e9:.3f} s"
-                what = f"{reader.name}: times step back in the order of recording, first by {back} at "
-                how = f": its messages {how}, or take another `clock`"
-                self._remarks.add(Sentence(what, Instant(step.from_ns, 0), how))
+            for signal, signal_texts in reader.unnamed.items():
+                unnamed = ", ".join(map(repr, signal_texts))
+                remark_text = f"`names` of the signal {signal!r} lacks {unnamed}; it is unknown there"
+                self._remarks.add(f"{reader.name}: {remark_text}")
+            if (step_back := reader.pending.first_step) is not None:
+                treatment = (
+                    "are sorted by time, as if of two senders; if a clock was set back, cut the log there"
+                )
+                if not step_back.is_sorted:
+                    treatment = "are numbered on, so those recorded later count later; cut the log there"
+                step_text = f"{(step_back.from_ns - step_back.to_ns) / 1e9:.3f} s"
+                remark_text = (
+                    f"{reader.name}: times step back in the order of recording, first by {step_text} at "
+                )
+                treatment = f": its messages {treatment}, or take another `clock`"
+                self._remarks.add(Sentence(remark_text, Instant(step_back.from_ns, 0), treatment))
             if reader.unstamped:
-                were = "message was" if reader.unstamped == 1 else "messages were"
+                subject = "message was" if reader.unstamped == 1 else "messages were"
                 self._remarks.add(
-                    f"{reader.name}: {reader.unstamped} {were} left out, without a stamp, or with one of 0,"
-                    " for the clock header"
+                    f"{reader.name}: {reader.unstamped} {subject} left out, without a stamp, or with one of"
+                    " 0, for the clock header"
                 )
         for contradiction in contradictions(self._tracker.evidence, self._plan.mapping):
             if isinstance(contradiction, Doubt):
@@ -201,8 +205,8 @@ class _Assembling:
         if mapping.fixed_frame is None or not is_whole or self._plan.lost:
             return
         extractors = (reader.extractor for reader in self._readers.values())
-        noted = (extractor.noted_frames for extractor in extractors if extractor is not None)
-        frames = sorted(self._tree.names.union(*noted) - {""})
+        noted_frames = (extractor.noted_frames for extractor in extractors if extractor is not None)
+        frames = sorted(self._tree.names.union(*noted_frames) - {""})
         if frames and mapping.fixed_frame not in frames:
             hint = nearest_hint(mapping.fixed_frame, frames)
             first_frames = ", ".join(frames[:20]) + (
@@ -236,12 +240,12 @@ class _Assembling:
         """Return remarks on stale objects, missing transforms and pauses; () before `finish`."""
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
-    def _add_step(self, arrived: MessageColumns) -> None:
+    def _add_step(self, messages: MessageColumns) -> None:
         """Pass messages with transforms to the frame tree, and others to the readers of their topics."""
-        topics = arrived.topics
-        numbers = map(self._number_of_topic.get, topics, repeat(-1))
-        number_of_message = np.fromiter(numbers, np.int64, len(arrived))
-        stamped: list[_Stamped] = []
+        topics = messages.topics
+        topic_numbers = map(self._number_of_topic.get, topics, repeat(-1))
+        topic_of_message = np.fromiter(topic_numbers, np.int64, len(messages))
+        batches: list[_Stamped] = []
         arrived_topics = set(topics)
         for reader in self._readers.values():
             if reader.planned.topic not in arrived_topics or (
@@ -249,113 +253,128 @@ class _Assembling:
             ):
                 # static transforms were added in advance, by `know_static`
                 continue
-            places = np.flatnonzero(number_of_message == self._number_of_topic[reader.planned.topic])
-            places = self._of_publisher(reader.planned, places, arrived)
-            if len(places):
-                stamped.append(self._stamp(reader, places, arrived))
-        end = self._advance_time(stamped, arrived)
-        for batch in stamped:
-            self._put(batch.before(end), arrived)
+            message_indices = np.flatnonzero(topic_of_message == self._number_of_topic[reader.planned.topic])
+            message_indices = self._of_publisher(reader.planned, message_indices, messages)
+            if len(message_indices):
+                batches.append(self._stamp(reader, message_indices, messages))
+        end_index = self._advance_time(batches, messages)
+        for batch in batches:
+            self._put(batch.before(end_index), messages)
 
-    def _of_publisher(self, planned: PlannedTopic, places: Integers, arrived: MessageColumns) -> Integers:
+    def _of_publisher(
+        self, planned: PlannedTopic, message_indices: Integers, messages: MessageColumns
+    ) -> Integers:
         """Return the places of messages from the publisher that the mapping selects.
 
         Raises:
             UsageError: the topic lacks this publisher.
         """
-        number = None if planned.mapping is None else planned.mapping.publisher
-        if number is None:
-            return places
-        channels = sorted(
-            code for code, channel in arrived.channels.items() if channel.topic == planned.topic
+        publisher = None if planned.mapping is None else planned.mapping.publisher
+        if publisher is None:
+            return message_indices
+        channel_codes = sorted(
+            code for code, channel in messages.channels.items() if channel.topic == planned.topic
         )
-        if number > len(channels):
+        if publisher > len(channel_codes):
             raise UsageError(
-                f"{self._plan.mapping.name}: topics.{planned.name}.publisher: there is no publisher {number};"
-                f" the topic has {plural(len(channels), 'channel')}"
+                f"{self._plan.mapping.name}: topics.{planned.name}.publisher: there is no publisher"
+                f" {publisher}; the topic has {plural(len(channel_codes), 'channel')}"
             )
-        of_publisher: Integers = places[arrived.channel[places] == channels[number - 1]]
+        of_publisher: Integers = message_indices[
+            messages.channel[message_indices] == channel_codes[publisher - 1]
+        ]
         return of_publisher
 
-    def _stamp(self, reader: TopicReader, places: Integers, arrived: MessageColumns) -> _Stamped:
+    def _stamp(self, reader: TopicReader, message_indices: Integers, messages: MessageColumns) -> _Stamped:
         """Return the messages of one topic with their times on its clock.
 
         They are decoded if the reader `decodes_on_arrival`, as for stamps and transforms.
         """
-        contents: list[Any] = [arrived.payloads[place] for place in places.tolist()]
+        contents: list[Any] = [messages.payloads[place] for place in message_indices.tolist()]
         clock = reader.planned.clock
-        times_ns = (arrived.publish_time_ns if clock == "publish" else arrived.log_time_ns)[places]
+        times_ns = (messages.publish_time_ns if clock == "publish" else messages.log_time_ns)[message_indices]
         if reader.decodes_on_arrival:
-            good = np.ones(len(places), np.bool_)
-            log_times_ns = arrived.log_time_ns[places].tolist()
-            contents = reader.decode(contents, log_times_ns, good)
+            is_good = np.ones(len(message_indices), np.bool_)
+            log_times_ns = messages.log_time_ns[message_indices].tolist()
+            contents = reader.decode(contents, log_times_ns, is_good)
             if clock == "header":
-                times_ns = reader.stamps(contents, log_times_ns, good)
+                times_ns = reader.stamps(contents, log_times_ns, is_good)
                 if reader.planned.is_static:
                     # many programs send static transforms without a stamp
-                    times_ns = np.where(times_ns == 0, arrived.log_time_ns[places], times_ns)
-            contents = list(compress(contents, good.tolist()))
-            places, times_ns = places[good], times_ns[good]
-        return _Stamped(reader, places, times_ns, contents)
+                    times_ns = np.where(times_ns == 0, messages.log_time_ns[message_indices], times_ns)
+            contents = list(compress(contents, is_good.tolist()))
+            message_indices, times_ns = message_indices[is_good], times_ns[is_good]
+        return _Stamped(reader, message_indices, times_ns, contents)
 
-    def _advance_time(self, stamped: list[_Stamped], arrived: MessageColumns) -> int:
+    def _advance_time(self, batches: list[_Stamped], messages: MessageColumns) -> int:
         """Update the newest time of the log; return the number of messages before a jump that ends the log.
 
         Raises:
             LogError: time jumps back, and a jump does not end the log.
         """
-        moving = [batch for batch in stamped if batch.reader.advances_time]
-        none = np.empty(0, np.int64)
-        places = np.concatenate([none, *(batch.places for batch in moving)])
+        moving_batches = [batch for batch in batches if batch.reader.advances_time]
+        no_integers = np.empty(0, np.int64)
+        message_indices = np.concatenate([no_integers, *(batch.message_indices for batch in moving_batches)])
         # in the order of arrival over all topics, in which a jump is defined
-        order = np.argsort(places, kind="stable")
-        times_ns = np.concatenate([none, *(batch.times_ns for batch in moving)])[order]
+        arrival_order = np.argsort(message_indices, kind="stable")
+        times_ns = np.concatenate([no_integers, *(batch.times_ns for batch in moving_batches)])[arrival_order]
         if self._begin_ns is None and len(times_ns):
             self._begin_ns = int(times_ns[0])
-        newest = np.maximum.accumulate(np.append(self._newest_ns, times_ns))
-        late = np.flatnonzero(times_ns < newest[:-1] - self._plan.late_ns)
-        at = int(late[0]) if len(late) else -1
-        self._newest_ns = int(newest[at])
-        if at < 0:
-            return len(arrived)
-        place = int(places[order[at]])
-        where = Sentence(
-            f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from ",
-            Instant(int(newest[at]), self._begin_ns or 0),
+        newest_ns = np.maximum.accumulate(np.append(self._newest_ns, times_ns))
+        late_indices = np.flatnonzero(times_ns < newest_ns[:-1] - self._plan.late_ns)
+        jump_index = int(late_indices[0]) if len(late_indices) else -1
+        self._newest_ns = int(newest_ns[jump_index])
+        if jump_index < 0:
+            return len(messages)
+        message_index = int(message_indices[arrival_order[jump_index]])
+        jump = Sentence(
+            (
+                f"time jumps back by {(int(newest_ns[jump_index]) - int(times_ns[jump_index])) / 1e9:.3f} s,"
+                " from "
+            ),
+            Instant(int(newest_ns[jump_index]), self._begin_ns or 0),
             " to ",
-            Instant(int(times_ns[at]), self._begin_ns or 0),
-            f", at a message of {arrived.topics[place]}",
+            Instant(int(times_ns[jump_index]), self._begin_ns or 0),
+            f", at a message of {messages.topics[message_index]}",
         )
         if self._on_time_jump == "error":
             remedy = f"{JUMP_REMEDY}, and another clock may not jump"
-            if int(newest[at]) - int(times_ns[at]) > _ANOTHER_CLOCK_NS:
+            if int(newest_ns[jump_index]) - int(times_ns[jump_index]) > _ANOTHER_CLOCK_NS:
                 remedy = "its stamps and those before are of two clocks; `clock: log` uses one for all"
-            raise LogError(f"{self._name}: {where}; {remedy}")
-        self.jump = where
-        return place
+            raise LogError(f"{self._name}: {jump}; {remedy}")
+        self.jump = jump
+        return message_index
 
-    def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:
-        reader = stamped.reader
-        if len(stamped.times_ns):
-            self._note_arrivals(reader, stamped.times_ns, stamped.contents)
-        log_times_ns = arrived.log_time_ns[stamped.places]
+    def _put(self, batch: _Stamped, messages: MessageColumns) -> None:
+        reader = batch.reader
+        if len(batch.times_ns):
+            self._note_arrivals(reader, batch.times_ns, batch.contents)
+        log_times_ns = messages.log_time_ns[batch.message_indices]
         if reader.is_mapped:
             arrivals = self._tracker.evidence[reader.name].arrivals
-            publish_times_ns, channels = (
-                column[stamped.places] for column in (arrived.publish_time_ns, arrived.channel)
+            publish_times_ns, channel_codes = (
+                column[batch.message_indices] for column in (messages.publish_time_ns, messages.channel)
             )
-            arrivals.add(stamped.times_ns, log_times_ns, publish_times_ns, channels)
+            arrivals.add(batch.times_ns, log_times_ns, publish_times_ns, channel_codes)
         if reader.transforms is not None and not (self._knows_static and reader.planned.is_static):
             for time_ns, log_ns, message in zip(
-                stamped.times_ns.tolist(), log_times_ns.tolist(), stamped.contents, strict=True
+                batch.times_ns.tolist(), log_times_ns.tolist(), batch.contents, strict=True
             ):
                 self._add_transforms(reader, time_ns, log_ns, message)
         if reader.is_mapped or reader.name == self._plan.sampled_topic:
-            times_ns, counts = self._counting(reader, stamped.times_ns, log_times_ns)
+            times_ns, is_used = self._counting(reader, batch.times_ns, log_times_ns)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
-            sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
-            columns = times_ns[counts], sequences[counts], log_times_ns[counts], recorded[counts]
-            reader.pending.add(columns, list(compress(stamped.contents, counts.tolist())))
+            sequence_numbers, record_numbers = (
+                messages.sequence[batch.message_indices],
+                messages.place[batch.message_indices],
+            )
+            columns = (
+                times_ns[is_used],
+                sequence_numbers[is_used],
+                log_times_ns[is_used],
+                record_numbers[is_used],
+            )
+            reader.pending.add(columns, list(compress(batch.contents, is_used.tolist())))
 
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
@@ -385,9 +404,9 @@ class _Assembling:
         start_ns = max(start_ns, self._settled_ns + 1)
         # NaN and infinity in logs are no reason for NumPy's warnings: they make objects unknown
         with np.errstate(all="ignore"):
-            sampled_ns, others_ns = self._tracker.advance(upto_ns)
-            others_ns = self._silences.sampled_in(others_ns)
-            times_ns = self._sample_times.upto(np.concatenate([sampled_ns, others_ns]), upto_ns)
+            sampled_ns, fallback_ns = self._tracker.advance(upto_ns)
+            fallback_ns = self._silences.sampled_in(fallback_ns)
+            times_ns = self._sample_times.upto(np.concatenate([sampled_ns, fallback_ns]), upto_ns)
             times_ns = times_ns[(times_ns >= start_ns) & (times_ns < end_ns)]
             self._remarks.samples.add(times_ns)
             trace = self._tracker.trace(times_ns, newest_ns)
@@ -405,20 +424,23 @@ class _Assembling:
     def _columns(self, messages: Sequence[Message]) -> MessageColumns:
         if not messages:
             return MessageColumns()
-        topics, *numbers, payloads = zip(*messages, strict=True)
-        log_ns, publish_ns, sequence = (np.array(column, np.int64) for column in numbers)
-        place = self._recorded + np.arange(len(messages))
-        self._recorded += len(messages)
+        topics, *number_columns, payloads = zip(*messages, strict=True)
+        log_ns, publish_ns, sequence_numbers = (np.array(column, np.int64) for column in number_columns)
+        record_numbers = self._message_count + np.arange(len(messages))
+        self._message_count += len(messages)
         # a topic keeps its channel number between calls, because a new number would be another publisher
-        codes = self._channel_by_topic
+        channel_by_topic = self._channel_by_topic
         channels = {
-            codes.setdefault(topic, len(codes)): Channel(topic, "", None) for topic in dict.fromkeys(topics)
+            channel_by_topic.setdefault(topic, len(channel_by_topic)): Channel(topic, "", None)
+            for topic in dict.fromkeys(topics)
         }
-        channel = np.array([codes[topic] for topic in topics], np.int64)
-        return MessageColumns(channels, channel, sequence, log_ns, publish_ns, payloads, place)
+        channel_codes = np.array([channel_by_topic[topic] for topic in topics], np.int64)
+        return MessageColumns(
+            channels, channel_codes, sequence_numbers, log_ns, publish_ns, payloads, record_numbers
+        )
 
-    def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
-        self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))
+    def _add_fault(self, topic: str, log_time_ns: int, fault: str) -> None:
+        self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {fault}"))
 
 
 class Assembler(_Assembling):
@@ -431,7 +453,7 @@ class Assembler(_Assembling):
         goes_on: returns whether the log has messages after the last one that is added; by default, no.
     """
 
-    _step, _count, _bytes = _FIRST_STEP, 0, 0
+    _step_limit, _step_count, _step_bytes = _FIRST_STEP, 0, 0
 
     def __init__(
         self,
@@ -462,19 +484,19 @@ class Assembler(_Assembling):
         """
         columns = messages if isinstance(messages, MessageColumns) else self._columns(messages)
         traces: list[Trace] = []
-        ends = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
+        end_bytes = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
         begin = 0
         while begin < len(columns) and not self.is_finished:
-            read = int(ends[begin - 1]) if begin else 0
-            by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
-            stop = min(begin + self._step - self._count, by_size, len(columns))
+            read_bytes = int(end_bytes[begin - 1]) if begin else 0
+            size_stop = int(np.searchsorted(end_bytes, read_bytes + _STEP_BYTES - self._step_bytes)) + 1
+            stop = min(begin + self._step_limit - self._step_count, size_stop, len(columns))
             self._add_step(select(columns, slice(begin, stop)))
-            self._count += stop - begin
-            self._bytes += int(ends[stop - 1]) - read
+            self._step_count += stop - begin
+            self._step_bytes += int(end_bytes[stop - 1]) - read_bytes
             begin = stop
-            if self._count == self._step or self._bytes >= _STEP_BYTES:
-                self._count = self._bytes = 0
-                self._step = min(2 * self._step, _LONGEST_STEP)
+            if self._step_count == self._step_limit or self._step_bytes >= _STEP_BYTES:
+                self._step_count = self._step_bytes = 0
+                self._step_limit = min(2 * self._step_limit, _LONGEST_STEP)
                 traces.append(self._settle(self._newest_ns - self._plan.wait_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
@@ -483,11 +505,11 @@ class Assembler(_Assembling):
         self._knows_static = True
         for topic, log_ns, publish_ns, _, payload in messages:
             reader = self._readers[topic]
-            good = np.ones(1, np.bool_)
-            contents = reader.decode([payload], [log_ns], good)
-            if good[0]:
-                times_ns = {"log": log_ns, "publish": publish_ns, "header": None}
-                self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
+            is_good = np.ones(1, np.bool_)
+            contents = reader.decode([payload], [log_ns], is_good)
+            if is_good[0]:
+                time_by_clock = {"log": log_ns, "publish": publish_ns, "header": None}
+                self._add_transforms(reader, time_by_clock[reader.planned.clock], log_ns, contents[0])
 
     def move_faults(self, target: FaultList) -> None:
         """Move all faults to another list, with the count of faults beyond the limit of the list."""
@@ -498,14 +520,19 @@ class _Stamped(NamedTuple):
     """Messages of one topic: places among all arrived messages, times and contents."""
 
     reader: TopicReader
-    places: Integers
+    message_indices: Integers
     times_ns: Integers
     contents: list[Any]
 
-    def before(self, place: int) -> _Stamped:
-        """Return the messages before a place."""
-        count = int(np.searchsorted(self.places, place))
-        return _Stamped(self.reader, self.places[:count], self.times_ns[:count], self.contents[:count])
+    def before(self, message_index: int) -> _Stamped:
+        """Return the messages before an index."""
+        count = int(np.searchsorted(self.message_indices, message_index))
+        return _Stamped(
+            self.reader,
+            self.message_indices[:count],
+            self.times_ns[:count],
+            self.contents[:count],
+        )
 
 
 class _SampleTimes:
@@ -537,13 +564,13 @@ class _SampleTimes:
         """
         if self._step_ns is None:
             # np.unique is slow for the single message of a running system
-            times = times_ns if len(times_ns) == 1 else np.unique(times_ns)
-            times = times[times > self._last_ns]
+            sample_times_ns = times_ns if len(times_ns) == 1 else np.unique(times_ns)
+            sample_times_ns = sample_times_ns[sample_times_ns > self._last_ns]
         else:
-            times = self._multiples(times_ns, upto_ns, self._step_ns)
-        if len(times):
-            self._last_ns = int(times[-1])
-        return times
+            sample_times_ns = self._multiples(times_ns, upto_ns, self._step_ns)
+        if len(sample_times_ns):
+            self._last_ns = int(sample_times_ns[-1])
+        return sample_times_ns
 
     def note(self, time_ns: int) -> bool:
         """Note an extra sample; return whether there is an earlier sample and none at or after its time."""
@@ -560,23 +587,24 @@ class _SampleTimes:
         begin_ns = max(self._from_ns, self._last_ns + 1)
         # multiples of the step since the epoch, so that samples do not depend on the window; integer
         # division, because floats do not resolve nanoseconds since 1970
-        first, stop = -(-begin_ns // step_ns), upto_ns // step_ns + 1
-        marks = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
-        gaps = np.diff(marks)
-        if len(gaps) and int(gaps.max()) // step_ns > _MOST_STEPS:
-            at = int(np.argmax(gaps))
-            start, end = times_apart(int(marks[at]), int(marks[at + 1]))
+        first_multiple, stop_multiple = -(-begin_ns // step_ns), upto_ns // step_ns + 1
+        marks_ns = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
+        gaps_ns = np.diff(marks_ns)
+        if len(gaps_ns) and int(gaps_ns.max()) // step_ns > _MOST_STEPS:
+            gap_index = int(np.argmax(gaps_ns))
+            start_text, end_text = times_apart(int(marks_ns[gap_index]), int(marks_ns[gap_index + 1]))
             raise LogError(
-                f"{self._name}: time jumps forward from {start} to {end}, more than {_MOST_STEPS} samples"
-                " without a message; take another clock or a longer step"
+                f"{self._name}: time jumps forward from {start_text} to {end_text}, more than {_MOST_STEPS}"
+                " samples without a message; take another clock or a longer step"
             )
-        if stop - first > _MOST_AT_ONCE:
+        if stop_multiple - first_multiple > _MOST_AT_ONCE:
             raise UsageError(
-                f"{self._mapping_name}: sample.every: a sample every {step_ns} ns makes {stop - first}"
-                f" samples up to {upto_ns} ns, and at most {_MOST_AT_ONCE} fit between messages that are read"
+                f"{self._mapping_name}: sample.every: a sample every {step_ns} ns makes"
+                f" {stop_multiple - first_multiple} samples up to {upto_ns} ns, and at most {_MOST_AT_ONCE}"
+                " fit between messages that are read"
                 " together; give a longer step"
             )
-        return np.arange(first, max(first, stop), dtype=np.int64) * step_ns
+        return np.arange(first_multiple, max(first_multiple, stop_multiple), dtype=np.int64) * step_ns
 
 
 class _Silences:
@@ -594,25 +622,25 @@ class _Silences:
     def __init__(
         self, plan: ReadingPlan, readers: Mapping[str, TopicReader], window_ns: tuple[int, int]
     ) -> None:
-        self._least_ns, self._most_ns = plan.silence_ns, plan.longest_silence_ns
+        self._least_limit_ns, self._greatest_limit_ns = plan.silence_ns, plan.longest_silence_ns
         self._window_ns = window_ns
-        self._sampled = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
-        self._others = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
-        self._others_begin_ns: int | None = None
+        self._sampled_pending = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
+        self._fallback_pending = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
+        self._fallback_begin_ns: int | None = None
         # times of the sampled topic: the last two before the next samples, and all later ones
         self._past_ns = self._times_ns = np.empty(0, np.int64)
         # whether fallback topics are sampled after each of these times; the last flag is for before the first
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None
-        self._pauses, self._last_pause_ns, self._last_ns = 0, -1, -1
+        self._pause_count, self._last_pause_ns, self._last_ns = 0, -1, -1
         self.first_ns: int | None = None
         self.before_ns: int | None = None
         self.goes_on: Callable[[], bool] = lambda: False
 
     def know_start(self, sampled_ns: int | None, others_ns: int | None) -> None:
         """Note the times of the log's first messages; see `Assembler.know_start`."""
-        self._others_begin_ns = others_ns
+        self._fallback_begin_ns = others_ns
         if sampled_ns is not None:
             self.first_ns = self._unread_ns = sampled_ns
             self._past_ns = np.array([sampled_ns], np.int64)
@@ -625,13 +653,13 @@ class _Silences:
             known_ns: time up to which all messages have arrived.
             is_last: whether no further message will arrive.
         """
-        if self._sampled is None or not self._others:
+        if self._sampled_pending is None or not self._fallback_pending:
             return upto_ns
-        waiting_ns = self._sampled.times_ns
+        waiting_ns = self._sampled_pending.times_ns
         times_ns = np.unique(np.concatenate([self._past_ns, waiting_ns[waiting_ns <= known_ns]]))
-        if self._others_begin_ns is None:
-            begin_ns = min(int(pending.times_ns.min(initial=LATEST_NS)) for pending in self._others)
-            self._others_begin_ns = begin_ns if begin_ns <= upto_ns else None
+        if self._fallback_begin_ns is None:
+            begin_ns = min(int(pending.times_ns.min(initial=LATEST_NS)) for pending in self._fallback_pending)
+            self._fallback_begin_ns = begin_ns if begin_ns <= upto_ns else None
         is_filled = self._silences(times_ns, known_ns, is_last=is_last)
         if is_last:
             if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
@@ -641,9 +669,9 @@ class _Silences:
             # until the silence after the last message is decided, samples end at that message
             last_ns = int(times_ns[-1])
             upto_ns = upto_ns if last_ns > upto_ns or is_filled[-2] else last_ns
-        elif self._others_begin_ns is not None and not is_filled[-1]:
+        elif self._fallback_begin_ns is not None and not is_filled[-1]:
             # not yet decided whether samples begin at fallback topics
-            upto_ns = min(upto_ns, self._others_begin_ns - 1)
+            upto_ns = min(upto_ns, self._fallback_begin_ns - 1)
         self._times_ns, self._is_filled = times_ns, is_filled
         # past messages stay past, even if this request ends before them
         past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
@@ -657,69 +685,69 @@ class _Silences:
 
         The last element concerns the silence before the first message.
         """
-        limits_ns = np.full(len(times_ns), self._most_ns)
-        limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_ns, self._most_ns)
+        limits_ns = np.full(len(times_ns), self._greatest_limit_ns)
+        limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_limit_ns, self._greatest_limit_ns)
         # if no message has arrived up to `known_ns`, the next one is later
         next_ns = np.append(times_ns, known_ns if is_last else known_ns + 1)
         if is_last and len(times_ns):
             # after the last message, a silence beyond the usual intervals is sampled to the end of the log
-            interval_ns = int(np.diff(times_ns)[-1]) if len(times_ns) > 1 else self._least_ns
-            limits_ns[-1] = min(self._least_ns, LONG_PAUSE * interval_ns)
-        is_late = False
-        if self._others_begin_ns is not None and not len(self._past_ns):
-            is_late = int(next_ns[0]) - self._others_begin_ns > self._least_ns
-            is_late = is_late or (is_last and not len(times_ns))
-        return np.append(next_ns[1:] - times_ns > limits_ns, is_late)
+            interval_ns = int(np.diff(times_ns)[-1]) if len(times_ns) > 1 else self._least_limit_ns
+            limits_ns[-1] = min(self._least_limit_ns, LONG_PAUSE * interval_ns)
+        begins_late = False
+        if self._fallback_begin_ns is not None and not len(self._past_ns):
+            begins_late = int(next_ns[0]) - self._fallback_begin_ns > self._least_limit_ns
+            begins_late = begins_late or (is_last and not len(times_ns))
+        return np.append(next_ns[1:] - times_ns > limits_ns, begins_late)
 
     def sampled_in(self, others_ns: Integers) -> Integers:
         """Return the times of fallback topics that are sampled, from times up to the `limit`."""
-        place = np.searchsorted(self._times_ns, others_ns, "right") - 1
-        is_sampled = self._is_filled[place]
+        message_index = np.searchsorted(self._times_ns, others_ns, "right") - 1
+        is_sampled = self._is_filled[message_index]
         start_ns, end_ns = self._window_ns
-        is_inside = is_sampled & (others_ns >= start_ns) & (others_ns < end_ns)
-        self._note(others_ns[is_inside], place[is_inside])
+        is_in_window = is_sampled & (others_ns >= start_ns) & (others_ns < end_ns)
+        self._note(others_ns[is_in_window], message_index[is_in_window])
         sampled_ns: Integers = others_ns[is_sampled]
         return sampled_ns
 
-    def _note(self, others_ns: Integers, place: Integers) -> None:
+    def _note(self, fallback_ns: Integers, message_index: Integers) -> None:
         """Note samples at fallback topics, with the index of the sampled topic's message before each."""
-        before_ns = others_ns[place < 0]
+        before_ns = fallback_ns[message_index < 0]
         if len(before_ns) and self.before_ns is None:
             self.before_ns = int(before_ns.min())
-        for start_ns in np.unique(self._times_ns[place[place >= 0]]).tolist():
+        for start_ns in np.unique(self._times_ns[message_index[message_index >= 0]]).tolist():
             if start_ns != self._last_pause_ns:
-                self._pauses, self._last_pause_ns = self._pauses + 1, start_ns
+                self._pause_count, self._last_pause_ns = self._pause_count + 1, start_ns
                 self._first_pause_ns = self._first_pause_ns or (start_ns, None)
-        self._last_ns = max(self._last_ns, int(others_ns.max(initial=-1)))
+        self._last_ns = max(self._last_ns, int(fallback_ns.max(initial=-1)))
         if self._first_pause_ns is not None and self._first_pause_ns[1] is None:
             later_ns = self._times_ns[self._times_ns > self._first_pause_ns[0]]
             self._first_pause_ns = self._first_pause_ns[0], int(later_ns[0]) if len(later_ns) else None
 
-    def remarks(self, sampled: str, others: str) -> Iterator[str]:
+    def remarks(self, sampled_topic: str, fallback_topics: str) -> Iterator[str]:
         """Yield remarks on samples at fallback topics, after the last sample."""
-        subject = f"samples are taken at {sampled}, which "
+        subject = f"samples are taken at {sampled_topic}, which "
         if self.before_ns is not None and self.first_ns is None:
-            yield f"samples are taken at {others}, since {sampled} has no message"
+            yield f"samples are taken at {fallback_topics}, since {sampled_topic} has no message"
         elif self.before_ns is not None and self.first_ns is not None:
-            how = "; those before, from ", Instant(self.before_ns, 0), f" on, are at {others}"
-            yield Sentence(f"{subject}begins at ", Instant(self.first_ns, 0), *how)
+            clause = "; those before, from ", Instant(self.before_ns, 0), f" on, are at {fallback_topics}"
+            yield Sentence(f"{subject}begins at ", Instant(self.first_ns, 0), *clause)
         if self._first_pause_ns is None:
             return
         is_open = self._last_pause_ns == int(self._times_ns[-1])
-        more = self._pauses - is_open - 1
+        more_pauses = self._pause_count - is_open - 1
         start_ns, end_ns = self._first_pause_ns
         if end_ns is not None:
-            start = () if start_ns == self._unread_ns else ("from ", Instant(start_ns, 0), " ")
-            until = "until " if start_ns == self._unread_ns else "to "
-            between = f" and in {plural(more, 'more pause')}" if more else ""
-            then = f"; those between{between} are at {others}"
-            yield Sentence(f"{subject}pauses ", *start, until, Instant(end_ns, 0), then)
+            start_words = () if start_ns == self._unread_ns else ("from ", Instant(start_ns, 0), " ")
+            until_word = "until " if start_ns == self._unread_ns else "to "
+            pauses_text = f" and in {plural(more_pauses, 'more pause')}" if more_pauses else ""
+            ending = f"; those between{pauses_text} are at {fallback_topics}"
+            yield Sentence(f"{subject}pauses ", *start_words, until_word, Instant(end_ns, 0), ending)
         if is_open and self._last_pause_ns == self._unread_ns:
-            yield f"samples are taken at {others}, since {sampled} is silent"
+            yield f"samples are taken at {fallback_topics}, since {sampled_topic} is silent"
         elif is_open:
-            how = "; those after, until ", Instant(self._last_ns, 0), f", are at {others}"
-            ends = "is silent after " if self.goes_on() else "ends at "
-            yield Sentence(f"{subject}{ends}", Instant(self._last_pause_ns, 0), *how)
+            clause = "; those after, until ", Instant(self._last_ns, 0), f", are at {fallback_topics}"
+            ending_verb = "is silent after " if self.goes_on() else "ends at "
+            yield Sentence(f"{subject}{ending_verb}", Instant(self._last_pause_ns, 0), *clause)
 
 
 _MOMENT_S: Final = 0.001
@@ -743,22 +771,22 @@ sample: {topic: /boxes}
 
 def rehearse() -> None:
     """Assemble a few samples of invented messages, so that the first real ones need no compilation."""
-    ring = [[0, 0], [2, 0], [2, 2], [1, 1]]
+    ring_corners = [[0, 0], [2, 0], [2, 2], [1, 1]]
     contents: dict[str, Any] = {
         "/boxes": {
             "frame_id": "map",
             "of": [{"id": number, "x": number, "y": 0, "yaw": number} for number in (1, 2)],
         },
         "/discs": {"x": 0, "y": 0},
-        "/rings": {"corners": [{"x": x, "y": y} for x, y in ring]},
+        "/rings": {"corners": [{"x": x, "y": y} for x, y in ring_corners]},
         "/charge": {"value": 1},
     }
     topics = [Topic(topic, "trial", "json") for topic in contents]
     plan = ReadingPlan.of(parse_mapping(_TRIAL), topics)
     assembler = LiveAssembler(plan, lambda topic: lambda _: contents[topic], name="", max_delay_s=1.0)
-    for tick in range(4):
+    for second in range(4):
         for topic in contents:
-            assembler.add([Message(topic, tick * 10**9, tick * 10**9, 0, b"")], tick)
+            assembler.add([Message(topic, second * 10**9, second * 10**9, 0, b"")], second)
     assembler.lose(tuple(contents), 5.0)
     assembler.finish()
 
@@ -814,22 +842,24 @@ class LiveAssembler(_Assembling):
         super().__init__(plan, decoder, name=name, on_time_jump="split", concave=concave)
         self._max_delay_s = max_delay_s
         self._is_in_order = in_order and plan.by_log_time
-        moving = (planned.name for planned in plan.planned if planned.is_transforms and not planned.is_static)
-        self._moving = frozenset(moving)
+        transform_topics = (
+            planned.name for planned in plan.planned if planned.is_transforms and not planned.is_static
+        )
+        self._transform_topics = frozenset(transform_topics)
         # static transforms are valid at all times, so no sample waits for their topics
-        self._in_step = [
+        self._awaited_topics = [
             planned.name
             for planned in plan.planned
             if not planned.is_static and (planned.mapping is not None or planned.name == plan.sampled_topic)
         ]
-        self._follows_frames = bool(self._moving) and any(
+        self._follows_frames = bool(self._transform_topics) and any(
             planned.is_static and planned.mapping is not None for planned in plan.planned
         )
-        self._latest_of = dict.fromkeys((planned.name for planned in plan.planned), -1)
-        self._back_ns = {name: int(reader.repeats_times) for name, reader in self._readers.items()}
-        self._silent: deque[tuple[float, int]] = deque()
+        self._latest_ns_by_topic = dict.fromkeys((planned.name for planned in plan.planned), -1)
+        self._step_back_ns = {name: int(reader.repeats_times) for name, reader in self._readers.items()}
+        self._deadlines: deque[tuple[float, int]] = deque()
         self._arrivals: deque[tuple[float, int]] = deque(maxlen=_MOST_HELD)
-        self._patient_ns = -1
+        self._expired_ns = -1
         self._held: list[_Held] = []
         self._are_transforms_new = False
         self._lost: set[str] = set()
@@ -841,10 +871,10 @@ class LiveAssembler(_Assembling):
     @property
     def topics(self) -> tuple[str, ...]:
         """Topics that samples depend on, without topics that are sent once and stay valid."""
-        passing = (
+        passing_topics = (
             planned.topic for planned in self._plan.planned if not (planned.is_lasting or planned.is_latched)
         )
-        return tuple(dict.fromkeys(passing))
+        return tuple(dict.fromkeys(passing_topics))
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
         """Add messages in order of arrival; return the samples that are now final.
@@ -857,11 +887,11 @@ class LiveAssembler(_Assembling):
         self._lost.difference_update(self._names_of({message.topic for message in messages}))
         if messages and not self.is_finished:
             self._add_step(self._columns(messages))
-        waited_ns = self._silent[-1][1] if self._silent else max(self._settled_ns, self._patient_ns)
+        waited_ns = self._deadlines[-1][1] if self._deadlines else max(self._settled_ns, self._expired_ns)
         # one deadline for all times since the last deadline
         if waited_ns < self._newest_ns:
             patience_s = _MOMENT_S if self._is_in_order else self._max_delay_s
-            self._silent.append((now_s + patience_s, self._newest_ns))
+            self._deadlines.append((now_s + patience_s, self._newest_ns))
             self._arrivals.append((now_s, self._newest_ns))
         return self._settle(self._upto_ns(now_s))
 
@@ -880,11 +910,11 @@ class LiveAssembler(_Assembling):
 
     def due_s(self) -> float | None:
         """Return the time of the next call of `add`, even without messages; None if nothing waits."""
-        times = [waiting.until_s for waiting in self._held]
+        deadlines_s = [waiting.until_s for waiting in self._held]
         is_settled = self._settled_ns >= self._newest_ns
-        if self._silent and self._silent[-1][1] > self._patient_ns and not is_settled:
-            times.append(self._silent[0][0])
-        return min(times, default=None)
+        if self._deadlines and self._deadlines[-1][1] > self._expired_ns and not is_settled:
+            deadlines_s.append(self._deadlines[0][0])
+        return min(deadlines_s, default=None)
 
     def flush(self) -> Trace:
         """Return the samples that still wait for messages."""
@@ -897,27 +927,29 @@ class LiveAssembler(_Assembling):
         A topic is lost with its connection, or after a silence. Its objects and signals stay unknown until it
         reports them again. Messages of other topics wait as before.
         """
-        newly_lost = self._names_of(topics) - self._lost
-        if not newly_lost:
+        newly_lost_topics = self._names_of(topics) - self._lost
+        if not newly_lost_topics:
             return Trace.empty()
         self._now_s = now_s
-        self._lost |= newly_lost
-        self._held = [waiting for waiting in self._held if waiting.topic not in newly_lost]
+        self._lost |= newly_lost_topics
+        self._held = [waiting for waiting in self._held if waiting.topic not in newly_lost_topics]
         # lost topics send nothing more, so that samples up to their last message are final
-        gone_ns = min(self._newest_ns, max(self._latest_of[topic] for topic in newly_lost))
-        so_far = self._settle(max(self._upto_ns(now_s), gone_ns), is_last=True)
+        last_message_ns = min(
+            self._newest_ns, max(self._latest_ns_by_topic[topic] for topic in newly_lost_topics)
+        )
+        trace = self._settle(max(self._upto_ns(now_s), last_message_ns), is_last=True)
         # one nanosecond later, so that the loss is a sample of its own
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
-            return so_far
+            return trace
         self._tracker.advance(lost_ns)
-        self._tracker.lose(lost_ns, newly_lost)
-        if any(self._readers[topic].transforms is not None for topic in newly_lost):
+        self._tracker.lose(lost_ns, newly_lost_topics)
+        if any(self._readers[topic].transforms is not None for topic in newly_lost_topics):
             self._tree.forget_moving()
         self._settled_ns = lost_ns
-        lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
+        lost_trace = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
         self._tracker.forget(lost_ns)
-        return Trace.concatenate([so_far, lost])
+        return Trace.concatenate([trace, lost_trace])
 
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
@@ -926,33 +958,33 @@ class LiveAssembler(_Assembling):
         if not is_late.any():
             return times_ns, ~is_late
         # as in a log, the next sample shows it, unless a later message of the topic has replaced it
-        counts = ~is_late | (times_ns > reader.pending.taken_ns) | reader.repeats_times
+        is_used = ~is_late | (times_ns > reader.pending.taken_ns) | reader.repeats_times
         for time_ns, log_ns, is_shown in zip(
-            times_ns[is_late].tolist(), log_times_ns[is_late].tolist(), counts[is_late].tolist(), strict=True
+            times_ns[is_late].tolist(), log_times_ns[is_late].tolist(), is_used[is_late].tolist(), strict=True
         ):
             self.late += 1
             remedy = (
                 "the next sample has it" if is_shown else "it is left out, since a later message came before"
             )
-            behind = (self._settled_ns - time_ns) / 1e9
-            what = f"it came after the samples up to {behind:.3f} s later; {remedy}"
-            self._add_fault(reader.name, log_ns, what)
-            if behind <= self._max_delay_s:
+            behind_s = (self._settled_ns - time_ns) / 1e9
+            fault = f"it came after the samples up to {behind_s:.3f} s later; {remedy}"
+            self._add_fault(reader.name, log_ns, fault)
+            if behind_s <= self._max_delay_s:
                 self._is_in_order = False
-        return times_ns, counts
+        return times_ns, is_used
 
     def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name
-        newest_ns = np.maximum.accumulate(np.append(self._latest_of[name], times_ns))
-        self._latest_of[name] = int(newest_ns[-1])
+        newest_ns = np.maximum.accumulate(np.append(self._latest_ns_by_topic[name], times_ns))
+        self._latest_ns_by_topic[name] = int(newest_ns[-1])
         back_ns = newest_ns[:-1] - times_ns
         # a message that steps back farther is too late anyway
         back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
         # one more, because samples are final only before the earliest time that may still come
-        self._back_ns[name] = max(self._back_ns[name], int(back_ns.max(initial=-1)) + 1)
-        if name in self._moving:
+        self._step_back_ns[name] = max(self._step_back_ns[name], int(back_ns.max(initial=-1)) + 1)
+        if name in self._transform_topics:
             self._are_transforms_new = True
-        if not self._moving or len(self._held) >= _MOST_HELD:
+        if not self._transform_topics or len(self._held) >= _MOST_HELD:
             return
         until_s = self._now_s + self._max_delay_s
         if self._follows_frames and name == self._plan.sampled_topic:
@@ -980,14 +1012,16 @@ class LiveAssembler(_Assembling):
         """Return the time up to which samples are final."""
         newest_ns = self._newest_ns
         # a topic that has stepped back in time may step back as far again
-        reached = (self._latest_of[topic] - self._back_ns[topic] for topic in self._in_step)
-        upto_ns = min(reached, default=newest_ns)
+        reached_ns = (
+            self._latest_ns_by_topic[topic] - self._step_back_ns[topic] for topic in self._awaited_topics
+        )
+        upto_ns = min(reached_ns, default=newest_ns)
         if self._is_in_order:
             # all messages before the newest time have arrived, but more messages of that time may follow
             upto_ns = max(upto_ns, newest_ns - 1)
-        while self._silent and self._silent[0][0] <= now_s:
-            self._patient_ns = self._silent.popleft()[1]
-        upto_ns = min(max(upto_ns, self._patient_ns), newest_ns)
+        while self._deadlines and self._deadlines[0][0] <= now_s:
+            self._expired_ns = self._deadlines.popleft()[1]
+        upto_ns = min(max(upto_ns, self._expired_ns), newest_ns)
         self._release(now_s)
         return min([upto_ns, *(waiting.time_ns - 1 for waiting in self._held)])
 
@@ -998,31 +1032,33 @@ class LiveAssembler(_Assembling):
             self._held = [
                 waiting for waiting, can_be in zip(self._held, self._placeable(), strict=True) if not can_be
             ]
-        late = [waiting for waiting in self._held if waiting.until_s <= now_s]
-        if late:
+        overdue = [waiting for waiting in self._held if waiting.until_s <= now_s]
+        if overdue:
             self._held = [waiting for waiting in self._held if waiting.until_s > now_s]
-            self.overdue += len(late)
-            self.overdue_frame = late[-1].topic, late[-1].frame
+            self.overdue += len(overdue)
+            self.overdue_frame = overdue[-1].topic, overdue[-1].frame
 
     def _placeable(self) -> list[bool]:
         """Return for each waiting observation whether its transforms have arrived."""
-        fixed, tree = self._plan.mapping.fixed_frame or "", self._tree
+        fixed_frame, tree = self._plan.mapping.fixed_frame or "", self._tree
         are_placeable = [False] * len(self._held)
-        reached_ns = min((self._latest_of[topic] for topic in self._moving), default=-1)
-        kinds: dict[tuple[str, bool], list[int]] = {}
-        for place, waiting in enumerate(self._held):
+        reached_ns = min((self._latest_ns_by_topic[topic] for topic in self._transform_topics), default=-1)
+        indices_by_kind: dict[tuple[str, bool], list[int]] = {}
+        for index, waiting in enumerate(self._held):
             if waiting.frame:
-                kinds.setdefault((waiting.frame, waiting.by_stamp), []).append(place)
+                indices_by_kind.setdefault((waiting.frame, waiting.by_stamp), []).append(index)
             else:
-                are_placeable[place] = reached_ns >= waiting.at_ns
-        for (frame, by_stamp), places in kinds.items():
-            at_ns = np.array([self._held[place].at_ns for place in places], np.int64)
-            time_ns = np.array([self._held[place].time_ns for place in places], np.int64)
+                are_placeable[index] = reached_ns >= waiting.at_ns
+        for (frame, by_stamp), indices in indices_by_kind.items():
+            at_ns = np.array([self._held[index].at_ns for index in indices], np.int64)
+            time_ns = np.array([self._held[index].time_ns for index in indices], np.int64)
             log_ns = time_ns if self._plan.by_log_time else None
-            is_found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
+            is_placeable = tree.between(fixed_frame, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
             if by_stamp:
                 # a stamp far behind the newest one may follow a reset clock: the next transform shows it
-                is_found = is_found & ((at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns))
-            for place, is_known in zip(places, is_found.tolist(), strict=True):
-                are_placeable[place] = is_known
+                is_placeable = is_placeable & (
+                    (at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns)
+                )
+            for index, is_known in zip(indices, is_placeable.tolist(), strict=True):
+                are_placeable[index] = is_known
         return are_placeable

@@ -69,19 +69,19 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
         is_accepted = assumption.name in mapping.accept
         uncontradicted.pop(assumption.name, None)
         for topics in _group_topics(clauses):
-            others = f" (and so in {plural(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
+            more_topics = f" (and so in {plural(len(topics) - 1, 'more topic')})" if len(topics) > 1 else ""
             if len({clauses[topic] for topic in topics}) == 1:
-                others = ""
-            subjects = topics[:1] if others else topics[:_MOST_NAMED]
+                more_topics = ""
+            subjects = topics[:1] if more_topics else topics[:_MOST_NAMED]
             remedy = f"; {assumption.remedy}" if assumption.remedy else ""
-            text = Sentence(f"{', '.join(subjects)}: ", clauses[topics[0]], f"{others}{remedy}")
+            text = Sentence(f"{', '.join(subjects)}: ", clauses[topics[0]], f"{more_topics}{remedy}")
             if assumption.is_remark:
                 yield Sentence("accepted: ", text) if is_accepted else text
                 continue
-            rests = [log[topic] for topic in topics]
+            topic_evidence = [log[topic] for topic in topics]
             signals = [
                 signal.name
-                for evidence in rests
+                for evidence in topic_evidence
                 if assumption.is_about_signals and evidence.planned.mapping is not None
                 for signal in evidence.planned.mapping.signals
             ]
@@ -89,7 +89,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
                 assumption.name,
                 topics[0],
                 text,
-                objects=frozenset[str]().union(*(evidence.object_names for evidence in rests)),
+                objects=frozenset[str]().union(*(evidence.object_names for evidence in topic_evidence)),
                 signals=frozenset(signals),
                 is_accepted=is_accepted,
             )
@@ -122,9 +122,9 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     # the mean period, not the shortest: messages within a burst are close in any unit
     period_ns = arrivals.mean_period_s * 1e9
-    for unit, ns in list(UNITS_NS.items())[1:]:
-        year = _year(first_ns * ns)
-        if year is not None and period_ns < SHORTEST_PERIOD_NS < period_ns * ns:
+    for unit, unit_ns in list(UNITS_NS.items())[1:]:
+        year = _year(first_ns * unit_ns)
+        if year is not None and period_ns < SHORTEST_PERIOD_NS < period_ns * unit_ns:
             return (
                 f"its times look like {unit}: {first_ns} is {year} in {unit} and January 1970 in ns;"
                 f" messages would come every {period_ns:.3g} ns"
@@ -148,12 +148,14 @@ def _year(time_ns: int) -> int | None:
 def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, clock = evidence.arrivals, evidence.planned.clock
     varies = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
-    others = [name for name, is_varying in varies.items() if is_varying and name != clock]
+    varying_clocks = [name for name, is_varying in varies.items() if is_varying and name != clock]
     # latched messages may all arrive at the same time
     is_latched = evidence.planned.is_latched or evidence.planned.is_lasting
-    if varies.get(clock, True) or arrivals.messages < _FEW or not others or is_latched:
+    if varies.get(clock, True) or arrivals.messages < _FEW or not varying_clocks or is_latched:
         return None
-    return f"its {arrivals.messages:,} messages have one {clock} time, and different {others[0]} times"
+    return (
+        f"its {arrivals.messages:,} messages have one {clock} time, and different {varying_clocks[0]} times"
+    )
 
 
 def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
@@ -187,7 +189,10 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     # a simulation may run at any rate, except by exactly the factor of a unit
     factor = passed_s / log_s
-    if not any(abs(factor * ns - 1) < _UNIT_ERROR or abs(factor / ns - 1) < _UNIT_ERROR for ns in _FACTORS):
+    if not any(
+        abs(factor * unit_factor - 1) < _UNIT_ERROR or abs(factor / unit_factor - 1) < _UNIT_ERROR
+        for unit_factor in _FACTORS
+    ):
         return None
     return (
         f"its stamps advance by {number_text(passed_s)} s while {number_text(log_s)} s pass in the log, as"
@@ -229,19 +234,22 @@ def _signed_s(late_s: float) -> str:
 
 
 def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
-    layout, count = evidence.planned.layout, evidence.quaternions
-    if layout is None or not layout.order or count < _FEW:
+    layout, quaternion_count = evidence.planned.layout, evidence.quaternions
+    if layout is None or not layout.order or quaternion_count < _FEW:
         return None
-    upright, other_upright = evidence.upright, evidence.upright_otherwise
-    if other_upright < _MOST_UPRIGHT * count or upright > _FEW_UPRIGHT * count:
+    upright_count, other_upright_count = evidence.upright, evidence.upright_otherwise
+    if (
+        other_upright_count < _MOST_UPRIGHT * quaternion_count
+        or upright_count > _FEW_UPRIGHT * quaternion_count
+    ):
         return None
     # a tag on a table, seen from above, is upside down; in the other order it seems upright and not turned
-    if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * count):
+    if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * quaternion_count):
         return None
     other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
     return (
-        f"{upright:,} of {plural(count, 'object')} stand upright if the order of the four numbers is"
-        f" {layout.order}, and {other_upright:,} if it is {other_order}"
+        f"{upright_count:,} of {plural(quaternion_count, 'object')} stand upright if the order of the four"
+        f" numbers is {layout.order}, and {other_upright_count:,} if it is {other_order}"
     )
 
 
@@ -250,18 +258,21 @@ _MOST_UPRIGHT, _FEW_UPRIGHT, _SOME_TURNED = 0.9, 0.5, 0.05
 
 
 def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
-    length = evidence.quaternion_length
-    short, long = length.quantile(_OUTLIERS), length.quantile(1 - _OUTLIERS)
-    if not long - short > _LENGTH_ERROR * long:
+    lengths = evidence.quaternion_length
+    shortest, longest = lengths.quantile(_OUTLIERS), lengths.quantile(1 - _OUTLIERS)
+    if not longest - shortest > _LENGTH_ERROR * longest:
         return None
-    return f"its quaternions have lengths from {number_text(short)} to {number_text(long)}"
+    return f"its quaternions have lengths from {number_text(shortest)} to {number_text(longest)}"
 
 
 def _scaled_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
-    usual = evidence.quaternion_length.median
-    if not abs(usual - 1) > _LENGTH_ERROR or _length_of_quaternion(evidence, log):
+    usual_length = evidence.quaternion_length.median
+    if not abs(usual_length - 1) > _LENGTH_ERROR or _length_of_quaternion(evidence, log):
         return None
-    return f"its quaternions have the length {number_text(usual)}, and are taken as multiples of a rotation"
+    return (
+        f"its quaternions have the length {number_text(usual_length)}, and are taken as multiples of a"
+        " rotation"
+    )
 
 
 _LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
@@ -300,18 +311,19 @@ _ROUNDING: Final = 0.01
 
 
 def _beyond_a_turn(evidence: TopicEvidence, log: Log) -> str | None:
-    layout, turn = evidence.planned.layout, evidence.turn
+    layout, angles = evidence.planned.layout, evidence.turn
     if layout is None or abs(layout.angle_scale) == 1.0:
         return None
     a_turn = round(2 * pi / abs(layout.angle_scale))
     limit = a_turn * _A_TURN / 360
-    if not turn.greatest > limit or _is_unwrapped(evidence, limit):
+    if not angles.greatest > limit or _is_unwrapped(evidence, limit):
         return None
-    reached = number_text(turn.greatest)
-    if turn.median > a_turn:
-        return f"its yaw reaches {reached}, and mostly lies beyond a turn of {a_turn}"
+    reached_text = number_text(angles.greatest)
+    if angles.median > a_turn:
+        return f"its yaw reaches {reached_text}, and mostly lies beyond a turn of {a_turn}"
     return (
-        f"its yaw reaches {reached}, which is beyond a turn of {a_turn}; {reached} often means not available"
+        f"its yaw reaches {reached_text}, which is beyond a turn of {a_turn}; {reached_text} often means not"
+        " available"
     )
 
 
@@ -325,8 +337,8 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
     if layout is None or motions.steps < _FEW_STEPS or evidence.has_given_heading or _radians(evidence, log):
         return None
     courses = motions.courses
-    read = courses.pop("read")
-    if abs(read) > _STEADY and abs(phase(read)) < _ASKEW:
+    read_course = courses.pop("read")
+    if abs(read_course) > _STEADY and abs(phase(read_course)) < _ASKEW:
         return None
     fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
@@ -335,9 +347,11 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
     if keys is None or (is_straight and not ("north" in keys and is_compass)):
         return None
-    off = f"{degrees(phase(read)):.0f} degrees" if abs(read) > _STEADY else "by changing angles"
+    deviation = (
+        f"{degrees(phase(read_course)):.0f} degrees" if abs(read_course) > _STEADY else "by changing angles"
+    )
     return (
-        f"its objects move {off} off their yaw, and along it with"
+        f"its objects move {deviation} off their yaw, and along it with"
         f" `yaw: {{field: {evidence.turn_path}, {keys}}}`"
     )
 
@@ -352,10 +366,10 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
     if goes_along or _heading(evidence, log):
         return None
     unit = {1.0: "rad", pi / 180: "deg"}.get(abs(yaw.scale), "cdeg")
-    compass = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
+    heading_keys = f"{{field: {yaw.field}, unit: {unit}, zero: north, clockwise: true}}"
     return (
         f"{yaw.field} counts from the east, counter-clockwise; a heading from the north, clockwise, is"
-        f" `yaw: {compass}`"
+        f" `yaw: {heading_keys}`"
     )
 
 
@@ -396,22 +410,29 @@ def _upward(evidence: TopicEvidence, log: Log) -> str | None:
     is_flat = np.isfinite([*low, *high]).all() and low[1] == high[1]
     if not is_flat or evidence.motions.speed.count < _FEW_LEAPS or high[2] - low[2] <= evidence.size.greatest:
         return None
-    depth = number_text(float(high[2] - low[2]))
-    return f"y is {number_text(float(low[1]))} throughout and z varies by {depth}, as where y points upwards"
+    depth_text = number_text(float(high[2] - low[2]))
+    return (
+        f"y is {number_text(float(low[1]))} throughout and z varies by {depth_text}, as where y points"
+        " upwards"
+    )
 
 
 def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
     layout = evidence.planned.layout
     if layout is None or layout.origin is None:
         return None
-    most = max(abs(evidence.low[0]), abs(evidence.high[0]))
-    if not most > 90:
+    greatest_latitude = max(abs(evidence.low[0]), abs(evidence.high[0]))
+    if not greatest_latitude > 90:
         return None
     # degrees times 10^7 are at most 9e8
-    hint = f"; times 1e-7 it is {number_text(most * 1e-7)}" if 1e6 < most <= 9e8 else ""
-    if most == _NO_LATITUDE:
+    hint = (
+        f"; times 1e-7 it is {number_text(greatest_latitude * 1e-7)}"
+        if 1e6 < greatest_latitude <= 9e8
+        else ""
+    )
+    if greatest_latitude == _NO_LATITUDE:
         hint = ", and AIS sends 91 and 181 for not available"
-    return f"{most:.0f} is no latitude in degrees{hint}"
+    return f"{greatest_latitude:.0f} is no latitude in degrees{hint}"
 
 
 _NO_LATITUDE: Final = 91.0
@@ -423,10 +444,13 @@ def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
     if layout is None or layout.origin is None or _no_degrees(evidence, log):
         return None
     origin = np.array(layout.origin)
-    distance = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
-    if not (distance > _FAR_DEGREES and np.abs(evidence.high[:2]).max() <= 360):
+    distance_deg = max(np.abs(evidence.low[:2] - origin).max(), np.abs(evidence.high[:2] - origin).max())
+    if not (distance_deg > _FAR_DEGREES and np.abs(evidence.high[:2]).max() <= 360):
         return None
-    return f"its fixes are up to {number_text(distance)} degrees from the origin, where the earth is not flat"
+    return (
+        f"its fixes are up to {number_text(distance_deg)} degrees from the origin, where the earth is not"
+        " flat"
+    )
 
 
 _FAR_DEGREES: Final = 2.0
@@ -434,20 +458,21 @@ _FAR_DEGREES: Final = 2.0
 
 
 def _precision(evidence: TopicEvidence, log: Log) -> str | None:
-    most = float(max(np.abs(evidence.low[:2]).max(), np.abs(evidence.high[:2]).max()))
-    if not (evidence.is_single and evidence.has_fraction and np.isfinite(most)):
+    greatest_coordinate = float(max(np.abs(evidence.low[:2]).max(), np.abs(evidence.high[:2]).max()))
+    if not (evidence.is_single and evidence.has_fraction and np.isfinite(greatest_coordinate)):
         return None
-    step = float(np.spacing(np.float32(most)))
+    resolution = float(np.spacing(np.float32(greatest_coordinate)))
     is_geodetic = evidence.planned.is_geodetic
     if is_geodetic:
-        step *= _METRES_A_DEGREE
-    sizes = [topic.size.median for topic in log.values() if topic.size.median > 0]
-    if step < _COARSE * min(sizes, default=np.inf):
+        resolution *= _METRES_A_DEGREE
+    object_sizes = [topic.size.median for topic in log.values() if topic.size.median > 0]
+    if resolution < _COARSE * min(object_sizes, default=np.inf):
         return None
-    place = f"{most:.0f} degrees" if is_geodetic else f"{most:.0f}"
+    place_text = f"{greatest_coordinate:.0f} degrees" if is_geodetic else f"{greatest_coordinate:.0f}"
     return (
-        f"its coordinates are float32, whose step at {place} is {number_text(step)}{' m' * is_geodetic}; the"
-        f" smallest objects are {number_text(min(sizes))} long"
+        f"its coordinates are float32, whose step at {place_text} is"
+        f" {number_text(resolution)}{' m' * is_geodetic}; the smallest objects are"
+        f" {number_text(min(object_sizes))} long"
     )
 
 
@@ -458,10 +483,13 @@ _METRES_A_DEGREE: Final = 111_320.0
 
 
 def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
-    zeros, count = evidence.zero_covariances, evidence.covariances
-    if not zeros or zeros < count / 2:
+    zero_count, covariance_count = evidence.zero_covariances, evidence.covariances
+    if not zero_count or zero_count < covariance_count / 2:
         return None
-    return f"{zeros:,} of {plural(count, 'covariance')} are zeros, which means unknown, and count as exact"
+    return (
+        f"{zero_count:,} of {plural(covariance_count, 'covariance')} are zeros, which means unknown, and"
+        " count as exact"
+    )
 
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
@@ -491,11 +519,11 @@ def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
     return _there_and_back(moment, returns, motions.chances, "two objects under one name do")
 
 
-def _there_and_back(moment: Moment, returns: int, chances: int, like: str) -> Sentence:
+def _there_and_back(moment: Moment, returns: int, chances: int, comparison: str) -> Sentence:
     return Sentence(
         f"{moment.name} leaps by {number_text(moment.amount)} at ",
         Instant(moment.time_ns, 0),
-        f" and back, and so in {returns:,} of {plural(chances, 'report')}, as {like}",
+        f" and back, and so in {returns:,} of {plural(chances, 'report')}, as {comparison}",
     )
 
 
@@ -504,13 +532,16 @@ def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
     if layout is None or not layout.complete:
         return None
     if evidence.reader.extractor is not None and evidence.reader.extractor.differences:
-        count = plural(evidence.reader.extractor.differences, "message")
-        return f"{count} have `is_diff`: lists of changes, and objects that they leave out are still there"
-    usual = int(gaps[:-1].argmax())
-    if usual < 2 or gaps[usual] < max(2 * _FEW, _REGULAR * gaps.sum()):
+        message_text = plural(evidence.reader.extractor.differences, "message")
+        return (
+            f"{message_text} have `is_diff`: lists of changes, and objects that they leave out are still"
+            " there"
+        )
+    usual_gap = int(gaps[:-1].argmax())
+    if usual_gap < 2 or gaps[usual_gap] < max(2 * _FEW, _REGULAR * gaps.sum()):
         return None
     return (
-        f"its objects leave and return in turn: most are in every {_ordinal(usual)} message only, as if"
+        f"its objects leave and return in turn: most are in every {_ordinal(usual_gap)} message only, as if"
         " a list came in parts"
     )
 
@@ -524,15 +555,18 @@ def _ordinal(number: int) -> str:
 
 
 def _one_class(evidence: TopicEvidence, log: Log) -> str | None:
-    changes, count = evidence.motions.changes, evidence.motions.change_count
+    changes, change_count = evidence.motions.changes, evidence.motions.change_count
     if not changes:
         return None
-    first = changes[0]
-    more = f", and so {count - 1:,} more times" if count > 1 else ""
+    first_change = changes[0]
+    more_text = f", and so {change_count - 1:,} more times" if change_count > 1 else ""
     return Sentence(
-        f"the class of {first.name} changes from {first.before or 'none'} to {first.after or 'none'} at ",
-        Instant(first.time_ns, 0),
-        f"{more}; a formula about a class says nothing of its object afterwards",
+        (
+            f"the class of {first_change.name} changes from {first_change.before or 'none'} to"
+            f" {first_change.after or 'none'} at "
+        ),
+        Instant(first_change.time_ns, 0),
+        f"{more_text}; a formula about a class says nothing of its object afterwards",
     )
 
 
@@ -540,16 +574,16 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     extractor = evidence.reader.extractor
     if extractor is None or not extractor.boxes:
         return None
-    left, low, count = extractor.leftward, extractor.downward, extractor.boxes
-    if left < count / 5 and not count / 5 < low < count * 4 / 5:
+    leftward_count, downward_count, box_count = extractor.leftward, extractor.downward, extractor.boxes
+    if leftward_count < box_count / 5 and not box_count / 5 < downward_count < box_count * 4 / 5:
         return None
     # opposite corners in the other order have similar ranges, but sizes do not reach as far as positions
     reach = extractor.corner_high - extractor.corner_low
-    if min(left, low) == count and (reach[1] > reach[0] / 2).all():
+    if min(leftward_count, downward_count) == box_count and (reach[1] > reach[0] / 2).all():
         return None
     return (
-        f"in {left:,} of {count:,} boxes the second corner lies left of the first: these may be x, y,"
-        " width and height"
+        f"in {leftward_count:,} of {box_count:,} boxes the second corner lies left of the first: these may be"
+        " x, y, width and height"
     )
 
 
@@ -562,25 +596,25 @@ def _extent(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
-    others = [topic for topic in log.values() if topic is not evidence and topic.objects]
-    sizes = [topic.size.median for topic in others if topic.size.median > 0]
-    speeds = [topic.motions.speed.quantile(0.9) for topic in others]
-    speeds = [speed for speed in speeds if speed > 0]
+    other_topics = [topic for topic in log.values() if topic is not evidence and topic.objects]
+    other_sizes = [topic.size.median for topic in other_topics if topic.size.median > 0]
+    other_speeds = [topic.motions.speed.quantile(0.9) for topic in other_topics]
+    other_speeds = [speed for speed in other_speeds if speed > 0]
     size, arrivals = evidence.size.median, evidence.arrivals
     # objects in messages recorded in bursts only seem fast, because times within a burst are close
-    burst = min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
-    usual, speed = (evidence.motions.speed.quantile(share) * burst for share in (0.5, 0.9))
+    burst_factor = min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
+    usual_speed, speed = (evidence.motions.speed.quantile(share) * burst_factor for share in (0.5, 0.9))
     # a size from the mapping is in another unit than the places if an object moves 1,000 sizes a second
-    if usual > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
-        return f"its objects are {number_text(size)} long and move at {number_text(usual)} a second"
-    if not (sizes and speeds and speed > _THOUSAND * max(speeds)):
+    if usual_speed > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
+        return f"its objects are {number_text(size)} long and move at {number_text(usual_speed)} a second"
+    if not (other_sizes and other_speeds and speed > _THOUSAND * max(other_speeds)):
         return None
     # a shape from the mapping shows no unit of the log, so that speed decides: no robot is faster than sound
-    if not (size > _THOUSAND * max(sizes) or speed > _SOUND):
+    if not (size > _THOUSAND * max(other_sizes) or speed > _SOUND):
         return None
     return (
         f"its objects are {number_text(size)} long and move at {number_text(speed)} a second, and others at"
-        f" most {number_text(max(sizes))} and {number_text(max(speeds))}: it may be in mm"
+        f" most {number_text(max(other_sizes))} and {number_text(max(other_speeds))}: it may be in mm"
     )
 
 
@@ -599,8 +633,10 @@ def _alternating(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, mapping = evidence.arrivals, evidence.planned.mapping
     if mapping is None or evidence.signal_chances < _FEW_LEAPS or arrivals.period_s.median > 1.0:
         return None
-    often = evidence.signal_returns > _IN_PAIRS * evidence.signal_chances
-    names = [signal.name for signal, is_often in zip(mapping.signals, often, strict=True) if is_often]
+    is_often = evidence.signal_returns > _IN_PAIRS * evidence.signal_chances
+    names = [
+        signal.name for signal, returns_often in zip(mapping.signals, is_often, strict=True) if returns_often
+    ]
     if not names:
         return None
     return f"{', '.join(names[:_MOST_NAMED])} goes there and back with each message, as if two senders report"
@@ -620,18 +656,18 @@ def _cornerless(evidence: TopicEvidence, log: Log) -> str | None:
     if extractor is None or not extractor.cornerless:
         return None
     is_bounds = extractor.layout.is_bounds
-    count = "other than two corners" if is_bounds else "fewer than three corners"
+    corner_condition = "other than two corners" if is_bounds else "fewer than three corners"
     hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
     outlines = plural(extractor.cornerless, "outline")
-    return f"{outlines} with {count}: objects are unknown there{hint}"
+    return f"{outlines} with {corner_condition}: objects are unknown there{hint}"
 
 
 def _unset(evidence: TopicEvidence, log: Log) -> str | None:
     extractor = evidence.reader.extractor
     if extractor is None or not extractor.unset:
         return None
-    counts = (f"{plural(count, 'object')} did not set {path}" for path, count in extractor.unset.items())
-    return f"{', '.join(counts)}, so it is unknown there"
+    clauses = (f"{plural(count, 'object')} did not set {path}" for path, count in extractor.unset.items())
+    return f"{', '.join(clauses)}, so it is unknown there"
 
 
 def _zero_quaternions(evidence: TopicEvidence, log: Log) -> str | None:
@@ -650,29 +686,31 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
     usual_step = motions.speed.median * evidence.arrivals.period_s.median
     is_far = moment is not None and moment.amount > _FAST_LEAP * usual_step
     if moment is not None and is_far and motions.returns >= _FEW and _one_object(evidence, log) is None:
-        like = "with a number that stands for not available"
-        return _there_and_back(moment, motions.returns, motions.chances, like)
-    jump, comeback, usual = motions.jump, motions.comeback, max(motions.speed.quantile(0.9), 0.0)
+        comparison = "with a number that stands for not available"
+        return _there_and_back(moment, motions.returns, motions.chances, comparison)
+    jump, comeback, usual_speed = motions.jump, motions.comeback, max(motions.speed.quantile(0.9), 0.0)
     if jump is None or motions.speed.count < _FEW_LEAPS or not evidence.size.greatest > 0:
         return None
     if motions.zeros >= _FEW:
-        times = plural(motions.zeros, "time")
-        return f"its objects leap to (0, 0) {times}, as where that stands for not available"
-    far = FAR_LEAP * evidence.size.greatest
-    if comeback is not None and comeback.amount > max(far, _FARTHER * usual * motions.comeback_s):
+        times_text = plural(motions.zeros, "time")
+        return f"its objects leap to (0, 0) {times_text}, as where that stands for not available"
+    far_distance = FAR_LEAP * evidence.size.greatest
+    if comeback is not None and comeback.amount > max(
+        far_distance, _FARTHER * usual_speed * motions.comeback_s
+    ):
         return Sentence(
             f"{comeback.name} is {number_text(comeback.amount)} farther at ",
             Instant(comeback.time_ns, 0),
             f", after {number_text(motions.comeback_s)} s without it, as where a name is used again; usual"
-            f" speeds are below {number_text(usual)}",
+            f" speeds are below {number_text(usual_speed)}",
         )
     speed = jump.amount / motions.jump_s if motions.jump_s > 0 else np.inf
-    if not (jump.amount > far and speed > _FAST_LEAP * usual):
+    if not (jump.amount > far_distance and speed > _FAST_LEAP * usual_speed):
         return None
     return Sentence(
         f"{jump.name} is {number_text(jump.amount)} farther at ",
         Instant(jump.time_ns, 0),
-        f", after {number_text(motions.jump_s)} s; usual speeds are below {number_text(usual)}",
+        f", after {number_text(motions.jump_s)} s; usual speeds are below {number_text(usual_speed)}",
     )
 
 

@@ -103,8 +103,8 @@ class Namer:
     @property
     def needs_messages(self) -> bool:
         """Whether names depend on fields of the messages, outside the objects."""
-        parts = (path for part in self._template.parts if not isinstance(part, str) for path in part)
-        return any(path.from_message for path in parts)
+        paths = (path for part in self._template.parts if not isinstance(part, str) for path in part)
+        return any(path.from_message for path in paths)
 
     def codes(
         self,
@@ -130,18 +130,18 @@ class Namer:
             self._name(objects[0], indices[0], message)
             self._prepare(objects[0], indices[0], message)
         code_by_value, get = self._code_by_value, self._get
-        of_objects = repeat(None, len(objects)) if messages is None else messages
-        rows = zip(objects, indices, of_objects, strict=True)
+        message_of_object = repeat(None, len(objects)) if messages is None else messages
+        arguments = zip(objects, indices, message_of_object, strict=True)
         if get is None:
-            return [self._codes[self._name(*row)] for row in rows]
+            return [self._codes[self._name(*argument)] for argument in arguments]
         codes = []
-        for row in rows:
-            value = get(*row)
+        for argument in arguments:
+            value = get(*argument)
             # the list of a UUID is not hashable
-            key = value if isinstance(value, str | int | float) else bytes(value)
-            code = code_by_value.get(key)
+            value_key = value if isinstance(value, str | int | float) else bytes(value)
+            code = code_by_value.get(value_key)
             if code is None:
-                code = code_by_value[key] = self._codes[self._name(*row)]
+                code = code_by_value[value_key] = self._codes[self._name(*argument)]
             codes.append(code)
         return codes
 
@@ -157,18 +157,18 @@ class Namer:
     def _prepare(self, example: object, index: int | str, message: object) -> None:
         """Compile a getter if the template has one field, so that names can be cached by its value."""
         self._is_prepared = True
-        fields = [part for part in self._template.parts if not isinstance(part, str)]
-        built_in = {INDEX, TOPIC}.difference(field_names(example))
-        if all(alternatives[0].text in built_in for alternatives in fields):
+        template_fields = [part for part in self._template.parts if not isinstance(part, str)]
+        built_in_names = {INDEX, TOPIC}.difference(field_names(example))
+        if all(alternatives[0].text in built_in_names for alternatives in template_fields):
             self._get = lambda _, index, message: index
-        elif len(fields) == 1 and len(fields[0]) == 1:
-            (path,) = fields[0]
+        elif len(template_fields) == 1 and len(template_fields[0]) == 1:
+            (path,) = template_fields[0]
             value = walk(path, message if path.from_message else example, index)
             if not isinstance(value, str | int | float) and not _is_uuid(value):
                 return
-            *before, last = path.steps
-            if path.from_message and isinstance(last, Place) and before:
-                get_names = getter(FieldPath(path.text, tuple(before)), message)
+            *list_steps, last_step = path.steps
+            if path.from_message and isinstance(last_step, Place) and list_steps:
+                get_names = getter(FieldPath(path.text, tuple(list_steps)), message)
                 self._get = lambda _, index, message: get_names(message)[index]
             elif not path.from_message:
                 get = getter(path, example)
@@ -176,7 +176,8 @@ class Namer:
 
     def _name(self, element: object, index: int | str, message: object) -> str:
         words = (
-            p if isinstance(p, str) else self._word(p, element, index, message) for p in self._template.parts
+            part if isinstance(part, str) else self._word(part, element, index, message)
+            for part in self._template.parts
         )
         return _check_name("".join(words))
 
@@ -211,18 +212,18 @@ def class_codes(
     if not binding.class_gets:
         return [codes[layout.class_name]] * len(objects)
     code_by_value: dict[Any, int] = {}
-    result = []
+    object_codes = []
     for element in objects:
         value = _first_value(binding.class_gets, element)
         code = code_by_value.get(value)
         if code is None:
             code = code_by_value[value] = codes[_class_name(layout, value, binding.class_names)]
-        result.append(code)
-    return result
+        object_codes.append(code)
+    return object_codes
 
 
-def _first_value(gets: Sequence[Get], element: object) -> Any:
-    for get in gets:
+def _first_value(getters: Sequence[Get], element: object) -> Any:
+    for get in getters:
         try:
             value = get(element)
         except (AttributeError, LookupError, TypeError):
@@ -238,12 +239,12 @@ def _class_name(layout: MessageLayout, value: object, names: Table[object, str])
     if value is None or value == "":
         return None
     # JSON can contain lone surrogates as escapes, which UTF-8 cannot encode
-    number = str(value).encode("utf-8", "replace").decode()
-    text = names.get(value, number)
-    for key in (number, text):
-        if key in layout.class_table:
-            return layout.class_table[key]
-    return layout.class_other if layout.class_has_other else text
+    value_text = str(value).encode("utf-8", "replace").decode()
+    class_text = names.get(value, value_text)
+    for table_key in (value_text, class_text):
+        if table_key in layout.class_table:
+            return layout.class_table[table_key]
+    return layout.class_other if layout.class_has_other else class_text
 
 
 def _text(value: object, path: FieldPath) -> str:
@@ -367,28 +368,28 @@ class TimeGetter:
         """
         times = map(self.get, values)
         if not self.is_pair:
-            unit = self.unit_ns
+            unit_ns = self.unit_ns
             return [
                 self._check(
-                    time * unit
+                    time * unit_ns
                     if type(time) is int
-                    else ns_from_text(time, unit)
+                    else ns_from_text(time, unit_ns)
                     if isinstance(time, str)
-                    else round(float(time) * unit)
+                    else round(float(time) * unit_ns)
                 )
                 for time in times
             ]
         pairs = np.fromiter(chain.from_iterable(times), np.int64, 2 * len(values))
-        seconds, rest = pairs[::2], pairs[1::2]
-        if len(rest) and rest.max() >= _SECOND_NS:
+        seconds, nanoseconds = pairs[::2], pairs[1::2]
+        if len(nanoseconds) and nanoseconds.max() >= _SECOND_NS:
             raise FieldError(
-                f"{self.path.text}: its nanoseconds, {rest.max()}, are not below one second, so the stamp is"
-                " invalid; `clock: log` takes the time of recording"
+                f"{self.path.text}: its nanoseconds, {nanoseconds.max()}, are not below one second, so the"
+                " stamp is invalid; `clock: log` takes the time of recording"
             )
         # checked before the product below, which would overflow
-        if len(seconds) and max(np.abs(seconds).max(), np.abs(rest).max()) >= LATEST_NS // _SECOND_NS:
+        if len(seconds) and max(np.abs(seconds).max(), np.abs(nanoseconds).max()) >= LATEST_NS // _SECOND_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
-        return [int(time) for time in (seconds * _SECOND_NS + rest).tolist()]
+        return [int(time) for time in (seconds * _SECOND_NS + nanoseconds).tolist()]
 
     def _check(self, time_ns: int) -> int:
         if abs(time_ns) > LATEST_NS:
@@ -408,14 +409,14 @@ def ns_from_text(text: str, unit_ns: int) -> int:
     Raises:
         ContentError: the text is none of these.
     """
-    if number := _SECONDS.fullmatch(text):
+    if seconds_match := _SECONDS.fullmatch(text):
         # exact, while a float of seconds since 1970 resolves only 0.24 us
-        return int(Decimal(number[1]) * (_SECOND_NS if number[2] else unit_ns))
-    date = _DATE.fullmatch(text)
+        return int(Decimal(seconds_match[1]) * (_SECOND_NS if seconds_match[2] else unit_ns))
+    date_match = _DATE.fullmatch(text)
     try:
-        if date is not None:
-            moment = datetime.fromisoformat(f"{date[1]}T{date[2]}{date[4] or '+00:00'}")
-            return int(moment.timestamp()) * _SECOND_NS + int((date[3] or "0").ljust(9, "0")[:9])
+        if date_match is not None:
+            moment = datetime.fromisoformat(f"{date_match[1]}T{date_match[2]}{date_match[4] or '+00:00'}")
+            return int(moment.timestamp()) * _SECOND_NS + int((date_match[3] or "0").ljust(9, "0")[:9])
     except ValueError:
         pass
     raise ContentError(
@@ -433,11 +434,11 @@ def ns_from_json(value: Any) -> int:
         ContentError, TypeError, ValueError: the value is none of these.
     """
     if isinstance(value, dict):
-        seconds, rest = (
+        seconds, nanoseconds = (
             next((value[name] for name in names if name in value), 0)
             for names in zip(*_TIME_FIELDS, strict=True)
         )
-        return int(seconds) * _SECOND_NS + int(rest)
+        return int(seconds) * _SECOND_NS + int(nanoseconds)
     return ns_from_text(value, 1) if isinstance(value, str) else int(value or 0)
 
 
@@ -465,9 +466,9 @@ class _Columns:
         value = walk(path, self.example)
         if not (is_number(value) or _is_numeral(value)):
             raise FieldError(f"{path.text}: expected a number, got {type_name(value)}")
-        texts = [column.text for column in self.paths]
-        if path.text in texts:
-            return texts.index(path.text)
+        path_texts = [column.text for column in self.paths]
+        if path.text in path_texts:
+            return path_texts.index(path.text)
         self.paths.append(path)
         return len(self.paths) - 1
 
@@ -477,12 +478,12 @@ class _Columns:
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
         """Return the columns of two or more coordinates of a point."""
         value = walk(path, self.example)
-        present = tuple(names) if isinstance(value, Sparse) else field_names(value)
-        if all(name in present for name in names[:2]):
-            return tuple(self.add(below(path, name)) for name in names if name in present)
+        existing_names = tuple(names) if isinstance(value, Sparse) else field_names(value)
+        if all(name in existing_names for name in names[:2]):
+            return tuple(self.add(below(path, name)) for name in names if name in existing_names)
         if is_list(value) and 2 <= len(value) <= len(names):
             return tuple(self.add(below(path, index)) for index in range(len(value)))
-        fields = f"; its fields are {', '.join(present)}" if present else ""
+        fields = f"; its fields are {', '.join(existing_names)}" if existing_names else ""
         zeros = "; if zeros are left out, add `missing: 0`" if isinstance(value, dict) else ""
         raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}{zeros}")
 
@@ -601,10 +602,10 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
         return ()
     position = _first(layout.position, columns_of)
     if position is None:
-        fields = ", ".join(field_names(columns.example)[:20])
+        field_list = ", ".join(field_names(columns.example)[:20])
         raise FieldError(
             f"no field of {type_name(columns.example)} looks like a position; name one with `position`"
-            + (f"; its fields are {fields}" if fields else "")
+            + (f"; its fields are {field_list}" if field_list else "")
         )
     return position
 
@@ -658,12 +659,12 @@ def _polygon(layout: MessageLayout, columns: _Columns) -> tuple[Get | None, bool
     if len(layout.polygon) > 1:
         columns.add_all(layout.polygon)
         return tuple_getter(list(map(FieldPath.of, layout.polygon)), example), False
-    text = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
-    if not text:
+    outline_path = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
+    if not outline_path:
         return None, False
-    path = FieldPath.of(text)
-    if (rings := path_of_rings(path, example)) is not None:
-        return (getter(rings, example) if rings.steps else lambda element: element), True
+    path = FieldPath.of(outline_path)
+    if (ring_path := path_of_rings(path, example)) is not None:
+        return (getter(ring_path, example) if ring_path.steps else lambda element: element), True
     value = walk(path, example)
     if "points" in field_names(value):
         # geometry_msgs/Polygon
@@ -689,8 +690,8 @@ def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int 
 def _frame(
     paths: Sequence[str], example: object, message: object, needs_frame: bool
 ) -> tuple[Get, bool] | None:
-    for text in paths:
-        path = FieldPath.of(text)
+    for path_text in paths:
+        path = FieldPath.of(path_text)
         root = message if path.from_message else example
         if (len(paths) > 1 or not needs_frame) and not leads_somewhere(path, root):
             continue
@@ -735,17 +736,17 @@ def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
     """
     value = walk(path, root)
     if stamp.nanoseconds:
-        parts = [path, FieldPath.of(stamp.nanoseconds)]
-        if not all(is_number(walk(part, root)) for part in parts):
+        paths = [path, FieldPath.of(stamp.nanoseconds)]
+        if not all(is_number(walk(part_path, root)) for part_path in paths):
             raise FieldError(f"{path.text}: seconds and nanoseconds have to be numbers")
-        return TimeGetter(path, tuple_getter(parts, root), True, 1)
-    names = field_names(value)
-    fits = any if isinstance(value, Sparse) else all
-    for names_of_parts in _TIME_FIELDS:
-        if fits(name in names for name in names_of_parts):
-            pair = tuple_getter([below(path, name) for name in names_of_parts], root)
+        return TimeGetter(path, tuple_getter(paths, root), True, 1)
+    existing_names = field_names(value)
+    quantifier = any if isinstance(value, Sparse) else all
+    for part_names in _TIME_FIELDS:
+        if quantifier(name in existing_names for name in part_names):
+            pair = tuple_getter([below(path, name) for name in part_names], root)
             return TimeGetter(path, pair, True, 1)
-    if is_list(value) and len(value) == 2 and all(type(part) is int for part in value):
+    if is_list(value) and len(value) == 2 and all(type(part_path) is int for part_path in value):
         return TimeGetter(path, getter(path, root), True, 1)
     if isinstance(value, str):
         ns_from_text(value, stamp.unit_ns)

@@ -69,17 +69,17 @@ class Solids:
 
     def repeat(self, owner: int, count: int) -> Solids:
         """Return the solids of one object, `count` times."""
-        indices = np.flatnonzero(self.owner == owner)
-        pieces = np.tile(indices, count)
-        sizes = np.diff(self.point_start)[pieces]
+        solid_indices = np.flatnonzero(self.owner == owner)
+        copy_indices = np.tile(solid_indices, count)
+        point_counts = np.diff(self.point_start)[copy_indices]
         return Solids(
-            owner=np.repeat(np.arange(count, dtype=np.int64), len(indices)),
-            kind=self.kind[pieces],
-            position=self.position[pieces],
-            rotation=self.rotation[pieces],
-            size=self.size[pieces],
-            point_start=starts_from_counts(sizes),
-            points=self.points[flat_index(self.point_start[pieces], sizes)],
+            owner=np.repeat(np.arange(count, dtype=np.int64), len(solid_indices)),
+            kind=self.kind[copy_indices],
+            position=self.position[copy_indices],
+            rotation=self.rotation[copy_indices],
+            size=self.size[copy_indices],
+            point_start=starts_from_counts(point_counts),
+            points=self.points[flat_index(self.point_start[copy_indices], point_counts)],
         )
 
 
@@ -96,26 +96,29 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     )
     # a tilted flat box needs no hexagon, because its projection has four corners
     is_tilted = ~np.isnan(size[boxes, 2]) & ~is_upright(solids.rotation[boxes])
-    flat, tilted = boxes[~is_tilted], boxes[is_tilted]
-    rings = [_ring(solids, piece) for piece in hulls.tolist()]
+    flat_boxes, tilted_boxes = boxes[~is_tilted], boxes[is_tilted]
+    rings = [_ring(solids, hull) for hull in hulls.tolist()]
     vertex_counts = _VERTICES[kind]
-    vertex_counts[tilted] = 6
+    vertex_counts[tilted_boxes] = 6
     vertex_counts[polygons] = np.diff(solids.point_start)[polygons]
     vertex_counts[hulls] = [len(ring) for ring in rings]
-    start = starts_from_counts(vertex_counts)
-    vertices = np.empty((int(start[-1]), 2))
+    vertex_start = starts_from_counts(vertex_counts)
+    vertices = np.empty((int(vertex_start[-1]), 2))
     radius = np.zeros(len(kind))
-    vertices[start[rounds]] = solids.position[rounds, :2]
+    vertices[vertex_start[rounds]] = solids.position[rounds, :2]
     radius[rounds] = size[rounds, 0] / 2
-    for pieces, corners in ((flat, _rectangles(solids, flat)), (tilted, _hexagons(solids, tilted))):
-        vertices[flat_index(start[pieces], vertex_counts[pieces])] = corners.reshape(-1, 2)
-    _fill_polygons(vertices, start, solids, polygons)
-    for piece, ring in zip(hulls.tolist(), rings, strict=True):
-        vertices[start[piece] : start[piece] + len(ring)] = ring
+    for box_indices, corners in (
+        (flat_boxes, _rectangles(solids, flat_boxes)),
+        (tilted_boxes, _hexagons(solids, tilted_boxes)),
+    ):
+        vertices[flat_index(vertex_start[box_indices], vertex_counts[box_indices])] = corners.reshape(-1, 2)
+    _fill_polygons(vertices, vertex_start, solids, polygons)
+    for hull, ring in zip(hulls.tolist(), rings, strict=True):
+        vertices[vertex_start[hull] : vertex_start[hull] + len(ring)] = ring
     bottom, top = _height_intervals(solids, count)
     return FootprintBatch.without_checks(
         part_start=starts_from_counts(np.bincount(solids.owner, minlength=count)),
-        vertex_start=start,
+        vertex_start=vertex_start,
         vertices=vertices,
         radius=radius,
         bottom=bottom,
@@ -130,62 +133,62 @@ _IS_ROUND = np.array([False, True, True, True, False, False])
 def _with_boxes(solids: Solids) -> Solids:
     """Replace cylinders that are tilted or not round, and spheres that are not round, by boxes."""
     kind, size = solids.kind, solids.size
-    doubtful = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
-    kind, size = kind[doubtful], size[doubtful]
-    unequal = size[:, 0] != size[:, 1]
-    cylinder = (kind == CYLINDER) & (unequal | ~is_upright(solids.rotation[doubtful]))
-    sphere = (kind == SPHERE) & (unequal | (size[:, 0] != size[:, 2]))
+    round_indices = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
+    kind, size = kind[round_indices], size[round_indices]
+    is_unequal = size[:, 0] != size[:, 1]
+    is_boxed_cylinder = (kind == CYLINDER) & (is_unequal | ~is_upright(solids.rotation[round_indices]))
+    is_boxed_sphere = (kind == SPHERE) & (is_unequal | (size[:, 0] != size[:, 2]))
     kinds = solids.kind.copy()
-    kinds[doubtful[cylinder | sphere]] = BOX
+    kinds[round_indices[is_boxed_cylinder | is_boxed_sphere]] = BOX
     return replace(solids, kind=kinds)
 
 
-def _rectangles(solids: Solids, pieces: Integers) -> Floats:
+def _rectangles(solids: Solids, box_indices: Integers) -> Floats:
     """Return the corners (K, 4, 2) of flat or upright boxes, seen from above."""
-    along = solids.rotation[pieces, :2, 0] * (solids.size[pieces, 0, None] / 2)
-    across = solids.rotation[pieces, :2, 1] * (solids.size[pieces, 1, None] / 2)
-    centre = solids.position[pieces, :2]
+    along = solids.rotation[box_indices, :2, 0] * (solids.size[box_indices, 0, None] / 2)
+    across = solids.rotation[box_indices, :2, 1] * (solids.size[box_indices, 1, None] / 2)
+    centre = solids.position[box_indices, :2]
     front, back = centre + along, centre - along
     return np.stack((back - across, front - across, front + across, back + across), axis=1)
 
 
-def _hexagons(solids: Solids, pieces: Integers) -> Floats:
+def _hexagons(solids: Solids, box_indices: Integers) -> Floats:
     """Return the outlines (K, 6, 2) of tilted boxes, seen from above.
 
     The projection of a box is the Minkowski sum of its three projected axes, a zonogon. The axes are flipped
     into the upper half plane and ordered by angle. The outline starts at the lowest corner, runs along each
     axis in this order, and then back along each axis in the same order.
     """
-    axes = np.swapaxes(solids.rotation[pieces, :2, :] * (solids.size[pieces, None, :] / 2), 1, 2)
-    down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
-    axes = np.where(down[..., None], -axes, axes)
-    order = np.argsort(np.arctan2(axes[..., 1], axes[..., 0]), axis=1, kind="stable")
-    axes = np.take_along_axis(axes, order[..., None], axis=1)
-    first = solids.position[pieces, :2] - axes.sum(axis=1)
-    corners = [first]
+    axes = np.swapaxes(solids.rotation[box_indices, :2, :] * (solids.size[box_indices, None, :] / 2), 1, 2)
+    points_down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
+    axes = np.where(points_down[..., None], -axes, axes)
+    angle_order = np.argsort(np.arctan2(axes[..., 1], axes[..., 0]), axis=1, kind="stable")
+    axes = np.take_along_axis(axes, angle_order[..., None], axis=1)
+    lowest_corner = solids.position[box_indices, :2] - axes.sum(axis=1)
+    corners = [lowest_corner]
     for axis in (0, 1, 2, 0, 1):
         sign = 2.0 if len(corners) <= 3 else -2.0
         corners.append(corners[-1] + sign * axes[:, axis])
     return np.stack(corners, axis=1)
 
 
-def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: Integers) -> None:
-    counts = np.diff(solids.point_start)[pieces]
-    points = solids.points[flat_index(solids.point_start[:-1][pieces], counts)]
-    rotation, position = solids.rotation[pieces, :2, :], solids.position[pieces, :2]
+def _fill_polygons(vertices: Floats, vertex_start: Integers, solids: Solids, polygons: Integers) -> None:
+    corner_counts = np.diff(solids.point_start)[polygons]
+    points = solids.points[flat_index(solids.point_start[:-1][polygons], corner_counts)]
+    rotation, position = solids.rotation[polygons, :2, :], solids.position[polygons, :2]
     if (rotation != np.eye(3)[:2]).any() or position.any():
-        points = np.einsum("nij,nj->ni", np.repeat(rotation, counts, axis=0), points)
-        points[:, :2] += np.repeat(position, counts, axis=0)
-    vertices[flat_index(start[pieces], counts)] = points[:, :2]
+        points = np.einsum("nij,nj->ni", np.repeat(rotation, corner_counts, axis=0), points)
+        points[:, :2] += np.repeat(position, corner_counts, axis=0)
+    vertices[flat_index(vertex_start[polygons], corner_counts)] = points[:, :2]
 
 
-def _ring(solids: Solids, piece: int) -> Floats:
+def _ring(solids: Solids, solid_index: int) -> Floats:
     """Return the convex hull of a solid's points, seen from above; one NaN if a point is not finite."""
-    points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
-    placed = points @ solids.rotation[piece].T + solids.position[piece]
-    if not np.isfinite(placed).all():
+    points = solids.points[solids.point_start[solid_index] : solids.point_start[solid_index + 1]]
+    placed_points = points @ solids.rotation[solid_index].T + solids.position[solid_index]
+    if not np.isfinite(placed_points).all():
         return np.full((1, 2), np.nan)
-    hull = convex_hull(placed[:, :2])
+    hull = convex_hull(placed_points[:, :2])
     return hull[:-1] if len(hull) > 1 and (hull[0] == hull[-1]).all() else hull
 
 
@@ -195,16 +198,16 @@ def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
     has_height = (solids.kind != DISC) & (solids.kind != POLYGON) & ~is_flat_box
     if not has_height.any():
         return np.full(count, np.nan), np.full(count, np.nan)
-    up = solids.rotation[:, 2, :]
+    up_rows = solids.rotation[:, 2, :]
     # half the extent along z of a rotated box: the sum of its projected half axes
-    half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(solids.size)) / 2
-    half = np.where(solids.kind == SPHERE, solids.size[:, 0] / 2, half)
-    half = np.where(has_height, half, np.nan)
-    lowest, highest = solids.position[:, 2] - half, solids.position[:, 2] + half
-    for piece in np.flatnonzero(solids.kind == HULL).tolist():
-        points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
-        heights = points @ solids.rotation[piece, 2] + solids.position[piece, 2]
-        lowest[piece], highest[piece] = heights.min(initial=np.inf), heights.max(initial=-np.inf)
+    half_height = np.einsum("ij,ij->i", np.abs(up_rows), np.nan_to_num(solids.size)) / 2
+    half_height = np.where(solids.kind == SPHERE, solids.size[:, 0] / 2, half_height)
+    half_height = np.where(has_height, half_height, np.nan)
+    lowest, highest = solids.position[:, 2] - half_height, solids.position[:, 2] + half_height
+    for hull in np.flatnonzero(solids.kind == HULL).tolist():
+        points = solids.points[solids.point_start[hull] : solids.point_start[hull + 1]]
+        heights = points @ solids.rotation[hull, 2] + solids.position[hull, 2]
+        lowest[hull], highest[hull] = heights.min(initial=np.inf), heights.max(initial=-np.inf)
     if len(lowest) == count:
         return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
@@ -243,17 +246,17 @@ def lenient_getter(style: Style) -> GetField:
 def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
     """Return the solids of a visualization_msgs/Marker; [] for arrows, lines and texts."""
     # 1 CUBE, 2 SPHERE, 3 CYLINDER, 6 CUBE_LIST, 7 SPHERE_LIST, 11 TRIANGLE_LIST
-    kind, scale = get(marker, "type"), _vector(get(marker, "scale"), get)
+    marker_type, scale = get(marker, "type"), _vector(get(marker, "scale"), get)
     position, quaternion = _pose(get(marker, "pose"), get)
-    single = {1: BOX, 2: SPHERE, 3: CYLINDER}.get(kind)
-    if single is not None:
-        return [Solid(single, position, quaternion, scale)]
+    solid_kind = {1: BOX, 2: SPHERE, 3: CYLINDER}.get(marker_type)
+    if solid_kind is not None:
+        return [Solid(solid_kind, position, quaternion, scale)]
     points = [_vector(point, get) for point in get(marker, "points") or ()]
-    if kind in (6, 7):
+    if marker_type in (6, 7):
         # elements of a list marker; `_listed_solids` adds the point, which is in the marker's frame
-        element = BOX if kind == 6 else SPHERE
-        return [Solid(element, position, quaternion, scale, (point,)) for point in points]
-    if kind == 11 and len(points) >= 3:
+        element_kind = BOX if marker_type == 6 else SPHERE
+        return [Solid(element_kind, position, quaternion, scale, (point,)) for point in points]
+    if marker_type == 11 and len(points) >= 3:
         # the points of a triangle list are in units of its scale
         scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
         return _triangles((position, quaternion), scaled)
@@ -276,8 +279,8 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
             solids.append(Solid(kind, *_pose(get(primitive, "pose"), get), size))
     for primitive in get(entity, "triangles") or ():
         points = [_vector(point, get) for point in get(primitive, "points") or ()]
-        order = list(get(primitive, "indices") or range(len(points)))
-        corners = [points[i] for i in order if i < len(points)]
+        corner_indices = list(get(primitive, "indices") or range(len(points)))
+        corners = [points[i] for i in corner_indices if i < len(points)]
         solids += _triangles(_pose(get(primitive, "pose"), get), corners)
     return solids
 
@@ -318,8 +321,8 @@ def _vector(vector: Any, get: GetField) -> Numbers:
     return (0.0,) * 3 if vector is None else _coordinates(vector, "xyz", get)
 
 
-def _coordinates(value: Any, names: Iterable[str], get: GetField) -> Numbers:
-    return tuple([float(get(value, name) or 0.0) for name in names])
+def _coordinates(value: Any, field_names: Iterable[str], get: GetField) -> Numbers:
+    return tuple([float(get(value, name) or 0.0) for name in field_names])
 
 
 def _or_one(value: Any) -> float:
@@ -463,9 +466,9 @@ def detections_from_chunks(
     Args:
         good: (N,) whether a message of the batch was read; the result numbers only the good messages.
     """
-    number = np.cumsum(good) - 1
+    good_number = np.cumsum(good) - 1
     deleted = [
-        (int(number[chunk.places[message]]), name) for chunk in chunks for message, name in chunk.deleted
+        (int(good_number[chunk.places[message]]), name) for chunk in chunks for message, name in chunk.deleted
     ]
     skipped = sum(chunk.skipped for chunk in chunks)
     chunks = [chunk for chunk in chunks if chunk.name]
@@ -480,20 +483,20 @@ def detections_from_chunks(
     else:
         poses = poses_from_numbers(layout, binding, numbers)
         if binding.polygon is not None:
-            counts = np.concatenate([chunk.corner_counts for chunk in chunks])
+            corner_counts = np.concatenate([chunk.corner_counts for chunk in chunks])
             object_frames = None
             if layout.shape is not None:
                 object_frames = _origins_of_shape(layout.shape, poses), poses.rotation
             corners = np.concatenate([chunk.corners for chunk in chunks])
             outline_counts = np.concatenate([chunk.outline_counts for chunk in chunks])
-            solids = _polygons(outline_counts, counts, corners, object_frames)
+            solids = _polygons(outline_counts, corner_counts, corners, object_frames)
         else:
             solids = solids_of_shape(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
     locked = list(chain.from_iterable(chunk.locked for chunk in chunks))
-    spreads = [chunk.covariance for chunk in chunks if chunk.covariance is not None]
+    chunk_covariances = [chunk.covariance for chunk in chunks if chunk.covariance is not None]
     return Detections(
-        message=np.concatenate([number[chunk.places[chunk.message]] for chunk in chunks]),
+        message=np.concatenate([good_number[chunk.places[chunk.message]] for chunk in chunks]),
         name=name,
         class_code=_join_columns(chunk.class_code for chunk in chunks),
         frames=list(chain.from_iterable(chunk.frames or () for chunk in chunks)) if has_frames else None,
@@ -502,7 +505,7 @@ def detections_from_chunks(
         solids=solids,
         height=heights_from_numbers(binding, numbers),
         uncertainty=radii_from_numbers(binding, numbers, len(name)),
-        covariance=np.concatenate(spreads) if spreads else None,
+        covariance=np.concatenate(chunk_covariances) if chunk_covariances else None,
         lifetime_ns=_join_columns(chunk.lifetimes for chunk in chunks) if layout.stays else None,
         is_locked=np.array(locked, np.bool_) if any(locked) else None,
         deleted=deleted,
@@ -512,11 +515,15 @@ def detections_from_chunks(
 
 
 def _no_detections(deleted: list[tuple[int, int]], skipped: int) -> Detections:
-    none, numbers = np.empty(0, np.int64), np.empty(0)
-    points, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
-    solids = Solids(none, np.empty(0, np.int8), points, matrices, points, np.zeros(1, np.int64), points)
-    poses = Poses(points, matrices, numbers)
-    return Detections(none, none, none, poses, solids, numbers, deleted=deleted, skipped=skipped)
+    no_codes, no_numbers = np.empty(0, np.int64), np.empty(0)
+    no_points, no_matrices = np.empty((0, 3)), np.empty((0, 3, 3))
+    solids = Solids(
+        no_codes, np.empty(0, np.int8), no_points, no_matrices, no_points, np.zeros(1, np.int64), no_points
+    )
+    poses = Poses(no_points, no_matrices, no_numbers)
+    return Detections(
+        no_codes, no_codes, no_codes, poses, solids, no_numbers, deleted=deleted, skipped=skipped
+    )
 
 
 def _join_columns(columns: Iterable[Sequence[int]]) -> Integers:
@@ -567,8 +574,8 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     north = np.array(
         [-np.sin(latitude) * np.cos(longitude), -np.sin(latitude) * np.sin(longitude), np.cos(latitude)]
     )
-    offsets = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
-    metres: Floats = offsets @ np.stack([east, north], axis=1)
+    offsets_m = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
+    metres: Floats = offsets_m @ np.stack([east, north], axis=1)
     # longitudes may run to 360 degrees
     is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
     metres[np.flatnonzero(is_off)] = np.nan
@@ -598,33 +605,35 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
     """Return the covariances (R, 3, 3) of positions, times the squared number of deviations."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
-    rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
-    size = {4: 2, 9: 3, 36: 6}[rows.shape[1]]
+    covariance_rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
+    size = {4: 2, 9: 3, 36: 6}[covariance_rows.shape[1]]
     # a 6 x 6 covariance begins with the position, as in geometry_msgs/PoseWithCovariance
-    used = min(size, 3)
+    used_size = min(size, 3)
     matrices = np.zeros((len(objects), 3, 3))
-    matrices[:, :used, :used] = rows.reshape(-1, size, size)[:, :used, :used]
+    matrices[:, :used_size, :used_size] = covariance_rows.reshape(-1, size, size)[:, :used_size, :used_size]
     return matrices * layout.uncertainty.sigmas**2
 
 
 def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
     """Return the solids of objects, at least one per object, and the pose of each object's first solid."""
-    counts = np.array([len(solids) for solids in solid_lists], np.int64)
+    solid_counts = np.array([len(solids) for solids in solid_lists], np.int64)
     solids = list(chain.from_iterable(solid_lists))
     position = _array([solid.position for solid in solids], 3)
     rotation, yaw = matrices_from_quaternions(_array([solid.quaternion for solid in solids], 4))
-    first = np.cumsum(counts) - counts
+    first_solid = np.cumsum(solid_counts) - solid_counts
     kind = np.array([solid.kind for solid in solids], np.int8)
-    poses = Poses(position[first], rotation[first], yaw[first])
+    poses = Poses(position[first_solid], rotation[first_solid], yaw[first_solid])
     points = _array(list(chain.from_iterable(solid.points for solid in solids)), 3)
-    start = starts_from_counts(np.array([len(solid.points) for solid in solids], np.int64))
+    point_start = starts_from_counts(np.array([len(solid.points) for solid in solids], np.int64))
     # a box or a sphere with one point is an element of a list marker, shifted to that point
-    shifted = np.flatnonzero((np.diff(start) == 1) & ((kind == BOX) | (kind == SPHERE)))
+    shifted_indices = np.flatnonzero((np.diff(point_start) == 1) & ((kind == BOX) | (kind == SPHERE)))
     position = position.copy()
-    position[shifted] += np.einsum("nij,nj->ni", rotation[shifted], points[start[shifted]])
-    owner = np.repeat(np.arange(len(counts)), counts)
+    position[shifted_indices] += np.einsum(
+        "nij,nj->ni", rotation[shifted_indices], points[point_start[shifted_indices]]
+    )
+    owner = np.repeat(np.arange(len(solid_counts)), solid_counts)
     size = _array([solid.size for solid in solids], 3)
-    return Solids(owner, kind, position, rotation, size, start, points), poses
+    return Solids(owner, kind, position, rotation, size, point_start, points), poses
 
 
 def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
@@ -633,7 +642,7 @@ def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbe
     position = poses.position if shape is None else _origins_of_shape(shape, poses)
     count = len(position)
     size = np.full((count, 3), np.nan)
-    counts, points = np.zeros(count, np.int64), np.empty((0, 3))
+    corner_counts, points = np.zeros(count, np.int64), np.empty((0, 3))
     if shape is None:
         kind = BOX if binding.sizes else DISC
         size[:, 0] = 0.0
@@ -647,11 +656,11 @@ def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbe
             size[:, 0] *= 2
         if shape.points:
             corners = np.array([(x, y, 0.0) for x, y in shape.points])
-            counts, points = np.full(count, len(corners)), np.tile(corners, (count, 1))
+            corner_counts, points = np.full(count, len(corners)), np.tile(corners, (count, 1))
     # NaN instead of a negative size, so that the object is unknown
     size[:, :2] = np.where(size[:, :2] < 0, np.nan, size[:, :2])
     owner, kinds = np.arange(count), np.full(count, kind, np.int8)
-    return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(counts), points)
+    return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(corner_counts), points)
 
 
 def _origins_of_shape(shape: ShapeMapping, poses: Poses) -> Floats:
@@ -662,7 +671,7 @@ def _origins_of_shape(shape: ShapeMapping, poses: Poses) -> Floats:
 
 
 def _polygons(
-    outline_counts: Integers, counts: Integers, points: Floats, frames: tuple[Floats, Floats] | None
+    outline_counts: Integers, corner_counts: Integers, points: Floats, frames: tuple[Floats, Floats] | None
 ) -> Solids:
     """Return polygons with corners in the frame of their message, or in the frames of their objects.
 
@@ -672,13 +681,16 @@ def _polygons(
         frames: positions (R, 3) and rotations (R, 3, 3) of the objects' frames; None for corners in the frame
             of their message.
     """
-    count = len(counts)
-    owner, kind = np.repeat(np.arange(len(outline_counts)), outline_counts), np.full(count, POLYGON, np.int8)
-    position, rotation = np.zeros((count, 3)), no_rotations(count)
+    polygon_count = len(corner_counts)
+    owner, kind = (
+        np.repeat(np.arange(len(outline_counts)), outline_counts),
+        np.full(polygon_count, POLYGON, np.int8),
+    )
+    position, rotation = np.zeros((polygon_count, 3)), no_rotations(polygon_count)
     if frames is not None:
         position, rotation = frames[0][owner], frames[1][owner]
-    size = np.full((count, 3), np.nan)
-    return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
+    size = np.full((polygon_count, 3), np.nan)
+    return Solids(owner, kind, position, rotation, size, starts_from_counts(corner_counts), points)
 
 
 def _array(rows: list[Any], width: int) -> Floats:

@@ -38,31 +38,34 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     # (N, T, 3): x and y of each object's centre, and its bottom
     places = np.where((rows >= 0)[:, :, None], places[np.maximum(rows, 0)], np.nan)
     places[:, :, 2][np.isnan(places[:, :, 2])] = 0.0
-    moves = np.diff(places, axis=1)
-    steps = np.sqrt(np.einsum("ijk,ijk->ij", moves, moves))
+    displacements = np.diff(places, axis=1)
+    step_lengths = np.sqrt(np.einsum("ijk,ijk->ij", displacements, displacements))
     # the longer of the steps before and after each step
-    around = np.zeros_like(steps)
-    around[:, 1:] = steps[:, :-1]
-    around[:, :-1] = np.fmax(around[:, :-1], steps[:, 1:])
+    neighbour_lengths = np.zeros_like(step_lengths)
+    neighbour_lengths[:, 1:] = step_lengths[:, :-1]
+    neighbour_lengths[:, :-1] = np.fmax(neighbour_lengths[:, :-1], step_lengths[:, 1:])
     # twice the fall of a body from rest within one frame
-    fall = _GRAVITY * (np.diff(trace.times_ns) / 1e9) ** 2
+    fall_distance = _GRAVITY * (np.diff(trace.times_ns) / 1e9) ** 2
     with np.errstate(invalid="ignore"):
-        is_jump = (steps > _SUDDEN * around) & (steps > fall)
+        is_jump = (step_lengths > _SUDDEN * neighbour_lengths) & (step_lengths > fall_distance)
     if not is_jump.any():
         return None
     extent = np.nan_to_num(np.fmax.reduce(places, axis=(0, 1)) - np.fmin.reduce(places, axis=(0, 1))).max()
-    is_jump &= steps > _FAR * extent
+    is_jump &= step_lengths > _FAR * extent
     if not is_jump.any():
         return None
-    number, frame = np.unravel_index(int(np.where(is_jump, steps, 0.0).argmax()), steps.shape)
-    count = int(np.count_nonzero(is_jump))
+    object_index, frame = np.unravel_index(
+        int(np.where(is_jump, step_lengths, 0.0).argmax()), step_lengths.shape
+    )
+    jump_count = int(np.count_nonzero(is_jump))
     return Sentence(
         f"{episode} at ",
         Instant(int(trace.times_ns[frame + 1]), 0),
-        f": {trace.names[number]} jumps by {number_text(float(steps[number, frame]))}, and moves at most"
-        f" {number_text(float(around[number, frame]))} in the frames next to it"
-        f"{f' ({count} jumps in all)' if count > 1 else ''}; frames may be missing, exchanged, or from"
-        " another run",
+        f": {trace.names[object_index]} jumps by {number_text(float(step_lengths[object_index, frame]))}, and"
+        f" moves at most {number_text(float(neighbour_lengths[object_index, frame]))} in the frames next to"
+        " it"
+        f"{f' ({jump_count} jumps in all)' if jump_count > 1 else ''}; frames may be missing, exchanged, or"
+        " from another run",
     )
 
 
@@ -76,8 +79,10 @@ def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[
             or not all(place.name.endswith("]") for place in places)
         ):
             continue
-        rows = [columns[place.feature].reshape(len(columns[place.feature]), -1) for place in places]
-        quaternions = np.column_stack([row[:, place.number] for row, place in zip(rows, places, strict=True)])
+        feature_rows = [columns[place.feature].reshape(len(columns[place.feature]), -1) for place in places]
+        quaternions = np.column_stack(
+            [row[:, place.number] for row, place in zip(feature_rows, places, strict=True)]
+        )
         if quaternion_order([quaternions]) == "wxyz":
             name = bound_object.name
             yield f"{name} stands upright only if its orientation has the other order; check `order`"

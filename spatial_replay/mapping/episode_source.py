@@ -170,7 +170,7 @@ class EpisodeSource(Source):
             UsageError: the mapping does not fit the numbers, or one of its objects has the name of a body.
             LogError: the files of the data set lack a feature.
         """
-        mapping, count = self.mapped_by, len(columns.times_ns)
+        mapping, frame_count = self.mapped_by, len(columns.times_ns)
         features = FeatureReading() if mapping is None else _bind(mapping, self.data_set)
         shapes = {} if mapping is None else mapping.shapes
         if mapping is not None and mapping.episodes.model is not None and not columns.bodies:
@@ -178,30 +178,31 @@ class EpisodeSource(Source):
                 f"{mapping.name}: model: {self.data_set.name} ({self.data_set.kind}) has no states of a"
                 " model; leave it out"
             )
-        class_of = {bound_object.name: bound_object.class_name for bound_object in features.objects}
+        class_by_name = {bound_object.name: bound_object.class_name for bound_object in features.objects}
         # NaN and infinity in features are no reason for NumPy's warnings: they make objects unknown
         with np.errstate(all="ignore"):
             detections = {
                 bound_object.name: bound_object.detections(
-                    columns.features, count, mapping.name if mapping else "", self.name
+                    columns.features, frame_count, mapping.name if mapping else "", self.name
                 )
                 for bound_object in features.objects
             }
             rows_by_name: dict[str, ObservationRows] = {}
             for body in columns.bodies:
-                if body.name in class_of:
+                if body.name in class_by_name:
                     raise UsageError(
                         f"{self.data_set.name} has a body {body.name!r}; give the object of the mapping"
                         " another `name`"
                     )
-                class_of[body.name] = None
+                class_by_name[body.name] = None
                 if (shape := shapes.get(body.name)) is None:
                     rows_by_name[body.name] = _rows_of_body(body, self.axes)
                 else:
                     detections[body.name] = detections_of_body(body, shape)
-            names, rows = self._rows(detections, rows_by_name, count, report)
+            names, rows = self._rows(detections, rows_by_name, frame_count, report)
             signals = {
-                signal.name: signal.values(columns.features, count, self.name) for signal in features.signals
+                signal.name: signal.values(columns.features, frame_count, self.name)
+                for signal in features.signals
             }
         if not names and not signals:
             names_of_features = [feature.name for feature in self.data_set.features if feature.width]
@@ -213,13 +214,13 @@ class EpisodeSource(Source):
             raise UsageError(
                 f"{mapping.name if mapping else self.name} names no objects of {self.data_set.name}; {remedy}"
             )
-        return _Frames(names, rows, signals, class_of)
+        return _Frames(names, rows, signals, class_by_name)
 
     def _rows(
         self,
         detections: Mapping[str, Detections],
         rows_by_name: Mapping[str, ObservationRows],
-        count: int,
+        frame_count: int,
         report: Report,
     ) -> tuple[list[str], ObservationRows]:
         """Return the names of objects, and their observations in all frames, object by object.
@@ -227,28 +228,30 @@ class EpisodeSource(Source):
         Objects are checked together, because a check of few rows costs as much as one of many. Frames
         without a valid footprint are faults.
         """
-        names, parts = list(rows_by_name), list(rows_by_name.values())
+        names, row_parts = list(rows_by_name), list(rows_by_name.values())
         for has_height in (False, True):
-            group = [
+            group_names = [
                 name
                 for name, object_detections in detections.items()
                 if (object_detections.height is not None) == has_height
             ]
-            if not group:
+            if not group_names:
                 continue
 
-            def report_row(index: int, what: str, group: Sequence[str] = group) -> None:
-                number, frame = divmod(index, count)
-                report(group[number], frame, what)
+            def report_row(index: int, fault: str, group_names: Sequence[str] = group_names) -> None:
+                object_index, frame = divmod(index, frame_count)
+                report(group_names[object_index], frame, fault)
 
-            together = join_objects([detections[name] for name in group])
-            parts.append(rows_from_detections(together, None, self.axes, self.reading.concave, report_row))
-            names += group
-        return names, parts[0] if len(parts) == 1 else concatenate_tables([_NO_ROWS, *parts])
+            joined_detections = join_objects([detections[name] for name in group_names])
+            row_parts.append(
+                rows_from_detections(joined_detections, None, self.axes, self.reading.concave, report_row)
+            )
+            names += group_names
+        return names, row_parts[0] if len(row_parts) == 1 else concatenate_tables([_NO_ROWS, *row_parts])
 
-    def _report(self, name: str, frame: int, what: str, *, times_ns: Integers, faults: FaultList) -> None:
-        moment = Instant(int(times_ns[frame]), 0)
-        faults.add(Sentence(f"{self.name} at ", moment, f": object {name!r}{what}"))
+    def _report(self, name: str, frame: int, fault: str, *, times_ns: Integers, faults: FaultList) -> None:
+        instant = Instant(int(times_ns[frame]), 0)
+        faults.add(Sentence(f"{self.name} at ", instant, f": object {name!r}{fault}"))
 
 
 class _Frames(NamedTuple):
@@ -269,15 +272,17 @@ class _Frames(NamedTuple):
     def trace(self, times_ns: Integers) -> Trace:
         """Return the frames as samples at times (T,)."""
         names, rows = self.names, self.rows
-        number = np.arange(len(rows), dtype=np.int64)
-        numbered = np.where(rows.is_valid, number, -2 - number).reshape(len(names), len(times_ns))
-        order = sorted(range(len(names)), key=names.__getitem__)
+        row_indices = np.arange(len(rows), dtype=np.int64)
+        row_numbers = np.where(rows.is_valid, row_indices, -2 - row_indices).reshape(
+            len(names), len(times_ns)
+        )
+        name_order = sorted(range(len(names)), key=names.__getitem__)
         classes = class_order(self.class_of.values())
         codes = np.array([classes.index(self.class_of[name]) for name in names], np.int64)
         return Trace(
             times_ns=times_ns,
-            names=tuple(names[place] for place in order),
-            rows=np.ascontiguousarray(numbered[order].T),
+            names=tuple(names[index] for index in name_order),
+            rows=np.ascontiguousarray(row_numbers[name_order].T),
             footprints=rows.shapes,
             yaw=rows.yaw,
             uncertainty=rows.uncertainty,
@@ -288,9 +293,9 @@ class _Frames(NamedTuple):
 
     def divide(self, starts: Sequence[int]) -> Iterator[_Frames]:
         """Yield the frames between successive starts."""
-        objects = np.arange(len(self.names), dtype=np.int64)[:, None] * starts[-1]
-        order = [(objects + np.arange(begin, end)).ravel() for begin, end in pairwise(starts)]
-        rows = select(self.rows, np.concatenate(order))
+        object_starts = np.arange(len(self.names), dtype=np.int64)[:, None] * starts[-1]
+        part_rows = [(object_starts + np.arange(begin, end)).ravel() for begin, end in pairwise(starts)]
+        rows = select(self.rows, np.concatenate(part_rows))
         for begin, end in pairwise(starts):
             rows_of_part = rows.slice(len(self.names) * begin, len(self.names) * end)
             signals = {name: values[begin:end] for name, values in self.signals.items()}
@@ -306,44 +311,44 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
 
     An episode that cannot be read stays unread, so that iterating over its blocks raises the error.
     """
-    read: list[Source] = []
+    read_sources: list[Source] = []
     for is_episode, group in groupby(sources, lambda source: isinstance(source, EpisodeSource)):
         if not is_episode:
-            read += group
+            read_sources += group
             continue
         episodes = cast(Iterator[EpisodeSource], group)
-        for _, alike in groupby(
+        for _, alike_sources in groupby(
             episodes, lambda source: (id(source.data_set), id(source.mapped_by), source.reading)
         ):
-            read += _read_alike(list(alike))
-    return read
+            read_sources += _read_alike(list(alike_sources))
+    return read_sources
 
 
 def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
     """Yield episodes of one data set with one mapping, after reading those with features of equal shapes."""
-    columns_by_place: dict[int, EpisodeColumns] = {}
-    frames = 0
-    for place, source in enumerate(sources if sources[0].mapped_by is not None else ()):
+    columns_by_index: dict[int, EpisodeColumns] = {}
+    frame_count = 0
+    for index, source in enumerate(sources if sources[0].mapped_by is not None else ()):
         # any error, because one episode must not end the reading of the others
         with suppress(Exception):
             columns = source.columns()
-            frames += len(columns.times_ns)
-            if frames > _MOST_FRAMES:
+            frame_count += len(columns.times_ns)
+            if frame_count > _MOST_FRAMES:
                 break
-            columns_by_place[place] = columns
-    shape = _shape_of(next(iter(columns_by_place.values()))) if columns_by_place else None
-    together = {
-        place: columns
-        for place, columns in columns_by_place.items()
-        if len(columns.times_ns) and not columns.unjudged and _shape_of(columns) == shape
+            columns_by_index[index] = columns
+    frame_shape = _shape_of(next(iter(columns_by_index.values()))) if columns_by_index else None
+    joinable_columns = {
+        index: columns
+        for index, columns in columns_by_index.items()
+        if len(columns.times_ns) and not columns.unjudged and _shape_of(columns) == frame_shape
     }
     episodes: dict[int, ReadEpisode] = {}
-    if shape is not None and len(together) > 1:
+    if frame_shape is not None and len(joinable_columns) > 1:
         with suppress(Exception):
-            parts = [(sources[place], columns) for place, columns in together.items()]
-            episodes = dict(zip(together, _read_parts(parts), strict=True))
-    for place, source in enumerate(sources):
-        yield replace(source, episode=episodes.get(place))
+            parts = [(sources[index], columns) for index, columns in joinable_columns.items()]
+            episodes = dict(zip(joinable_columns, _read_parts(parts), strict=True))
+    for index, source in enumerate(sources):
+        yield replace(source, episode=episodes.get(index))
 
 
 def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
@@ -355,7 +360,7 @@ def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
 
 def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
     """Read episodes whose features have equal shapes, together."""
-    starts = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
+    first_frames = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
     features = {
         name: np.concatenate([columns.features[name] for _, columns in parts])
         for name in parts[0][1].features
@@ -365,19 +370,23 @@ def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[R
         for fault in columns.faults:
             faults.add(f"{source.name}: {fault}")
 
-    def report(name: str, frame: int, what: str) -> None:
-        place = bisect_right(starts, frame) - 1
-        source, columns = parts[place]
+    def report(name: str, frame: int, fault: str) -> None:
+        part_index = bisect_right(first_frames, frame) - 1
+        source, columns = parts[part_index]
         source._report(
-            name, frame - starts[place], what, times_ns=columns.times_ns, faults=fault_lists[place]
+            name,
+            frame - first_frames[part_index],
+            fault,
+            times_ns=columns.times_ns,
+            faults=fault_lists[part_index],
         )
 
-    numbers = np.arange(starts[-1], dtype=np.int64)
-    frames = parts[0][0]._frames(EpisodeColumns(numbers, features), report)
+    frame_numbers = np.arange(first_frames[-1], dtype=np.int64)
+    frames = parts[0][0]._frames(EpisodeColumns(frame_numbers, features), report)
     return [
         ReadEpisode(columns, frames_of_part.trace(columns.times_ns), faults.take(last=True))
         for (_, columns), faults, frames_of_part in zip(
-            parts, fault_lists, frames.divide(starts), strict=True
+            parts, fault_lists, frames.divide(first_frames), strict=True
         )
     ]
 
@@ -392,23 +401,23 @@ def _bind(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
 
 def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
     """Return the observations of a body that a data set names, with its own shapes or as a point."""
-    count = len(body.positions)
+    frame_count = len(body.positions)
     is_valid: Booleans = np.asarray(np.isfinite(body.positions).all(axis=1))
-    yaw: Floats = np.full(count, np.nan)
+    yaw: Floats = np.full(frame_count, np.nan)
     if body.quaternions is not None:
         is_valid &= np.isfinite(body.quaternions).all(axis=1)
         _, yaw = matrices_from_quaternions(body.quaternions)
     shapes = body.shapes
     if shapes is None:
         shapes = FootprintBatch.without_checks(
-            part_start=np.arange(count + 1, dtype=np.int64),
-            vertex_start=np.arange(count + 1, dtype=np.int64),
+            part_start=np.arange(frame_count + 1, dtype=np.int64),
+            vertex_start=np.arange(frame_count + 1, dtype=np.int64),
             vertices=np.ascontiguousarray(body.positions[:, :2]),
-            radius=np.zeros(count),
+            radius=np.zeros(frame_count),
             bottom=body.positions[:, 2].copy(),
             top=body.positions[:, 2].copy(),
         )
-    no_class = np.zeros(count, np.int64)
+    no_class = np.zeros(frame_count, np.int64)
     return ObservationRows(
-        axes.convert_shapes(shapes), axes.convert_yaw(yaw), np.zeros(count), no_class, is_valid
+        axes.convert_shapes(shapes), axes.convert_yaw(yaw), np.zeros(frame_count), no_class, is_valid
     )

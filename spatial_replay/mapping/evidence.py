@@ -69,15 +69,18 @@ class Spread:
             times_ns = None if times_ns is None else times_ns[is_finite]
         if not len(values):
             return
-        at = int(values.argmax())
-        if values[at] > self.greatest:
-            self.greatest, self.greatest_ns = float(values[at]), 0 if times_ns is None else int(times_ns[at])
+        greatest_index = int(values.argmax())
+        if values[greatest_index] > self.greatest:
+            self.greatest, self.greatest_ns = (
+                float(values[greatest_index]),
+                0 if times_ns is None else int(times_ns[greatest_index]),
+            )
         self.least = min(self.least, float(values.min()))
         # the stride continues over calls, so that the sample does not depend on their sizes
-        held = np.concatenate([self._held, values[-self.count % self._stride :: self._stride]])
-        while len(held) > _MOST_VALUES:
-            held, self._stride = held[::2], 2 * self._stride
-        self._held = held
+        kept_values = np.concatenate([self._held, values[-self.count % self._stride :: self._stride]])
+        while len(kept_values) > _MOST_VALUES:
+            kept_values, self._stride = kept_values[::2], 2 * self._stride
+        self._held = kept_values
         self.count += len(values)
 
     @property
@@ -177,15 +180,15 @@ class Arrivals:
             self.publishers.add(self._publisher)
         self.log_varies = self.log_varies or bool((log_ns != self._first_log_ns).any())
         self.publish_varies = self.publish_varies or bool((publish_ns != self._first_publish_ns).any())
-        since = np.append(self.last_ns, times_ns)
-        passed = slice(int(is_first), None)
-        self.period_s.add(np.diff(since)[passed] / 1e9, times_ns[passed])
-        log_since = np.append(self._last_log_ns, log_ns)
-        self.log_period_s.add(np.diff(log_since)[passed] / 1e9)
+        times_with_previous = np.append(self.last_ns, times_ns)
+        intervals = slice(int(is_first), None)
+        self.period_s.add(np.diff(times_with_previous)[intervals] / 1e9, times_ns[intervals])
+        log_times_with_previous = np.append(self._last_log_ns, log_ns)
+        self.log_period_s.add(np.diff(log_times_with_previous)[intervals] / 1e9)
         self._last_log_ns = int(log_ns[-1])
         if (channels != self._publisher).any():
-            before = np.append(self._publisher or 0, channels[:-1])
-            for channel in channels[channels != before].tolist():
+            previous_channels = np.append(self._publisher or 0, channels[:-1])
+            for channel in channels[channels != previous_channels].tolist():
                 self.returns += channel in self.publishers
                 self.publishers.add(channel)
         self._publisher = int(channels[-1])
@@ -220,9 +223,9 @@ class Arrivals:
         since_ns[0] = since_ns[0] or self._since_ns
         since_ns = np.maximum.accumulate(since_ns)
         still_s = (log_ns - since_ns) / 1e9
-        at = int(still_s.argmax())
-        if still_s[at] > self.longest_still_s:
-            self.longest_still_s, self.still_ns = float(still_s[at]), int(since_ns[at])
+        longest_index = int(still_s.argmax())
+        if still_s[longest_index] > self.longest_still_s:
+            self.longest_still_s, self.still_ns = float(still_s[longest_index]), int(since_ns[longest_index])
         self._stamp_ns, self._since_ns = int(stamps_ns[-1]), int(since_ns[-1])
 
 
@@ -293,37 +296,46 @@ class Motions:
         """
         self._begin_ns = begin_ns
         reports = np.concatenate([self._tail, reports])
-        name = reports[:, _NAME].astype(np.int64)
-        reports = reports[np.argsort(name, kind="stable")]
+        name_codes = reports[:, _NAME].astype(np.int64)
+        reports = reports[np.argsort(name_codes, kind="stable")]
         is_same_object = reports[1:, _NAME] == reports[:-1, _NAME]
         # `behind`: number of later reports of the same object
-        last = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
-        behind = np.repeat(last, np.diff(last, prepend=-1)) - np.arange(len(reports))
-        self._tail = reports[behind < _MOST_LEAPS].copy()
+        last_indices = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
+        later_count = np.repeat(last_indices, np.diff(last_indices, prepend=-1)) - np.arange(len(reports))
+        self._tail = reports[later_count < _MOST_LEAPS].copy()
         self._tail[:, _IS_NEW] = 0.0
         if len(self._tail) > _MOST_ROWS:
             message = self._tail[:, _MESSAGE]
             self._tail = self._tail[message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]]
-        after = np.flatnonzero(is_same_object & (reports[1:, _IS_NEW] > 0)) + 1
-        if not len(after):
+        new_indices = np.flatnonzero(is_same_object & (reports[1:, _IS_NEW] > 0)) + 1
+        if not len(new_indices):
             return
-        earlier, later = reports[after - 1], reports[after]
+        earlier, later = reports[new_indices - 1], reports[new_indices]
         self._add_steps(earlier, later, turns_back=turns_back, zero=zero, scale=scale)
-        self._add_returns(reports, after)
-        gap = np.clip(later[:, _MESSAGE] - earlier[:, _MESSAGE], 0, _LONGEST_GAP).astype(np.int64)
-        self.gaps += np.bincount(gap, minlength=_LONGEST_GAP + 1)
-        for at in np.flatnonzero(earlier[:, _CLASS] != later[:, _CLASS]).tolist():
+        self._add_returns(reports, new_indices)
+        message_gaps = np.clip(later[:, _MESSAGE] - earlier[:, _MESSAGE], 0, _LONGEST_GAP).astype(np.int64)
+        self.gaps += np.bincount(message_gaps, minlength=_LONGEST_GAP + 1)
+        for change_index in np.flatnonzero(earlier[:, _CLASS] != later[:, _CLASS]).tolist():
             self.change_count += 1
             if len(self.changes) < _MOST_CHANGES:
-                before, now = (self._classes.by_code[int(row[at, _CLASS])] for row in (earlier, later))
-                self.changes.append(ClassChange(self._name(later[at]), before, now, self._time_ns(later[at])))
+                class_before, class_after = (
+                    self._classes.by_code[int(row[change_index, _CLASS])] for row in (earlier, later)
+                )
+                self.changes.append(
+                    ClassChange(
+                        self._name(later[change_index]),
+                        class_before,
+                        class_after,
+                        self._time_ns(later[change_index]),
+                    )
+                )
 
     def _add_steps(
         self, earlier: Floats, later: Floats, *, turns_back: bool, zero: float, scale: float
     ) -> None:
         seconds = later[:, _SECONDS] - earlier[:, _SECONDS]
-        step = later[:, _X : _Y + 1] - earlier[:, _X : _Y + 1]
-        distance = np.hypot(step[:, 0], step[:, 1])
+        step_xy = later[:, _X : _Y + 1] - earlier[:, _X : _Y + 1]
+        distance = np.hypot(step_xy[:, 0], step_xy[:, 1])
         times_ns = self._begin_ns + (later[:, _SECONDS] * 1e9).astype(np.int64)
         self.speed.add(np.where(seconds > 0, distance / seconds, nan), times_ns)
         turn_step = np.fmax.reduce(np.abs(later[:, _TURN] - earlier[:, _TURN]))
@@ -331,10 +343,12 @@ class Motions:
         # by the shorter way round
         turn = np.abs((later[:, _YAW] - earlier[:, _YAW] + pi) % (2 * pi) - pi)
         self.turn_rate.add(np.where(seconds > 0, turn / seconds, nan), times_ns)
-        at = int(np.nan_to_num(distance, nan=0.0).argmax())
-        if distance[at] > (self.jump.amount if self.jump is not None else 0.0):
-            self.jump = Moment(self._name(later[at]), int(times_ns[at]), float(distance[at]))
-            self.jump_s = float(seconds[at])
+        longest_index = int(np.nan_to_num(distance, nan=0.0).argmax())
+        if distance[longest_index] > (self.jump.amount if self.jump is not None else 0.0):
+            self.jump = Moment(
+                self._name(later[longest_index]), int(times_ns[longest_index]), float(distance[longest_index])
+            )
+            self.jump_s = float(seconds[longest_index])
         is_absence = (later[:, _MESSAGE] - earlier[:, _MESSAGE] > 1) & (seconds >= 1.0)
         if is_absence.any():
             self._add_comeback(later, np.where(is_absence, np.nan_to_num(distance, nan=0.0), 0.0), seconds)
@@ -349,52 +363,63 @@ class Motions:
         moves &= distance >= self.speed.median / 2 * seconds
         if not moves.any():
             return
-        course = np.arctan2(step[moves, 1], step[moves, 0])
-        yaw, number = earlier[moves, _YAW], earlier[moves, _TURN]
+        course = np.arctan2(step_xy[moves, 1], step_xy[moves, 0])
+        yaw, raw_angle = earlier[moves, _YAW], earlier[moves, _TURN]
         sign = -1.0 if turns_back else 1.0
         # another interpretation differs from the yaw by the differences of zero and scale
-        readings = (base - zero + (unit - scale) * number for base, unit in HEADINGS.values())
+        readings = (
+            base_angle - zero + (unit_angle - scale) * raw_angle
+            for base_angle, unit_angle in HEADINGS.values()
+        )
         angles = [yaw, *(yaw + sign * reading for reading in readings)]
         offsets = [np.exp(1j * (course - angle)).sum() for angle in angles]
         self._courses += np.array([*offsets, np.exp(1j * course).sum()])
         self._steps += int(np.count_nonzero(moves))
 
     def _add_comeback(self, later: Floats, distance: Floats, seconds: Floats) -> None:
-        at = int(distance.argmax())
-        if distance[at] > (self.comeback.amount if self.comeback is not None else 0.0):
-            self.comeback = Moment(self._name(later[at]), self._time_ns(later[at]), float(distance[at]))
-            self.comeback_s = float(seconds[at])
+        longest_index = int(distance.argmax())
+        if distance[longest_index] > (self.comeback.amount if self.comeback is not None else 0.0):
+            self.comeback = Moment(
+                self._name(later[longest_index]),
+                self._time_ns(later[longest_index]),
+                float(distance[longest_index]),
+            )
+            self.comeback_s = float(seconds[longest_index])
 
-    def _add_returns(self, reports: Floats, after: Integers) -> None:
+    def _add_returns(self, reports: Floats, new_indices: Integers) -> None:
         """Count returns of objects to an earlier place after leaps.
 
         Args:
             reports: reports, grouped by object.
             after: indices of new reports that are not the first of their object.
         """
-        place, name = reports[:, _X : _Y + 1], reports[:, _NAME]
-        step_xy = np.diff(place, axis=0, prepend=place[:1])
+        position, name = reports[:, _X : _Y + 1], reports[:, _NAME]
+        step_xy = np.diff(position, axis=0, prepend=position[:1])
         leap = np.hypot(step_xy[:, 0], step_xy[:, 1])
         step_s = np.diff(reports[:, _SECONDS], prepend=0.0)
         leap = np.where(leap > np.fmax(reports[:, _SIZE], 0.0), leap, 0.0)
-        self.chances += int(np.count_nonzero((after > 1) & (name[after] == name[after - 2])))
-        if not leap[after].any():
+        self.chances += int(
+            np.count_nonzero((new_indices > 1) & (name[new_indices] == name[new_indices - 2]))
+        )
+        if not leap[new_indices].any():
             return
-        least, is_back = leap[after], np.zeros(len(after), np.bool_)
+        least_leap, is_back = leap[new_indices], np.zeros(len(new_indices), np.bool_)
         for steps in range(2, _MOST_LEAPS + 1):
-            before = np.maximum(after - steps, 0)
-            least = np.minimum(least, leap[before + 1])
-            apart = place[after] - place[before]
-            is_same = (name[before] == name[after]) & (after >= steps)
+            earlier_indices = np.maximum(new_indices - steps, 0)
+            least_leap = np.minimum(least_leap, leap[earlier_indices + 1])
+            offset = position[new_indices] - position[earlier_indices]
+            is_same = (name[earlier_indices] == name[new_indices]) & (new_indices >= steps)
             # within a quarter of the shortest leap on the way
-            is_back |= is_same & (np.hypot(apart[:, 0], apart[:, 1]) < least / 4)
-        is_slow = is_back & (step_s[after] >= 1.0) & (leap[after] < _FAST * step_s[after])
+            is_back |= is_same & (np.hypot(offset[:, 0], offset[:, 1]) < least_leap / 4)
+        is_slow = is_back & (step_s[new_indices] >= 1.0) & (leap[new_indices] < _FAST * step_s[new_indices])
         self.returns += int(np.count_nonzero(is_back))
         self.slow_returns += int(np.count_nonzero(is_slow))
         if self.return_moment is None and is_back.any():
-            at = after[is_back.argmax()]
+            return_index = new_indices[is_back.argmax()]
             self.return_moment = Moment(
-                self._name(reports[at]), self._time_ns(reports[at - 1]), float(leap[at - 1])
+                self._name(reports[return_index]),
+                self._time_ns(reports[return_index - 1]),
+                float(leap[return_index - 1]),
             )
 
     @property
@@ -572,14 +597,14 @@ class TopicEvidence:
         Args:
             times_ns: (M,) time of each message.
         """
-        first, self._messages = self._messages, self._messages + len(times_ns)
+        first_message, self._messages = self._messages, self._messages + len(times_ns)
         if not len(detections.name):
             return
         binding = None if self.reader.extractor is None else self.reader.extractor.binding
         if binding is not self._binding:
             self._measure()
             self._binding = binding
-        self._waiting.append(_Objects(first, times_ns, detections, shapes, yaw, uncertainty))
+        self._waiting.append(_Objects(first_message, times_ns, detections, shapes, yaw, uncertainty))
         self._waiting_rows += len(detections.name)
         if self._waiting_rows >= _ROWS_AT_ONCE:
             self._measure()
@@ -601,19 +626,21 @@ class TopicEvidence:
     def _measure(self) -> None:
         if not self._waiting:
             return
-        waiting, self._waiting, self._waiting_rows = self._waiting, [], 0
-        detections = [objects.detections for objects in waiting]
+        waiting_objects, self._waiting, self._waiting_rows = self._waiting, [], 0
+        detections = [objects.detections for objects in waiting_objects]
         name = np.concatenate([detected.name for detected in detections])
         class_code = np.concatenate([detected.class_code for detected in detections])
-        message = np.concatenate([objects.first + objects.detections.message for objects in waiting])
+        message = np.concatenate([objects.first + objects.detections.message for objects in waiting_objects])
         yaw, uncertainty = (
             np.concatenate(columns)
-            for columns in zip(*((objects.yaw, objects.uncertainty) for objects in waiting), strict=True)
+            for columns in zip(
+                *((objects.yaw, objects.uncertainty) for objects in waiting_objects), strict=True
+            )
         )
-        shapes = FootprintBatch.concatenate([objects.shapes for objects in waiting])
+        shapes = FootprintBatch.concatenate([objects.shapes for objects in waiting_objects])
         self.objects += len(name)
-        begins = np.flatnonzero(np.diff(message, prepend=-1))
-        self.most_at_once = max(self.most_at_once, int(np.diff(begins, append=len(name)).max()))
+        message_starts = np.flatnonzero(np.diff(message, prepend=-1))
+        self.most_at_once = max(self.most_at_once, int(np.diff(message_starts, append=len(name)).max()))
         self.name_codes.update(name.tolist())
         self.class_codes.update(class_code.tolist())
         numbers = self._measure_numbers(detections, message)
@@ -630,7 +657,9 @@ class TopicEvidence:
         self.pointlike += int(np.count_nonzero(longer == 0.0))
         self.bottom.add(shapes.bottom)
         self.top.add(shapes.top)
-        passed_ns = np.concatenate([objects.times_ns[objects.detections.message] for objects in waiting])
+        passed_ns = np.concatenate(
+            [objects.times_ns[objects.detections.message] for objects in waiting_objects]
+        )
         reports = np.empty((len(name), _IS_NEW + 1))
         reports[:, _NAME] = name
         reports[:, _MESSAGE] = message
@@ -647,26 +676,26 @@ class TopicEvidence:
         self._reports_rows += len(reports)
         self._measure_motions(self._reports_rows // _ROWS_AT_ONCE * _ROWS_AT_ONCE)
 
-    def _measure_motions(self, count: int) -> None:
+    def _measure_motions(self, report_count: int) -> None:
         """Measure the motions of `count` reports, in parts of fixed size.
 
         The parts do not depend on the division of the log into calls, so that the results do not, either.
         """
-        if not count:
+        if not report_count:
             return
         layout = self.planned.layout
         reports = np.concatenate(self._reports)
-        for begin in range(0, count, _ROWS_AT_ONCE):
+        for begin in range(0, report_count, _ROWS_AT_ONCE):
             # no warnings about NaN, infinity, and quotients of equal numbers
             with np.errstate(all="ignore"):
                 self.motions.add(
-                    reports[begin : min(begin + _ROWS_AT_ONCE, count)],
+                    reports[begin : min(begin + _ROWS_AT_ONCE, report_count)],
                     self.arrivals.first_ns or 0,
                     turns_back=self.reader.axes.y == "down",
                     zero=0.0 if layout is None else layout.angle_zero,
                     scale=1.0 if layout is None else layout.angle_scale,
                 )
-        self._reports, self._reports_rows = [reports[count:]], len(reports) - count
+        self._reports, self._reports_rows = [reports[report_count:]], len(reports) - report_count
 
     def _measure_signals(self) -> None:
         """Count the returns of signals to their last but one value."""
@@ -678,8 +707,8 @@ class TopicEvidence:
         if len(values) < 3:
             return
         with np.errstate(all="ignore"):
-            step = np.abs(np.diff(values, axis=0))
-            smaller_step = np.minimum(step[1:], step[:-1])
+            steps = np.abs(np.diff(values, axis=0))
+            smaller_step = np.minimum(steps[1:], steps[:-1])
             is_back = np.abs(values[2:] - values[:-2]) < smaller_step / 4
             is_switch = (np.fmin.reduce(values) == 0) & (np.fmax.reduce(values) == 1)
         self.signal_chances += len(is_back)
@@ -688,37 +717,43 @@ class TopicEvidence:
     def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
         """Measure the unchanged numbers of messages; return them, or None without a binding."""
         binding = self._binding
-        pieces = [detected.numbers for detected in detections if detected.numbers is not None]
-        numbers = np.concatenate(pieces) if binding is not None and len(pieces) == len(detections) else None
-        places = np.concatenate([detected.poses.position for detected in detections])
+        number_arrays = [detected.numbers for detected in detections if detected.numbers is not None]
+        numbers = (
+            np.concatenate(number_arrays)
+            if binding is not None and len(number_arrays) == len(detections)
+            else None
+        )
+        positions = np.concatenate([detected.poses.position for detected in detections])
         if binding is not None and numbers is not None:
             if binding.orientation:
                 self._measure_quaternions(numbers[:, list(binding.orientation)])
             if binding.yaw is not None:
-                turn = numbers[:, binding.yaw]
-                self.turn.add(turn)
-                is_finite = np.isfinite(turn)
+                raw_angles = numbers[:, binding.yaw]
+                self.turn.add(raw_angles)
+                is_finite = np.isfinite(raw_angles)
                 if not self.first_turn >= 0 and is_finite.any():
                     is_first = message == message[is_finite.argmax()]
-                    self.first_turn = float(np.fmax.reduce(np.abs(turn[is_first])))
+                    self.first_turn = float(np.fmax.reduce(np.abs(raw_angles[is_first])))
             if binding.position:
-                places = numbers[:, list(binding.position[:3])]
+                positions = numbers[:, list(binding.position[:3])]
             else:
                 points = [detected.solids.points for detected in detections if len(detected.solids.points)]
-                places = np.concatenate(points) if points else places
+                positions = np.concatenate(points) if points else positions
         with np.errstate(all="ignore"):
-            low, high = np.fmin.reduce(places, axis=0), np.fmax.reduce(places, axis=0)
-        axes = slice(places.shape[1])
+            low, high = np.fmin.reduce(positions, axis=0), np.fmax.reduce(positions, axis=0)
+        axes = slice(positions.shape[1])
         self.low[axes], self.high[axes] = np.fmin(self.low[axes], low), np.fmax(self.high[axes], high)
         # the resolution of float32 matters for degrees, and far from the origin
         is_far = self.planned.is_geodetic or np.fmax.reduce(np.abs([*low, *high])) > _FAR
         if self.is_single and is_far:
-            plane = places[:, :2]
+            plane_positions = positions[:, :2]
             if not self.planned.is_geodetic:
-                plane = plane[(np.abs(plane) > _FAR).any(axis=1)]
-            is_finite = np.isfinite(plane)
-            self.is_single = bool((plane.astype(np.float32) == plane)[is_finite].all())
-            self.has_fraction = self.has_fraction or bool((plane != np.rint(plane))[is_finite].any())
+                plane_positions = plane_positions[(np.abs(plane_positions) > _FAR).any(axis=1)]
+            is_finite = np.isfinite(plane_positions)
+            self.is_single = bool((plane_positions.astype(np.float32) == plane_positions)[is_finite].all())
+            self.has_fraction = self.has_fraction or bool(
+                (plane_positions != np.rint(plane_positions))[is_finite].any()
+            )
         return numbers
 
     def _measure_quaternions(self, quaternions: Floats) -> None:
@@ -733,10 +768,10 @@ class TopicEvidence:
         layout = self.planned.layout
         # in the other order the numbers called w, x, y (or y, z, w) are x, y, z
         is_w_first = layout is not None and layout.order == "wxyz"
-        first, second, up = (w, x, y) if is_w_first else (y, z, w)
-        is_upright = first * first + second * second < _LEVEL
+        other_x, other_y, other_z = (w, x, y) if is_w_first else (y, z, w)
+        is_upright = other_x * other_x + other_y * other_y < _LEVEL
         self.upright_otherwise += int(np.count_nonzero(is_upright))
-        self.turned_otherwise += int(np.count_nonzero(is_upright & (np.abs(up) > _TURNED)))
+        self.turned_otherwise += int(np.count_nonzero(is_upright & (np.abs(other_z) > _TURNED)))
 
 
 _FAR: Final = 1e4
@@ -749,16 +784,16 @@ _TURNED: Final = 0.174
 
 def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:
     """Return centres and sides (R, 2) of the boxes around footprints; NaN for unknown footprints."""
-    count = len(shapes.part_start) - 1
+    footprint_count = len(shapes.part_start) - 1
     parts, vertices = shapes.part_start, shapes.vertex_start[shapes.part_start]
     has_parts = vertices[1:] > vertices[:-1]
-    low, high = np.full((count, 2), nan), np.full((count, 2), nan)
+    low, high = np.full((footprint_count, 2), nan), np.full((footprint_count, 2), nan)
     if has_parts.any():
         # rows without vertices are skipped, because reduceat would return a vertex of the next row
-        starts = vertices[:-1][has_parts]
+        vertex_starts = vertices[:-1][has_parts]
         radius = np.maximum.reduceat(shapes.radius, parts[:-1][has_parts])[:, None]
-        low[has_parts] = np.minimum.reduceat(shapes.vertices, starts, axis=0) - radius
-        high[has_parts] = np.maximum.reduceat(shapes.vertices, starts, axis=0) + radius
+        low[has_parts] = np.minimum.reduceat(shapes.vertices, vertex_starts, axis=0) - radius
+        high[has_parts] = np.maximum.reduceat(shapes.vertices, vertex_starts, axis=0) + radius
     # coordinates of a log may be infinite
     with np.errstate(invalid="ignore"):
         return (low + high) / 2, high - low

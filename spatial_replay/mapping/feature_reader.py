@@ -90,19 +90,22 @@ class BoundObject:
         return detections_of(self.layout, self.binding, numbers)
 
     def _check_quaternions(self, quaternions: Floats, mapping_name: str, episode: str) -> None:
-        length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
+        lengths = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
         # zeros mean an orientation that was not set; NaN and infinity make the object unknown
-        is_off = np.isfinite(length) & (length > 0) & (np.abs(length - 1) > _LENGTH_ERROR)
-        if not is_off.any():
+        is_wrong = np.isfinite(lengths) & (lengths > 0) & (np.abs(lengths - 1) > _LENGTH_ERROR)
+        if not is_wrong.any():
             return
-        frame = int(is_off.argmax())
-        widest = int(np.fmax.reduce(np.abs(quaternions[is_off]), axis=0).argmax())
-        least, greatest = np.fmin.reduce(quaternions[:, widest]), np.fmax.reduce(quaternions[:, widest])
+        frame = int(is_wrong.argmax())
+        widest_column = int(np.fmax.reduce(np.abs(quaternions[is_wrong]), axis=0).argmax())
+        least, greatest = (
+            np.fmin.reduce(quaternions[:, widest_column]),
+            np.fmax.reduce(quaternions[:, widest_column]),
+        )
         names = listing([place.name for place in self.quaternion])
         raise UsageError(
             f"{mapping_name}: {self.key}.orientation: {names} have the length"
-            f" {number_text(float(length[frame]))} in frame {frame} of {episode}, so they are no quaternion"
-            f" ({self.quaternion[widest].name} goes from {number_text(float(least))} to"
+            f" {number_text(float(lengths[frame]))} in frame {frame} of {episode}, so they are no quaternion"
+            f" ({self.quaternion[widest_column].name} goes from {number_text(float(least))} to"
             f" {number_text(float(greatest))}); give its four numbers, or leave `orientation` out"
         )
 
@@ -152,10 +155,10 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
     objects: dict[str, BoundObject] = {}
     signals: dict[str, BoundSignal] = {}
     absent, faults = [], []
-    count_of: dict[str, int] = {}
+    entry_count_of: dict[str, int] = {}
     for entry in mapping.features:
-        number = count_of[entry.topic] = count_of.get(entry.topic, -1) + 1
-        key = f"features.{entry.topic}" + (f"[{number}]" if number else "")
+        entry_number = entry_count_of[entry.topic] = entry_count_of.get(entry.topic, -1) + 1
+        key = f"features.{entry.topic}" + (f"[{entry_number}]" if entry_number else "")
         feature = data_set.feature(entry.topic)
         if feature is None and entry.optional:
             absent.append(entry.topic)
@@ -180,9 +183,9 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
     return FeatureReading(tuple(objects.values()), tuple(signals.values()), tuple(absent))
 
 
-def _claim(claimed: Mapping[str, object], name: str, key: str, what: str) -> None:
-    if name in claimed:
-        raise UsageError(f"{key}: there is another {what} {name!r}; give one of them another name")
+def _claim(by_name: Mapping[str, object], name: str, key: str, kind: str) -> None:
+    if name in by_name:
+        raise UsageError(f"{key}: there is another {kind} {name!r}; give one of them another name")
 
 
 def _bind_signal(signal: SignalMapping, entry: TopicMapping, places: _Places) -> BoundSignal:
@@ -243,15 +246,15 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
 
 def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> Detections:
     """Return the detections of one object in T frames, from its numbers (T, W)."""
-    count = len(numbers)
-    poses, no_codes = poses_from_numbers(layout, binding, numbers), np.zeros(count, np.int64)
+    frame_count = len(numbers)
+    poses, no_codes = poses_from_numbers(layout, binding, numbers), np.zeros(frame_count, np.int64)
     detections = Detections(
-        message=np.arange(count, dtype=np.int64),
+        message=np.arange(frame_count, dtype=np.int64),
         name=no_codes,
         class_code=no_codes,
         poses=poses,
         solids=solids_of_shape(layout, binding, poses, numbers),
-        uncertainty=radii_from_numbers(binding, numbers, count),
+        uncertainty=radii_from_numbers(binding, numbers, frame_count),
         height=heights_from_numbers(binding, numbers),
         numbers=numbers,
     )
@@ -262,26 +265,37 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
     """Join detections of several objects, each in all frames; heights exist for all objects or for none."""
     if len(objects) == 1:
         return objects[0]
-    solids, counts = (
+    solids, frame_counts = (
         [detections.solids for detections in objects],
         [len(detections.name) for detections in objects],
     )
-    first, first_point = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.points) for part in solids)])
-    starts = [part.point_start[:-1] + begin for part, begin in zip(solids, first_point[:-1], strict=True)]
+    first_frame, first_points = (
+        np.cumsum([0, *frame_counts]),
+        np.cumsum([0, *(len(object_solids.points) for object_solids in solids)]),
+    )
+    point_starts = [
+        object_solids.point_start[:-1] + start
+        for object_solids, start in zip(solids, first_points[:-1], strict=True)
+    ]
     heights = [detections.height for detections in objects if detections.height is not None]
     return Detections(
         message=np.concatenate([detections.message for detections in objects]),
-        name=np.repeat(np.arange(len(objects)), counts),
+        name=np.repeat(np.arange(len(objects)), frame_counts),
         class_code=np.concatenate([detections.class_code for detections in objects]),
         poses=concatenate_tables([detections.poses for detections in objects]),
         solids=Solids(
-            owner=np.concatenate([part.owner + begin for part, begin in zip(solids, first, strict=False)]),
-            kind=np.concatenate([part.kind for part in solids]),
-            position=np.concatenate([part.position for part in solids]),
-            rotation=np.concatenate([part.rotation for part in solids]),
-            size=np.concatenate([part.size for part in solids]),
-            point_start=np.concatenate([*starts, first_point[-1:]]),
-            points=np.concatenate([part.points for part in solids]),
+            owner=np.concatenate(
+                [
+                    object_solids.owner + start
+                    for object_solids, start in zip(solids, first_frame, strict=False)
+                ]
+            ),
+            kind=np.concatenate([object_solids.kind for object_solids in solids]),
+            position=np.concatenate([object_solids.position for object_solids in solids]),
+            rotation=np.concatenate([object_solids.rotation for object_solids in solids]),
+            size=np.concatenate([object_solids.size for object_solids in solids]),
+            point_start=np.concatenate([*point_starts, first_points[-1:]]),
+            points=np.concatenate([object_solids.points for object_solids in solids]),
         ),
         uncertainty=np.concatenate([detections.uncertainty for detections in objects]),
         height=np.concatenate(heights) if heights else None,
@@ -348,13 +362,13 @@ class _Places:
         Raises:
             UsageError: a text names no place, or the number of places is not in `counts`.
         """
-        parts = (texts,) if isinstance(texts, str) else texts
-        places = tuple(place for text in parts for place in self._places(key, text))
+        path_texts = (texts,) if isinstance(texts, str) else texts
+        places = tuple(place for text in path_texts for place in self._places(key, text))
         if len(places) not in counts:
-            needed = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
+            need = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
             raise UsageError(
-                f"{self.key}.{key}: {listing(list(parts))} has {plural(len(places), 'number')}, and {needed};"
-                f" write {self._example(counts[-1])}"
+                f"{self.key}.{key}: {listing(list(path_texts))} has {plural(len(places), 'number')}, and"
+                f" {need}; write {self._example(counts[-1])}"
             )
         return places
 
@@ -375,19 +389,21 @@ class _Places:
         if text in feature.places:
             yield NumberPlace(feature.name, feature.places.index(text), text)
             return
-        whole = self.data_set.feature(text)
-        if whole is not None:
-            yield from (_place(whole, index) for index in range(whole.width))
+        whole_feature = self.data_set.feature(text)
+        if whole_feature is not None:
+            yield from (_place(whole_feature, index) for index in range(whole_feature.width))
             return
-        numbered = _SLICE.fullmatch(text)
-        source = feature if numbered is None or not numbered[1] else self.data_set.feature(numbered[1])
-        if numbered is None or source is None:
+        slice_match = _SLICE.fullmatch(text)
+        source = (
+            feature if slice_match is None or not slice_match[1] else self.data_set.feature(slice_match[1])
+        )
+        if slice_match is None or source is None:
             raise UsageError(f"{self.key}.{key}: {feature.name} has no place {text!r}; {self._hint(text)}")
-        if numbered[2] is None:
-            begin, end = (None if part is None else int(part) for part in numbered.groups()[2:])
+        if slice_match[2] is None:
+            begin, end = (None if part is None else int(part) for part in slice_match.groups()[2:])
             yield from (_place(source, index) for index in range(*slice(begin, end).indices(source.width)))
             return
-        index = int(numbered[2])
+        index = int(slice_match[2])
         if not -source.width <= index < source.width:
             raise UsageError(
                 f"{self.key}.{key}: {source.name} has {plural(source.width, 'number')}, so there is no"

@@ -273,12 +273,12 @@ _SCORES = ("score", "probability", "confidence")
 
 def _score(value: object) -> float:
     """Return the score of a result or of its hypothesis; -inf without one."""
-    names = field_names(value)
-    if "hypothesis" in names:
+    score_fields = field_names(value)
+    if "hypothesis" in score_fields:
         return _score(get_field(value, "hypothesis"))
-    scores: Iterator[Any] = (get_field(value, name) for name in _SCORES if name in names)
-    best = next((float(score) for score in scores if score is not None and is_number(score)), nan)
-    return -inf if isnan(best) else best
+    scores: Iterator[Any] = (get_field(value, name) for name in _SCORES if name in score_fields)
+    best_score = next((float(score) for score in scores if score is not None and is_number(score)), nan)
+    return -inf if isnan(best_score) else best_score
 
 
 @dataclass(frozen=True, slots=True)
@@ -443,9 +443,11 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
     if not path.steps:
         return {}
     owner = walk(FieldPath(path.text, path.steps[:-1]), message)
-    last = path.steps[-1]
-    kind = getattr(_definition_of(owner, last) if isinstance(last, str) else None, "enum_type", None)
-    return {} if kind is None else {member.number: member.name for member in kind.values}
+    last_step = path.steps[-1]
+    enum_type = getattr(
+        _definition_of(owner, last_step) if isinstance(last_step, str) else None, "enum_type", None
+    )
+    return {} if enum_type is None else {member.number: member.name for member in enum_type.values}
 
 
 def is_set(path: FieldPath, value: object) -> bool:
@@ -489,7 +491,7 @@ def getter(path: FieldPath, example: object) -> Get:
     if style == "attributes" and path.steps and all(isinstance(step, str) for step in path.steps):
         # one call in C for all steps
         return attrgetter(".".join(map(str, path.steps)))
-    chain: list[Get] = [
+    getters: list[Get] = [
         step.read
         if isinstance(step, Keyed | Best)
         else attrgetter(step)
@@ -497,14 +499,14 @@ def getter(path: FieldPath, example: object) -> Get:
         else itemgetter(step)
         for step in path.steps
     ]
-    if len(chain) == 1:
-        return chain[0]
-    may_end = any(isinstance(step, Keyed) for step in path.steps)
+    if len(getters) == 1:
+        return getters[0]
+    may_be_missing = any(isinstance(step, Keyed) for step in path.steps)
 
     def follow(value: Any) -> Any:
-        for get in chain:
+        for get in getters:
             value = get(value)
-            if may_end and value is None:
+            if may_be_missing and value is None:
                 return None
         return value
 
@@ -535,8 +537,8 @@ def tuple_getter(paths: Sequence[FieldPath], example: object) -> Callable[[Any],
     )
     if is_plain and len(paths) > 1:
         return attrgetter(*(".".join(map(str, path.steps)) for path in paths))
-    gets = [getter(path, example) for path in paths]
-    return lambda value: tuple([get(value) for get in gets])
+    getters = [getter(path, example) for path in paths]
+    return lambda value: tuple([get(value) for get in getters])
 
 
 def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
@@ -569,9 +571,9 @@ def keys_of(value: Mapping[Any, object]) -> list[Any]:
 
 def list_getter(path: FieldPath, example: object) -> Get | None:
     """Compile a path of the form `a.b[*]` to a function that returns the list; None for other forms."""
-    *before, last = path.steps
-    if isinstance(last, Each) and not any(isinstance(step, Each) for step in before):
-        return getter(FieldPath(path.text, tuple(before)), example)
+    *list_steps, last_step = path.steps
+    if isinstance(last_step, Each) and not any(isinstance(step, Each) for step in list_steps):
+        return getter(FieldPath(path.text, tuple(list_steps)), example)
     return None
 
 

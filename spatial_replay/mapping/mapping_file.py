@@ -325,9 +325,9 @@ def parse_mapping(text: str, name: str = "mapping", folder: Path | None = None) 
 def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
     value: Any = document.value
     shapes = value.get("shapes") or {}
-    sample = value.get("sample", {})
+    sampling = value.get("sample", {})
     # hashed in a canonical form, so that layout and comments do not change the hash
-    canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
+    canonical_text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
     topics = tuple(
         _topic_mapping(topic, entry or {}, shapes) for topic, _, entry in _entries(value, "topics")
@@ -336,16 +336,18 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
         _topic_mapping(feature, _without_indices(entry), shapes)
         for feature, _, entry in _entries(value, "features")
     )
-    units = {
+    unit_by_signal = {
         signal.name: signal.unit for entry in (*topics, *features) for signal in entry.signals if signal.unit
     }
     return LogMapping(
         name=name,
-        sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
+        sha256=hashlib.sha256(canonical_text.encode("utf-8", "surrogatepass")).hexdigest(),
         topics=topics,
         fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
         clock=value.get("clock", "log"),
-        sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
+        sampling=Sampling(
+            sampling.get("topic"), duration_ns(sampling["every"]) if "every" in sampling else None
+        ),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
         max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
         trims_ends=value.get("ends", "trim") == "trim",
@@ -355,7 +357,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
             value.get("axes", {}).get("y", "up"),
             float(value.get("scale", 1.0)),
             value.get("unit", ""),
-            units,
+            unit_by_signal,
         ),
         features=features,
         episodes=EpisodeReading(
@@ -381,17 +383,17 @@ def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any
 def _without_indices(entry: Any) -> Any:
     """Return the entry of a feature, with indices such as 3 written as places such as `[3]`."""
 
-    def as_text(place: Any) -> Any:
-        if isinstance(place, list):
-            return list(map(as_text, place))
-        if isinstance(place, dict):
-            return {**place, "field": as_text(place["field"])}
-        return f"[{place}]" if isinstance(place, int) else place
+    def as_text(index: Any) -> Any:
+        if isinstance(index, list):
+            return list(map(as_text, index))
+        if isinstance(index, dict):
+            return {**index, "field": as_text(index["field"])}
+        return f"[{index}]" if isinstance(index, int) else index
 
-    places = {key: as_text(entry[key]) for key in ("position", "orientation", "yaw") if key in entry}
+    path_entries = {key: as_text(entry[key]) for key in ("position", "orientation", "yaw") if key in entry}
     if "signals" in entry:
-        places["signals"] = {name: as_text(place) for name, place in entry["signals"].items()}
-    return {**entry, **places}
+        path_entries["signals"] = {name: as_text(index) for name, index in entry["signals"].items()}
+    return {**entry, **path_entries}
 
 
 _OF_TOPICS = ("topics", "fixed_frame", "origin", "clock", "sample", "max_age", "ends")
@@ -402,12 +404,12 @@ _OF_EPISODES = ("features", "label", "fps", "model", "assets", "order")
 
 def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, str]]:
     """Yield faults of a file that mixes keys of logs and data sets, or has neither."""
-    of_episodes = [key for key in _OF_EPISODES if key in value]
-    if not of_episodes and "topics" not in value:
+    episode_keys = [key for key in _OF_EPISODES if key in value]
+    if not episode_keys and "topics" not in value:
         yield (), "the key 'topics' is missing, or 'features' for a data set of episodes"
-    for key in _OF_TOPICS if of_episodes else ():
+    for key in _OF_TOPICS if episode_keys else ():
         if key in value:
-            yield (key,), f"it is for logs of messages, and {of_episodes[0]!r} for data sets of episodes"
+            yield (key,), f"it is for logs of messages, and {episode_keys[0]!r} for data sets of episodes"
     if "features" in value and not value["features"]:
         yield ("features",), NO_FEATURE
 
@@ -426,9 +428,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     shapes = list(shapes_by_name) if isinstance(shapes_by_name, dict) else []
     if value.get("fixed_frame", "") is None:
         faults.append((("fixed_frame",), NO_FRAME))
-    features = list(_entries(value, "features"))
-    entries = [*_entries(value, "topics"), *features]
-    for _, place, entry in features:
+    feature_entries = list(_entries(value, "features"))
+    entries = [*_entries(value, "topics"), *feature_entries]
+    for _, place, entry in feature_entries:
         if isinstance(entry, dict) and "position" not in entry and not entry.keys() <= _SIGNAL_KEYS:
             faults.append((place, "the key 'position' is missing"))
     for _, place, entry in entries:
@@ -439,18 +441,21 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
             faults.append(((*place, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
         outlines = combinations(("polygon", "bounds", "shape"), 2)
-        for key, rival in (*outlines, ("orientation", "yaw")):
-            if key in entry and rival in entry:
-                faults.append(((*place, rival), f"there is {key!r} already; give one of the two"))
+        for key, other_key in (*outlines, ("orientation", "yaw")):
+            if key in entry and other_key in entry:
+                faults.append(((*place, other_key), f"there is {key!r} already; give one of the two"))
         is_feature = place[0] == "features"
-        faults += [((*place, *within), text) for within, text in _contradictions_of_turns(entry, is_feature)]
-    tables: list[tuple[Place, Any, str]] = [
+        faults += [
+            ((*place, *inner_place), text)
+            for inner_place, text in _contradictions_of_turns(entry, is_feature)
+        ]
+    tables_with_durations: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),
         ((), value, "max_gap"),
         (("sample",), value.get("sample"), "every"),
     ]
-    tables += [(place, entry, "max_age") for _, place, entry in entries]
-    for place, table, key in tables:
+    tables_with_durations += [(place, entry, "max_age") for _, place, entry in entries]
+    for place, table, key in tables_with_durations:
         text = table.get(key) if isinstance(table, dict) else None
         if isinstance(text, str) and _NO_TIME.fullmatch(text):
             faults.append(((*place, key), f"{text!r} is not a time; give a duration above 0"))
@@ -464,8 +469,11 @@ def _contradictions_of_turns(entry: Table[str, Any], is_feature: bool) -> Iterat
     if "order" in entry and yaw is not None:
         yield ("order",), "it is the order of a quaternion, and there is `yaw`; give one of the two"
     if isinstance(yaw, dict) and "field" in yaw and ("zero" in yaw) != ("clockwise" in yaw):
-        absent, example = ("zero", "north") if "clockwise" in yaw else ("clockwise", "true")
-        yield ("yaw",), f"`zero` and `clockwise` belong together; add `{absent}: {example}` or the opposite"
+        missing_key, example = ("zero", "north") if "clockwise" in yaw else ("clockwise", "true")
+        yield (
+            ("yaw",),
+            f"`zero` and `clockwise` belong together; add `{missing_key}: {example}` or the opposite",
+        )
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
@@ -596,11 +604,14 @@ def _signal(name: str, value: Any) -> SignalMapping:
     """
     if not isinstance(value, dict):
         return SignalMapping(name, value)
-    names: dict[str, float] = {}
-    for key, label in value.get("names", {}).items():
-        text, number = (label, float(key)) if isinstance(label, str) else (key, float(label))
-        if names.setdefault(text, number) != number:
+    number_by_text: dict[str, float] = {}
+    for raw_key, label in value.get("names", {}).items():
+        signal_text, number = (label, float(raw_key)) if isinstance(label, str) else (raw_key, float(label))
+        if number_by_text.setdefault(signal_text, number) != number:
             raise UsageError(
-                f"names of the signal {name!r}: two numbers are called {text!r}; give each its own name"
+                f"names of the signal {name!r}: two numbers are called {signal_text!r};"
+                " give each its own name"
             )
-    return SignalMapping(name, value["field"], value.get("unit", json.dumps(names) if names else ""))
+    return SignalMapping(
+        name, value["field"], value.get("unit", json.dumps(number_by_text) if number_by_text else "")
+    )

@@ -177,26 +177,32 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
         best = replace(best, is_plan=best.is_plan or any(map(_PLANS.intersection, words)))
     if any(isinstance(message, dict) for message in messages):
         with suppress(FieldError):
-            zeros = _best([sparse(message) for message in messages])
-            if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
-                return replace(zeros, has_zeros_left_out=True)
+            sparse_guess = _best([sparse(message) for message in messages])
+            if (
+                sparse_guess is not None
+                and isinstance(sparse_guess.position, str)
+                and _lacks_coordinates(sparse_guess, messages)
+            ):
+                return replace(sparse_guess, has_zeros_left_out=True)
     return best
 
 
 def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether all objects have a position, but some positions lack x or y."""
-    counts = set()
+    coordinate_counts = set()
     for message in messages:
         try:
-            places = [
+            positions = [
                 walk(FieldPath.of(str(guess.position)), element) for element in _objects_in(guess, message)
             ]
         except FieldError:
             return False
-        if not all(isinstance(place, dict) for place in places):
+        if not all(isinstance(position, dict) for position in positions):
             return False
-        counts |= {len({"x", "y"} & place.keys()) for place in places if isinstance(place, dict)}
-    return bool(counts - {2})
+        coordinate_counts |= {
+            len({"x", "y"} & position.keys()) for position in positions if isinstance(position, dict)
+        }
+    return bool(coordinate_counts - {2})
 
 
 def _best(messages: Sequence[object]) -> Guess | None:
@@ -207,9 +213,11 @@ def _best(messages: Sequence[object]) -> Guess | None:
     best = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
     if best.objects is None:
         return best
-    lists = {candidate.objects: candidate for guess in guesses for candidate in (guess, *guess.others)}
-    further = (guess for path, guess in lists.items() if path not in (None, best.objects))
-    return replace(best, others=tuple(_with_evidence(guess, messages) for guess in further))
+    guess_by_path = {
+        candidate.objects: candidate for guess in guesses for candidate in (guess, *guess.others)
+    }
+    further_guesses = (guess for path, guess in guess_by_path.items() if path not in (None, best.objects))
+    return replace(best, others=tuple(_with_evidence(guess, messages) for guess in further_guesses))
 
 
 def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
@@ -227,8 +235,10 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
     elif guess.size:
         guess = replace(guess, other_outline=_outline_of_sizeless(guess, messages))
     if guess.plane is not None:
-        planes = {value for value in _values_at((guess.plane,), guess, messages) if isinstance(value, str)}
-        guess = replace(guess, plane=guess.plane if len(planes) > 1 else None)
+        plane_names = {
+            value for value in _values_at((guess.plane,), guess, messages) if isinstance(value, str)
+        }
+        guess = replace(guess, plane=guess.plane if len(plane_names) > 1 else None)
     return replace(guess, names=names or tuple(_names_beside(guess, messages)))
 
 
@@ -241,14 +251,14 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
         path = FieldPath.of(f"{prefix}.{name}" if prefix else name)
         objects = FieldPath.of(guess.objects)
         try:
-            pairs = [
+            names_and_counts = [
                 (walk(path, message), sum(1 for _ in iter_elements(objects, message))) for message in messages
             ]
         except FieldError:
             continue
-        texts = [list(map(str, names)) for names, _ in pairs if is_list(names)]
-        counts = [count for _, count in pairs]
-        if [len(names) for names in texts] == [len(set(names)) for names in texts] == counts:
+        name_lists = [list(map(str, names)) for names, _ in names_and_counts if is_list(names)]
+        object_counts = [object_count for _, object_count in names_and_counts]
+        if [len(names) for names in name_lists] == [len(set(names)) for names in name_lists] == object_counts:
             yield f"$.{path.text}[{INDEX}]"
 
 
@@ -263,15 +273,15 @@ def signals_in(message: object) -> tuple[str, ...]:
         if isinstance(value, int | float) or (isinstance(value, str) and path == "data"):
             paths.append(path)
         elif is_list(value) and len(value) and isinstance(value[0], int | float):
-            prefix, _, last = path.rpartition(".")
-            keys = [
+            prefix, _, last_name = path.rpartition(".")
+            name_lists = [
                 names
                 for name, names in _iter_fields(message, is_skipped=_is_time)
                 if name == (f"{prefix}.name" if prefix else "name") and is_list(names)
             ]
-            if keys and len(keys[0]) == len(value):
-                usable = [key for key in keys[0] if isinstance(key, str) and _KEY.fullmatch(key)]
-                paths += [f"{prefix + '.' if prefix else ''}{last}[name={key}]" for key in usable]
+            if name_lists and len(name_lists[0]) == len(value):
+                usable_keys = [key for key in name_lists[0] if isinstance(key, str) and _KEY.fullmatch(key)]
+                paths += [f"{prefix + '.' if prefix else ''}{last_name}[name={key}]" for key in usable_keys]
     return tuple(paths)
 
 
@@ -284,30 +294,36 @@ def frame_of(message: object) -> str | None:
 
 
 def _guess(message: object) -> Guess | None:
-    itself = _object_in(message)
-    lists = sorted(
+    whole_message = _object_in(message)
+    list_guesses = sorted(
         ((guess, path) for path, guess in _iter_lists(message)),
-        key=lambda pair: (pair[0].is_plan, -_list_rank(pair[1]), -pair[0].score),
+        key=lambda guess_and_path: (
+            guess_and_path[0].is_plan,
+            -_list_rank(guess_and_path[1]),
+            -guess_and_path[0].score,
+        ),
     )
-    if lists and (itself is None or (itself.polygon is None and not lists[0][0].is_plan)):
-        best, path = lists[0]
-        others = tuple(replace(guess, objects=path) for guess, path in lists[1:])
-        return replace(best, objects=path, others=others)
-    return itself
+    if list_guesses and (
+        whole_message is None or (whole_message.polygon is None and not list_guesses[0][0].is_plan)
+    ):
+        best, path = list_guesses[0]
+        other_guesses = tuple(replace(guess, objects=path) for guess, path in list_guesses[1:])
+        return replace(best, objects=path, others=other_guesses)
+    return whole_message
 
 
 def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether a field distinguishes the objects of a message or, for single objects, the senders."""
     try:
-        texts = [
+        texts_by_message = [
             [str(walk(FieldPath.of(name), element)) for element in _objects_in(guess, message)]
             for message in messages
         ]
     except FieldError:
         return False
     if guess.objects is None:
-        return takes_turns([text for (text,) in texts])
-    return all(len(set(row)) == len(row) for row in texts)
+        return takes_turns([text for (text,) in texts_by_message])
+    return all(len(set(message_texts)) == len(message_texts) for message_texts in texts_by_message)
 
 
 def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None:
@@ -369,21 +385,23 @@ def _objects_in(guess: Guess, message: object) -> Iterator[object]:
 
 def takes_turns(texts: Sequence[str]) -> bool:
     """Return whether a text returns after another one, as names of several senders do, unlike a counter."""
-    starts = [text for text, before in zip(texts, (None, *texts), strict=False) if text != before]
-    return len(set(starts)) < len(starts)
+    run_starts = [
+        text for text, previous_text in zip(texts, (None, *texts), strict=False) if text != previous_text
+    ]
+    return len(set(run_starts)) < len(run_starts)
 
 
 def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
     for path, value in (("", message), *_iter_fields(message)):
-        table = _table_of_objects(value)
-        if table and (guess := _object_in(table[0])) is not None:
+        table_objects = _table_of_objects(value)
+        if table_objects and (guess := _object_in(table_objects[0])) is not None:
             yield f"{path}[*]", replace(guess, names=(INDEX,))
         elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
-            last = path.split(".")[-1]
+            last_name = path.split(".")[-1]
             # corners of an outline are points instead of objects
-            if guess is not None and not (last in _OUTLINES and guess.score <= 10):
-                yield f"{path}[*]", replace(guess, is_plan=not _PLANS.isdisjoint(_words(last)))
+            if guess is not None and not (last_name in _OUTLINES and guess.score <= 10):
+                yield f"{path}[*]", replace(guess, is_plan=not _PLANS.isdisjoint(_words(last_name)))
 
 
 def _table_of_objects(value: object) -> list[object]:
@@ -397,40 +415,40 @@ def _table_of_objects(value: object) -> list[object]:
     objects = [value[key] for key in keys]
     if not isinstance(value, dict):
         return objects
-    fields = {frozenset(field_names(element)) for element in objects}
-    is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
+    field_sets = {frozenset(field_names(element)) for element in objects}
+    is_table = len(objects) > 1 and len(field_sets) == 1 and _PARTS.isdisjoint(keys)
     return objects if is_table and not any(map(_is_no_place, keys)) else []
 
 
 def _object_in(value: object) -> Guess | None:
     """Find the fields of one object in a message or an element of a list."""
     fields = dict(_iter_fields(value))
-    position, turn = _pose_in(fields)
+    position, orientation = _pose_in(fields)
     polygon, corners = _outline_in(fields)
     bounds = _bounds_in(fields)
-    is_own = False
-    if polygon is not None and turn is not None and isinstance(position, str):
-        place = _point(fields[position]) or (0.0, 0.0)
-        is_own = not _is_around(corners, place) and _is_around(corners, (0.0, 0.0))
-        if not is_own and not _is_around(corners, place):
+    is_in_object_frame = False
+    if polygon is not None and orientation is not None and isinstance(position, str):
+        origin = _point(fields[position]) or (0.0, 0.0)
+        is_in_object_frame = not _is_around(corners, origin) and _is_around(corners, (0.0, 0.0))
+        if not is_in_object_frame and not _is_around(corners, origin):
             # the outline is elsewhere, such as pixels next to a pose in metres
             polygon, corners = None, []
     if polygon is not None or position is not None:
         bounds = None
     if polygon is None and position is None and bounds is None:
         return None
-    is_posed = polygon is None or is_own
+    is_posed = polygon is None or is_in_object_frame
     if bounds is not None:
         corners = [_box_at(bounds, value)]
     elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
         corners = [_point(fields[position]) or ()]
     return Guess(
         position=position if is_posed else None,
-        orientation=turn if is_posed else None,
-        has_order=is_posed and turn is not None and is_list(fields[turn]),
-        yaw=_first(fields, _YAWS, _is_number) if is_posed and not turn else None,
+        orientation=orientation if is_posed else None,
+        has_order=is_posed and orientation is not None and is_list(fields[orientation]),
+        yaw=_first(fields, _YAWS, _is_number) if is_posed and not orientation else None,
         polygon=polygon,
-        is_own=is_own,
+        is_own=is_in_object_frame,
         bounds=bounds,
         size=_size_in(fields) if polygon is None else (),
         names=_names_in(fields),
@@ -438,7 +456,7 @@ def _object_in(value: object) -> Guess | None:
             fields, _CLASSES, lambda value: isinstance(value, str) and value not in _GEOMETRIES
         ),
         plane=_first(fields, _PLANES, lambda value: isinstance(value, str) and value != ""),
-        is_in_pixels=not is_own and _are_pixels(corners),
+        is_in_pixels=not is_in_object_frame and _are_pixels(corners),
     )
 
 
@@ -452,8 +470,8 @@ def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float
             return path, [point for corner in value if (point := _point(corner)) is not None]
     for path in _paths_by_name(fields, ("geometry",)):
         # a geometry of GeoJSON
-        names = field_names(fields[path])
-        if "coordinates" in names and get_field(fields[path], "type") in _GEOMETRIES:
+        geometry_fields = field_names(fields[path])
+        if "coordinates" in geometry_fields and get_field(fields[path], "type") in _GEOMETRIES:
             return path, list(_corners_in(get_field(fields[path], "coordinates")))
     return None, []
 
@@ -472,14 +490,14 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
         if _numbers(fields[path], 4):
             return path
     # reversed, so that the first of several fields with one name is used
-    paths = {
+    path_by_name = {
         "_".join(_words(path.split(".")[-1])): path for path in reversed(fields) if _is_number(fields[path])
     }
     for names in _FOUR_BOUNDS:
-        if all(name in paths for name in names):
-            left, low, right, top = (float(fields[paths[name]]) for name in names)  # type: ignore[arg-type]
+        if all(name in path_by_name for name in names):
+            left, low, right, top = (float(fields[path_by_name[name]]) for name in names)  # type: ignore[arg-type]
             # in another order they are the ends of a line, not corners of a box
-            return tuple(paths[name] for name in names) if left <= right and low <= top else None
+            return tuple(path_by_name[name] for name in names) if left <= right and low <= top else None
     return None
 
 
@@ -503,23 +521,23 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
     bounds = guess.bounds
     if bounds is None or isinstance(bounds, tuple):
         return bounds is not None and _words(bounds[-1].split(".")[-1])[-1] == "height"
-    last = bounds.split(".")[-1]
-    if "xywh" in last:
+    last_name = bounds.split(".")[-1]
+    if "xywh" in last_name:
         return True
     boxes = [_box_at(bounds, element) for message in messages for element in _objects_in(guess, message)]
-    return "xyxy" not in last and any(
+    return "xyxy" not in last_name and any(
         right < left or top < low for left, low, right, top in filter(None, boxes)
     )
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
     """Return the paths of a position and an orientation, preferably those of one pose."""
-    turns = [
+    orientations = [
         path
         for path in _paths_by_name(fields, _TURNS)
         if _has(fields[path], "xyzw") or _numbers(fields[path], 4)
     ]
-    places = [
+    positions = [
         path
         # first names such as `position`, then names such as `agvPosition`
         for path in (*_paths_by_name(fields, _POSITIONS), *_paths_by_last_word(fields, _POSITIONS))
@@ -527,17 +545,17 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
     ]
-    for place in places:
-        for turn in turns:
-            if place.rpartition(".")[0] == turn.rpartition(".")[0]:
-                return place, turn
-    position: str | tuple[str, ...] | None = places[0] if places else None
+    for position_path in positions:
+        for orientation in orientations:
+            if position_path.rpartition(".")[0] == orientation.rpartition(".")[0]:
+                return position_path, orientation
+    position: str | tuple[str, ...] | None = positions[0] if positions else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
         # x and y next to w are parts of a quaternion
         position = None if _is_number(fields.get("w")) else ("x", "y")
     if position is None:
         position = geodetic_order(tuple(path for path, value in fields.items() if _is_number(value)))
-    return position, turns[0] if turns else None
+    return position, orientations[0] if orientations else None
 
 
 def _point(value: object) -> tuple[float, ...] | None:
@@ -558,7 +576,9 @@ def _numbers(value: object, count: int) -> list[float]:
 
 def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
     """Return whether a place is inside the box around an outline, enlarged by the outline's size."""
-    low, high = (tuple(pick(corner[axis] for corner in corners) for axis in (0, 1)) for pick in (min, max))
+    low, high = (
+        tuple(extremum(corner[axis] for corner in corners) for axis in (0, 1)) for extremum in (min, max)
+    )
     size = sum(high) - sum(low)
     return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
 
@@ -578,9 +598,9 @@ def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
 def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
     for path in _paths_by_name(fields, _SIZES):
         for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
-            inner = field_names(fields[path])
-            if all(name in inner and _is_number(get_field(fields[path], name)) for name in names[:2]):
-                return tuple(f"{path}.{name}" for name in names if name in inner)
+            inner_names = field_names(fields[path])
+            if all(name in inner_names and _is_number(get_field(fields[path], name)) for name in names[:2]):
+                return tuple(f"{path}.{name}" for name in names if name in inner_names)
         numbers = () if path.endswith("bbox") else _numbers(fields[path], 3) or _numbers(fields[path], 2)
         if numbers:
             return tuple(f"{path}[{index}]" for index in range(len(numbers)))
@@ -592,14 +612,14 @@ def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
 
 def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
     """Return the paths of fields that may distinguish objects: `name`, `id`, then others as `fiducial_id`."""
-    others = [
+    other_paths = [
         path
         for path in fields
         if (words := _words(path.split(".")[-1]))[-1] in ("id", "uuid") and not _NO_IDENTITIES & {*words}
     ]
     names: list[str] = []
     for path in dict.fromkeys(
-        [*_paths_by_name(fields, _NAMES), *sorted(others, key=lambda path: path.count("."))]
+        [*_paths_by_name(fields, _NAMES), *sorted(other_paths, key=lambda path: path.count("."))]
     ):
         value = fields[path]
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
@@ -607,8 +627,8 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
             # a list of one id, or of the bytes of a UUID
             names.append(path)
-        elif inner := next((name for name in ("value", "uuid") if name in field_names(value)), None):
-            names.append(f"{path}.{inner}")
+        elif inner_name := next((name for name in ("value", "uuid") if name in field_names(value)), None):
+            names.append(f"{path}.{inner_name}")
     return tuple(dict.fromkeys(names))
 
 
@@ -619,9 +639,9 @@ def _words(name: str) -> list[str]:
 
 def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
     """Return the paths whose last name is in `names`, by depth, then in the order of `names`."""
-    ends = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
-    paths = [path for path in fields if ends[path] in names]
-    return sorted(paths, key=lambda path: (path.count("."), names.index(ends[path])))
+    last_names = {path: "_".join(_words(path.split(".")[-1])) for path in fields}
+    matching_paths = [path for path in fields if last_names[path] in names]
+    return sorted(matching_paths, key=lambda path: (path.count("."), names.index(last_names[path])))
 
 
 def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
@@ -630,12 +650,12 @@ def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> li
     Names of planned or earlier positions are excluded.
     """
     words_of = {path: _words(path.split(".")[-1]) for path in fields}
-    paths = [
+    matching_paths = [
         path
         for path, words in words_of.items()
         if len(words) > 1 and words[-1] in names and _ELSEWHERE.isdisjoint(words)
     ]
-    return sorted(paths, key=lambda path: path.count("."))
+    return sorted(matching_paths, key=lambda path: path.count("."))
 
 
 def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[object], bool]) -> str | None:
@@ -656,16 +676,16 @@ def _iter_fields(
     """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
     for name in field_names(value) if depth < _DEEPEST else ():
         if not is_skipped(name) and _FIELD.fullmatch(name):
-            inner = get_field(value, name)
-            full = f"{path}.{name}" if path else name
-            yield full, inner
-            yield from _iter_fields(inner, full, depth + 1, is_skipped=is_skipped)
+            inner_value = get_field(value, name)
+            full_path = f"{path}.{name}" if path else name
+            yield full_path, inner_value
+            yield from _iter_fields(inner_value, full_path, depth + 1, is_skipped=is_skipped)
 
 
 def _list_rank(path: str) -> int:
     """Return a rank of a list by its name; lists of moving objects have the highest."""
-    last = path.removesuffix("[*]").split(".")[-1].lower()
-    return 2 * ("moving" in last or "dynamic" in last) + bool(_LISTS.search(last))
+    last_name = path.removesuffix("[*]").split(".")[-1].lower()
+    return 2 * ("moving" in last_name or "dynamic" in last_name) + bool(_LISTS.search(last_name))
 
 
 def _is_number(value: object) -> bool:
@@ -676,6 +696,6 @@ def _has(value: object, names: str) -> bool:
     """Return whether a message has a number in each of the fields with these one-letter names."""
     fields = field_names(value)
     if isinstance(value, Sparse):
-        allowed = "xyz" if names == "xy" else names
-        return all(name in allowed and _is_number(value[name]) for name in fields)
+        allowed_names = "xyz" if names == "xy" else names
+        return all(name in allowed_names and _is_number(value[name]) for name in fields)
     return all(name in fields and _is_number(get_field(value, name)) for name in names)

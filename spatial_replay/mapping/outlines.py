@@ -46,26 +46,33 @@ def outlines_from_lists(
         is_bounds: whether each list has two opposite corners of a box, which become four corners.
         have_size: whether bounds have width and height instead of the second corner.
     """
-    counts, points = points_from_lists(lists)
+    corner_counts, points = points_from_lists(lists)
     if is_bounds:
-        few = counts != 2
-        starts = starts_from_counts(counts)[:-1][~few]
-        ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
+        is_faulty = corner_counts != 2
+        first_corners = starts_from_counts(corner_counts)[:-1][~is_faulty]
+        box_corners = (
+            np.stack([points[first_corners], points[first_corners + 1]])
+            if len(first_corners)
+            else np.empty((2, 0, 3))
+        )
         if have_size:
             # NaN instead of a negative size, so that the object is unknown
-            ends[1] = ends[0] + np.where(ends[1] < 0, np.nan, ends[1])
-        (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
-        xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
-        boxes = np.stack([xs, ys, np.zeros_like(xs)], axis=2).reshape(-1, 3)
-        counts, points = np.where(few, 0, 4), boxes
+            box_corners[1] = box_corners[0] + np.where(box_corners[1] < 0, np.nan, box_corners[1])
+        (left, low, _), (right, high, _) = box_corners.min(axis=0).T, box_corners.max(axis=0).T
+        box_xs, box_ys = (
+            np.stack([left, right, right, left], axis=1),
+            np.stack([low, low, high, high], axis=1),
+        )
+        boxes = np.stack([box_xs, box_ys, np.zeros_like(box_xs)], axis=2).reshape(-1, 3)
+        corner_counts, points = np.where(is_faulty, 0, 4), boxes
     else:
-        few = counts < _LEAST_CORNERS
-    if not few.any():
-        return counts, points, 0
-    is_enough = np.repeat(~few, counts)
-    at = starts_from_counts(np.where(few, 0, counts))[:-1][few]
-    points = np.insert(points[is_enough], at, np.nan, axis=0)
-    return np.where(few, 1, counts), points, int(np.count_nonzero(few))
+        is_faulty = corner_counts < _LEAST_CORNERS
+    if not is_faulty.any():
+        return corner_counts, points, 0
+    is_enough = np.repeat(~is_faulty, corner_counts)
+    insertions = starts_from_counts(np.where(is_faulty, 0, corner_counts))[:-1][is_faulty]
+    points = np.insert(points[is_enough], insertions, np.nan, axis=0)
+    return np.where(is_faulty, 1, corner_counts), points, int(np.count_nonzero(is_faulty))
 
 
 def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
@@ -74,21 +81,23 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     Elements are points with fields, pairs of numbers, or x and y in turn.
     """
     example = next((corners[0] for corners in lists if len(corners)), None)
-    flat = list(chain.from_iterable(lists))
-    counts = np.array([len(corners) for corners in lists], np.int64)
+    elements = list(chain.from_iterable(lists))
+    element_counts = np.array([len(corners) for corners in lists], np.int64)
     names = field_names(example)
     if "x" in names and "y" in names:
         axes = "xyz" if "z" in names else "xy"
-        get = tuple_getter([FieldPath.of(axis) for axis in axes], example)
-        rows = read_rows(get, flat, len(axes), style_of(example))
-        return counts, rows if len(axes) == 3 else np.column_stack([rows, np.zeros(len(flat))])
+        get_axes = tuple_getter([FieldPath.of(axis) for axis in axes], example)
+        coordinate_rows = read_rows(get_axes, elements, len(axes), style_of(example))
+        return element_counts, coordinate_rows if len(axes) == 3 else np.column_stack(
+            [coordinate_rows, np.zeros(len(elements))]
+        )
     if example is None or hasattr(example, "__len__"):
-        pairs = np.array([(point[0], point[1]) for point in flat], np.float64).reshape(-1, 2)
-        return counts, np.column_stack([pairs, np.zeros(len(pairs))])
-    if (counts % 2).any():
+        xy_pairs = np.array([(point[0], point[1]) for point in elements], np.float64).reshape(-1, 2)
+        return element_counts, np.column_stack([xy_pairs, np.zeros(len(xy_pairs))])
+    if (element_counts % 2).any():
         raise ValueError("a polygon has an odd number of coordinates; give x and y of each corner in turn")
-    pairs = np.array(flat, np.float64).reshape(-1, 2)
-    return counts // 2, np.column_stack([pairs, np.zeros(len(pairs))])
+    xy_pairs = np.array(elements, np.float64).reshape(-1, 2)
+    return element_counts // 2, np.column_stack([xy_pairs, np.zeros(len(xy_pairs))])
 
 
 def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) -> Floats:
@@ -97,13 +106,13 @@ def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) ->
     Args:
         get: function from an element to its numbers.
     """
-    count = len(elements)
+    element_count = len(elements)
     if style == "attributes":
         # faster than an array from a list of tuples, but np.fromiter refuses None
         with suppress(TypeError):
             numbers = chain.from_iterable(map(get, elements))
-            return np.fromiter(numbers, np.float64, count * width).reshape(count, width)
-    return np.array(list(map(get, elements)), np.float64).reshape(count, width)
+            return np.fromiter(numbers, np.float64, element_count * width).reshape(element_count, width)
+    return np.array(list(map(get, elements)), np.float64).reshape(element_count, width)
 
 
 def features_in(message: object) -> dict[str, object]:
@@ -112,17 +121,19 @@ def features_in(message: object) -> dict[str, object]:
     Raises:
         ContentError: the text is not GeoJSON.
     """
-    text = get_field(message, "geojson")
+    geojson_text = get_field(message, "geojson")
     try:
-        value = json.loads(str(text))
+        geojson = json.loads(str(geojson_text))
     except (ValueError, RecursionError) as error:
         raise ContentError(f"geojson: it is not JSON: {error}") from None
-    kind = value.get("type") if isinstance(value, dict) else None
-    if kind == "FeatureCollection":
-        return value  # type: ignore[no-any-return]
-    if kind is None:
+    geojson_type = geojson.get("type") if isinstance(geojson, dict) else None
+    if geojson_type == "FeatureCollection":
+        return geojson  # type: ignore[no-any-return]
+    if geojson_type is None:
         raise ContentError("geojson: it has no type, such as FeatureCollection")
-    feature = value if kind == "Feature" else {"type": "Feature", "geometry": value, "properties": {}}
+    feature = (
+        geojson if geojson_type == "Feature" else {"type": "Feature", "geometry": geojson, "properties": {}}
+    )
     return {"features": [feature]}
 
 
@@ -153,15 +164,15 @@ def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Flo
         ContentError: a ring crosses or touches itself or another ring.
     """
     outlines: list[Floats] = []
-    outline_counts, empty = [], 0
+    outline_counts, empty_count = [], 0
     for holder in holders:
         pieces = [piece for rings in _polygons_in(holder) for piece in _pieces(rings)]
-        empty += not pieces
+        empty_count += not pieces
         outlines += pieces or [np.full((1, 3), np.nan)]
         outline_counts.append(max(1, len(pieces)))
     corner_counts = np.array([len(outline) for outline in outlines], np.int64)
     corners = np.concatenate(outlines) if outlines else np.empty((0, 3))
-    return np.array(outline_counts, np.int64), corner_counts, corners, empty
+    return np.array(outline_counts, np.int64), corner_counts, corners, empty_count
 
 
 def _polygons_in(holder: Any) -> list[Any]:
@@ -173,8 +184,8 @@ def _polygons_in(holder: Any) -> list[Any]:
     if "type" in names:
         coordinates = get_field(holder, "coordinates") if "coordinates" in names else ()
         # points and lines cover no area
-        kinds: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
-        return list(kinds.get(get_field(holder, "type"), ()))
+        polygons_by_type: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
+        return list(polygons_by_type.get(get_field(holder, "type"), ()))
     # a polygon has three levels (rings, corners, numbers), a MultiPolygon four
     return list(holder) if _depth(holder) > 3 else [holder]
 

@@ -145,9 +145,9 @@ class TopicSuggestion:
     def signals(self) -> str:
         """Entry that reads the numbers as signals; "" without numbers."""
         prefix = _topic_words(self.topic.name)
-        names = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
-        signals = flow_text({yaml_text(name): yaml_text(path) for name, path in names.items()})
-        return f"{{signals: {signals}}}" if names else ""
+        path_by_name = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
+        signals = flow_text({yaml_text(name): yaml_text(path) for name, path in path_by_name.items()})
+        return f"{{signals: {signals}}}" if path_by_name else ""
 
 
 def suggest_topics(
@@ -164,9 +164,11 @@ def suggest_topics(
     suggestions = []
     for topic in topics:
         messages = examples.get(topic.name, ())
-        times = times_ns.get(topic.name) or [second * 10**9 for second in range(len(messages))]
-        lists = [_with_trial(entry, messages, times) for entry in _suggestions(topic, messages)]
-        suggestions.append(_join_lists(lists))
+        log_times_ns = times_ns.get(topic.name) or [second * 10**9 for second in range(len(messages))]
+        list_suggestions = [
+            _with_trial(entry, messages, log_times_ns) for entry in _suggestions(topic, messages)
+        ]
+        suggestions.append(_join_lists(list_suggestions))
     return tuple(suggestions)
 
 
@@ -187,57 +189,77 @@ def suggest_mapping(
     """
     suggestions = suggest_topics(topics, examples, times_ns)
     first_ns = {name: times[0] for name, times in times_ns.items() if times}
-    usable = [
+    usable_suggestions = [
         suggestion
         for suggestion in suggestions
         if len(yaml_text(suggestion.topic.name)) <= _LONGEST_KEY and not suggestion.aside
     ]
-    mapped = [suggestion for suggestion in usable if suggestion.entry and not suggestion.is_transforms]
+    mapped_suggestions = [
+        suggestion for suggestion in usable_suggestions if suggestion.entry and not suggestion.is_transforms
+    ]
     axes: _Axes = next(
-        (axes for axes in _AXES if any(suggestion.axes == axes for suggestion in mapped)), "plane"
+        (axes for axes in _AXES if any(suggestion.axes == axes for suggestion in mapped_suggestions)), "plane"
     )
-    mapped = [suggestion for suggestion in mapped if suggestion.axes == axes]
-    mapped = mapped or [suggestion for suggestion in usable if suggestion.entry and suggestion.is_transforms]
-    transforms = [suggestion.topic.name for suggestion in suggestions if suggestion.is_transforms]
-    frame_lines, apart = _choose_frame(mapped, [m for name in transforms for m in examples.get(name, ())])
-    active = _with_distinct_names([suggestion for suggestion in mapped if suggestion.topic.name not in apart])
-    if any(suggestion.frames for suggestion in active):
-        active = [
+    mapped_suggestions = [suggestion for suggestion in mapped_suggestions if suggestion.axes == axes]
+    mapped_suggestions = mapped_suggestions or [
+        suggestion for suggestion in usable_suggestions if suggestion.entry and suggestion.is_transforms
+    ]
+    transform_topics = [suggestion.topic.name for suggestion in suggestions if suggestion.is_transforms]
+    frame_lines, reason_by_topic = _choose_frame(
+        mapped_suggestions, [message for name in transform_topics for message in examples.get(name, ())]
+    )
+    active_suggestions = _with_distinct_names(
+        [suggestion for suggestion in mapped_suggestions if suggestion.topic.name not in reason_by_topic]
+    )
+    if any(suggestion.frames for suggestion in active_suggestions):
+        active_suggestions = [
             _with_frame_remark(suggestion) if examples.get(suggestion.topic.name) else suggestion
-            for suggestion in active
+            for suggestion in active_suggestions
         ]
-    signals = [] if active else [suggestion for suggestion in usable if suggestion.signals]
+    signals = (
+        [] if active_suggestions else [suggestion for suggestion in usable_suggestions if suggestion.signals]
+    )
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
-    if not active:
-        refused = any(suggestion.aside for suggestion in suggestions)
+    if not active_suggestions:
+        has_refused = any(suggestion.aside for suggestion in suggestions)
         lines.append(
             "# Nothing can be read as an object; the reasons are below."
-            if refused
+            if has_refused
             else f"# Nothing looks like an object{': these are signals' if signals else ''}."
         )
     lines += [
         *frame_lines,
-        *_axes_lines(axes if active else "plane"),
-        *_origin_lines(active, examples),
+        *_axes_lines(axes if active_suggestions else "plane"),
+        *_origin_lines(active_suggestions, examples),
         *(f"# {_comment(doubt)}" for doubt in doubts_of(topics)),
-        *_time_lines(active or signals, first_ns),
+        *_time_lines(active_suggestions or signals, first_ns),
         "topics:",
     ]
-    if not active and not signals:
+    if not active_suggestions and not signals:
         lines.append(f"  # {NO_TOPIC}, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
-    entries = {suggestion.topic.name: "\n".join(_entry_lines(suggestion)) for suggestion in active or signals}
+    entries = {
+        suggestion.topic.name: "\n".join(_entry_lines(suggestion))
+        for suggestion in active_suggestions or signals
+    }
     entries_that_fit = _first_that_fit(list(entries.items()), _LARGEST_SUGGESTION - len("\n".join(lines)))
-    rest = [suggestion for suggestion in suggestions if suggestion.topic.name not in dict(entries_that_fit)]
-    rest = [replace(rest_of, aside=apart.get(rest_of.topic.name, rest_of.aside)) for rest_of in rest]
-    unused = {suggestion.topic.name: _unused_line(suggestion, axes) for suggestion in rest}
-    left = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(entries_that_fit).values()]))
-    unused_that_fit = _first_that_fit(list(unused.items()), left)
+    unused_suggestions = [
+        suggestion for suggestion in suggestions if suggestion.topic.name not in dict(entries_that_fit)
+    ]
+    unused_suggestions = [
+        replace(unused, aside=reason_by_topic.get(unused.topic.name, unused.aside))
+        for unused in unused_suggestions
+    ]
+    unused_lines = {
+        suggestion.topic.name: _unused_line(suggestion, axes) for suggestion in unused_suggestions
+    }
+    remaining_bytes = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(entries_that_fit).values()]))
+    unused_that_fit = _first_that_fit(list(unused_lines.items()), remaining_bytes)
     lines += dict(entries_that_fit).values()
     if unused_that_fit:
         lines += ["", "  # not used:", *dict(unused_that_fit).values()]
-    if len(unused_that_fit) < len(unused):
-        lines.append(f"  # … and {plural(len(unused) - len(unused_that_fit), 'topic')} more")
+    if len(unused_that_fit) < len(unused_lines):
+        lines.append(f"  # … and {plural(len(unused_lines) - len(unused_that_fit), 'topic')} more")
     return "\n".join(lines) + "\n"
 
 
@@ -251,26 +273,26 @@ def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
         yield f"  {topic}: {suggestion.entry or suggestion.signals}"
 
 
-def _first_that_fit(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
+def _first_that_fit(texts: Sequence[tuple[str, str]], byte_limit: int) -> list[tuple[str, str]]:
     """Return the first (name, text) pairs whose texts fit into `most` bytes."""
     texts_that_fit: list[tuple[str, str]] = []
     for name, text in texts:
-        most -= len(text.encode()) + 1
-        if most < 0:
+        byte_limit -= len(text.encode()) + 1
+        if byte_limit < 0:
             break
         texts_that_fit.append((name, text))
     return texts_that_fit
 
 
-def _with_distinct_names(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
+def _with_distinct_names(suggestions: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
     """Return suggestions in which names shared by several topics are prefixed by the topic."""
-    lists = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in active}
-    shared = Counter(part.name for parts in lists.values() for part in parts)
+    parts_by_topic = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in suggestions}
+    name_counts = Counter(part.name for parts in parts_by_topic.values() for part in parts)
     return [
         _with_prefix(suggestion, _topic_words(suggestion.topic.name))
-        if any(shared[part.name] > 1 for part in lists[suggestion.topic.name])
+        if any(name_counts[part.name] > 1 for part in parts_by_topic[suggestion.topic.name])
         else suggestion
-        for suggestion in active
+        for suggestion in suggestions
     ]
 
 
@@ -283,9 +305,9 @@ def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
     fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
     # `objects` first, then `name`, as in handwritten mappings
-    ordered = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
+    ordered_fields = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
     further = tuple(_with_prefix(part, prefix) for part in suggestion.further)
-    return replace(suggestion, fields=dict(ordered), name=name, further=further)
+    return replace(suggestion, fields=dict(ordered_fields), name=name, further=further)
 
 
 def _with_trial(
@@ -298,20 +320,20 @@ def _with_trial(
         return suggestion
     origin = ""
     if layout is not None and (layout.is_geojson or geodetic_paths(layout) is not None):
-        place = _first_fix(layout, examples)
-        if place is None:
+        first_fix = _first_fix(layout, examples)
+        if first_fix is None:
             return replace(
                 suggestion, aside="no message looked at has a fix in degrees, to count metres from"
             )
-        origin = f"origin: [{place[0]!r}, {place[1]!r}]\n"
+        origin = f"origin: [{first_fix[0]!r}, {first_fix[1]!r}]\n"
     try:
-        readable, reasons = readable_messages(topic, entry, examples, origin)
+        readable_examples, reasons = readable_messages(topic, entry, examples, origin)
     except UsageError as error:
         return replace(suggestion, aside=_comment(str(error).partition(f"{topic.name}: ")[2] or str(error)))
     if reasons:
-        first = f"cannot be read: {_comment(reasons[0])}"
-        remark = f"{len(reasons)} of {len(examples)} messages looked at {first}"
-        frames = suggestion.frames if layout is None else frozenset(_iter_frames(layout, readable))
+        first_reason = f"cannot be read: {_comment(reasons[0])}"
+        remark = f"{len(reasons)} of {len(examples)} messages looked at {first_reason}"
+        frames = suggestion.frames if layout is None else frozenset(_iter_frames(layout, readable_examples))
         suggestion = replace(suggestion, remarks=(*suggestion.remarks, remark), frames=frames)
     if suggestion.fields is None:
         return suggestion
@@ -330,10 +352,10 @@ def _origin_lines(
     """Yield the lines of the `origin`, which is the first fix."""
     for suggestion in active:
         layout = suggestion.layout
-        place = None if layout is None else _first_fix(layout, examples.get(suggestion.topic.name, ()))
-        if place is not None:
+        first_fix = None if layout is None else _first_fix(layout, examples.get(suggestion.topic.name, ()))
+        if first_fix is not None:
             yield "# where (0, 0) is, here at the first fix; x is in metres east of it, y north"
-            yield f"origin: [{place[0]!r}, {place[1]!r}]"
+            yield f"origin: [{first_fix[0]!r}, {first_fix[1]!r}]"
             return
 
 
@@ -344,8 +366,8 @@ def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float
         return next(filter(None, map(_first_corner, examples)), None)
     if paths is None:
         return None
-    places = (_place_of_fix(fix, paths) for _, fix in _iter_objects(layout, examples))
-    return next((place for place in places if place is not None), None)
+    positions = (_place_of_fix(fix, paths) for _, fix in _iter_objects(layout, examples))
+    return next((position for position in positions if position is not None), None)
 
 
 def _first_corner(message: object) -> tuple[float, float] | None:
@@ -355,8 +377,8 @@ def _first_corner(message: object) -> tuple[float, float] | None:
     except FieldError:
         return None
     # longitude comes before latitude (RFC 7946, section 3.1.1)
-    place = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', text)
-    return None if place is None else (float(place[2]), float(place[1]))
+    coordinates_match = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', text)
+    return None if coordinates_match is None else (float(coordinates_match[2]), float(coordinates_match[1]))
 
 
 def _place_of_fix(fix: object, paths: Sequence[str]) -> tuple[float, float] | None:
@@ -399,9 +421,9 @@ def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggesti
     if guess is None:
         return [TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())]
     bodies = [body for body in guess.others if body.is_body and not share_places(guess, body, examples)]
-    rest = tuple(unnamed for unnamed in guess.others if unnamed not in bodies)
-    lists = [replace(guess, others=rest), *bodies]
-    return [_of_guess(topic, guess, examples) for guess in lists[:_MOST_LISTS]]
+    other_guesses = tuple(other_guess for other_guess in guess.others if other_guess not in bodies)
+    guesses = [replace(guess, others=other_guesses), *bodies]
+    return [_of_guess(topic, guess, examples) for guess in guesses[:_MOST_LISTS]]
 
 
 def _of_known_type(topic: Topic, reading: MessageLayout, examples: Sequence[object]) -> TopicSuggestion:
@@ -428,28 +450,31 @@ def _of_guess(topic: Topic, guess: Guess, examples: Sequence[object]) -> TopicSu
     return replace(suggestion, axes=axes, aside=aside, path=guess.objects or "")
 
 
-def _join_lists(lists: Sequence[TopicSuggestion]) -> TopicSuggestion:
+def _join_lists(suggestions: Sequence[TopicSuggestion]) -> TopicSuggestion:
     """Join the suggestions for lists of objects of a topic into one."""
-    first, *others = lists
-    further = [
+    first_suggestion, *other_suggestions = suggestions
+    further_suggestions = [
         suggestion
-        for suggestion in others
-        if not suggestion.aside and suggestion.axes == first.axes and suggestion.fields is not None
+        for suggestion in other_suggestions
+        if not suggestion.aside and suggestion.axes == first_suggestion.axes and suggestion.fields is not None
     ]
-    if first.aside or not further:
-        return first
-    shared = Counter(suggestion.name for suggestion in (first, *further))
-    further = [
+    if first_suggestion.aside or not further_suggestions:
+        return first_suggestion
+    name_counts = Counter(suggestion.name for suggestion in (first_suggestion, *further_suggestions))
+    further_suggestions = [
         _with_prefix(suggestion, _topic_words(suggestion.path.rpartition(".")[0].replace(".", "/")))
-        if shared[suggestion.name] > 1
+        if name_counts[suggestion.name] > 1
         else suggestion
-        for suggestion in further
+        for suggestion in further_suggestions
     ]
     return replace(
-        first,
-        further=tuple(further),
-        remarks=(*first.remarks, *(remark for suggestion in further for remark in suggestion.remarks)),
-        frames=first.frames.union(*(suggestion.frames for suggestion in further)),
+        first_suggestion,
+        further=tuple(further_suggestions),
+        remarks=(
+            *first_suggestion.remarks,
+            *(remark for suggestion in further_suggestions for remark in suggestion.remarks),
+        ),
+        frames=first_suggestion.frames.union(*(suggestion.frames for suggestion in further_suggestions)),
     )
 
 
@@ -522,16 +547,16 @@ def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     if topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static":
         remark = "static transforms place frames, such as those of sensors; they are no objects"
         return TopicSuggestion(topic, remarks=(remark,), is_transforms=True)
-    children = {child for message in examples for _, child in _edges(message)}
-    mounted = sorted(child for child in children if _SENSORS.search(child))
-    left_out = (
-        {"except": f"[{', '.join(map(yaml_text, mounted))}]"}
-        if mounted and len(mounted) < len(children)
+    child_frames = {child for message in examples for _, child in _edges(message)}
+    sensor_frames = sorted(child for child in child_frames if _SENSORS.search(child))
+    exclusions = (
+        {"except": f"[{', '.join(map(yaml_text, sensor_frames))}]"}
+        if sensor_frames and len(sensor_frames) < len(child_frames)
         else {}
     )
     frames = frozenset(parent for message in examples for parent, _ in _edges(message))
     return TopicSuggestion(
-        topic, {**left_out, **_POINT}, "{child_frame_id}", _SIZELESS, is_transforms=True, frames=frames
+        topic, {**exclusions, **_POINT}, "{child_frame_id}", _SIZELESS, is_transforms=True, frames=frames
     )
 
 
@@ -555,7 +580,7 @@ _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
 
 
 def _fields(name: str, guess: Guess) -> dict[str, str]:
-    parts: list[tuple[str, str | tuple[str, ...] | None]] = [
+    values: list[tuple[str, str | tuple[str, ...] | None]] = [
         ("objects", guess.objects),
         ("name", name),
         ("class", guess.class_name),
@@ -566,7 +591,7 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("polygon", None if guess.is_own else guess.polygon),
         ("bounds", guess.bounds),
     ]
-    fields = {key: _value(key, value) for key, value in parts if value is not None}
+    fields = {key: _value(key, value) for key, value in values if value is not None}
     if guess.bounds_have_size:
         fields["bounds"] = f"{{field: {fields['bounds']}, form: xywh}}"
     if guess.has_compass:
@@ -582,8 +607,8 @@ def _topic_words(topic: str) -> str:
 
 def _signal_name(path: str) -> str:
     """Return a name for a path: `position[name=elbow]` → elbow_position."""
-    before, _, key = path.removesuffix("]").partition("[name=")
-    return re.sub(r"\W", "_", f"{key}_{before}" if key else path, flags=re.ASCII)
+    list_path, _, element_name = path.removesuffix("]").partition("[name=")
+    return re.sub(r"\W", "_", f"{element_name}_{list_path}" if element_name else path, flags=re.ASCII)
 
 
 def _value(key: str, value: str | tuple[str, ...]) -> str:
@@ -613,33 +638,39 @@ def _name(topic: Topic, guess: Guess) -> str:
 
 
 def _remarks(guess: Guess) -> tuple[str, ...]:
-    by_id: tuple[str, ...] = ()
+    object_remarks: tuple[str, ...] = ()
     if guess.objects is None and guess.names:
-        by_id = (f"one object a message: {guess.names[0]} takes turns",)
-    sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
+        object_remarks = (f"one object a message: {guess.names[0]} takes turns",)
+    size_remarks = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
     if guess.size[:1] and guess.size[0].endswith("[0]"):
-        sizeless = (f"{guess.size[0][:-3]} is read as length, width and height, in this order",)
+        size_remarks = (f"{guess.size[0][:-3]} is read as length, width and height, in this order",)
     if guess.is_sizeless:
-        sizeless = (f"its sizes are 0 in all messages looked at: {_RADIUS} is a guess",)
+        size_remarks = (f"its sizes are 0 in all messages looked at: {_RADIUS} is a guess",)
     paths = [str(unused.objects) for unused in guess.others[:6]]
-    others = (f"other lists that look like objects: {', '.join(paths)}",) if paths else ()
+    list_remarks = (f"other lists that look like objects: {', '.join(paths)}",) if paths else ()
     if isinstance(guess.bounds, str) and "xy" not in guess.bounds:
-        sizeless = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
-    indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
+        size_remarks = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
+    index_remarks = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
     if guess.other_outline is not None:
         shape = f"shape: {{polygon: {guess.other_outline}}}"
-        by_id = (*by_id, f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes")
+        object_remarks = (
+            *object_remarks,
+            f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes",
+        )
     if guess.plane is not None:
         floors = f"{guess.plane} names floors or maps; objects on all of them are in one plane here"
         one_floor = f"frame: {{field: {guess.plane}}} with `fixed_frame: FLOOR` evaluates one of them"
-        by_id = (*by_id, floors, one_floor)
+        object_remarks = (*object_remarks, floors, one_floor)
     if guess.has_compass:
-        by_id = (*by_id, f"{guess.yaw} beside latitude and longitude counts from north, clockwise")
-    return by_id + sizeless + indexed + others
+        object_remarks = (
+            *object_remarks,
+            f"{guess.yaw} beside latitude and longitude counts from north, clockwise",
+        )
+    return object_remarks + size_remarks + index_remarks + list_remarks
 
 
 def _choose_frame(
-    mapped: Sequence[TopicSuggestion], transforms: Sequence[object]
+    suggestions: Sequence[TopicSuggestion], transforms: Sequence[object]
 ) -> tuple[list[str], dict[str, str]]:
     """Choose the fixed frame as the frame in which most topics can be placed.
 
@@ -649,41 +680,46 @@ def _choose_frame(
     Returns:
         Lines of the mapping, and the reason why a topic cannot be placed, by topic.
     """
-    frames = sorted(frozenset().union(*(suggestion.frames for suggestion in mapped)))
+    frames = sorted(frozenset().union(*(suggestion.frames for suggestion in suggestions)))
     edges = sorted({edge for message in transforms for edge in _edges(message)})
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) < 2:
-        fixed = yaml_text((roots or frames or ["map"])[0])
-        lines = ["# without a fixed frame, coordinates are taken as they are", f"# fixed_frame: {fixed}"]
+        fixed_frame = yaml_text((roots or frames or ["map"])[0])
+        lines = [
+            "# without a fixed frame, coordinates are taken as they are",
+            f"# fixed_frame: {fixed_frame}",
+        ]
         return (lines if edges else []), {}
-    joined = {root: _below(root, edges).intersection(frames) for root in (*roots, *frames)}
+    frames_by_root = {root: _below(root, edges).intersection(frames) for root in (*roots, *frames)}
 
     def rank(root: str) -> tuple[int, int]:
-        topics = [s.topic for s in mapped if joined[root] & s.frames]
+        topics = [suggestion.topic for suggestion in suggestions if frames_by_root[root] & suggestion.frames]
         return len(topics), sum(topic.count or 0 for topic in topics)
 
-    fixed = max(joined, key=rank)
-    others = sorted(set(frames) - joined[fixed])
-    apart = {
-        suggestion.topic.name: f"in {_comment(', '.join(sorted(suggestion.frames)))}, apart from {fixed}"
-        for suggestion in mapped
-        if suggestion.frames and not joined[fixed] & suggestion.frames
+    fixed_frame = max(frames_by_root, key=rank)
+    other_frames = sorted(set(frames) - frames_by_root[fixed_frame])
+    reason_by_topic = {
+        suggestion.topic.name: (
+            f"in {_comment(', '.join(sorted(suggestion.frames)))}, apart from {fixed_frame}"
+        )
+        for suggestion in suggestions
+        if suggestion.frames and not frames_by_root[fixed_frame] & suggestion.frames
     }
     lines = [f"# coordinates are in the frames {_comment(', '.join(frames))}"]
-    if others:
+    if other_frames:
         lines.append(
-            f"# no transforms join {_comment(', '.join(others))} with {fixed}: what is in these is unknown or"
-            " left out; `frame` of a topic overrides its frame"
+            f"# no transforms join {_comment(', '.join(other_frames))} with {fixed_frame}: what is in these"
+            " is unknown or left out; `frame` of a topic overrides its frame"
         )
-    return [*lines, f"fixed_frame: {yaml_text(fixed)}"], apart
+    return [*lines, f"fixed_frame: {yaml_text(fixed_frame)}"], reason_by_topic
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
     """Return a frame and all frames below it in the tree of transforms."""
-    below = {root}
-    while more := {child for parent, child in edges if parent in below} - below:
-        below |= more
-    return below
+    frames_below = {root}
+    while new_frames := {child for parent, child in edges if parent in frames_below} - frames_below:
+        frames_below |= new_frames
+    return frames_below
 
 
 def _edges(message: object) -> Iterator[tuple[str, str]]:
@@ -714,29 +750,41 @@ def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) 
 
 def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
     """Return the clock and the reason: stamps are used if delays of recording differ too much."""
-    late = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
-    without = [topic for topic, lateness in late if lateness is None]
-    medians = {topic: float(np.median(lateness)) for topic, lateness in late if lateness is not None}
-    if not medians:
+    lateness_by_topic = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
+    stampless_topics = [topic for topic, lateness in lateness_by_topic if lateness is None]
+    median_by_topic = {
+        topic: float(np.median(lateness)) for topic, lateness in lateness_by_topic if lateness is not None
+    }
+    if not median_by_topic:
         return "log", ""
-    first, last = min(medians, key=medians.__getitem__), max(medians, key=medians.__getitem__)
-    apart_s = medians[last] - medians[first]
-    sentence = (
-        f"stamps of {_comment(last)} are {apart_s:.3g} s later recorded than those of {_comment(first)}"
+    earliest_topic, latest_topic = (
+        min(median_by_topic, key=median_by_topic.__getitem__),
+        max(median_by_topic, key=median_by_topic.__getitem__),
     )
-    widest = max(
-        ((float(np.ptp(lateness)), topic) for topic, lateness in late if lateness is not None),
+    apart_s = median_by_topic[latest_topic] - median_by_topic[earliest_topic]
+    sentence = (
+        f"stamps of {_comment(latest_topic)} are {apart_s:.3g} s later recorded than those of"
+        f" {_comment(earliest_topic)}"
+    )
+    widest_spread = max(
+        ((float(np.ptp(lateness)), topic) for topic, lateness in lateness_by_topic if lateness is not None),
         key=itemgetter(0),
     )
     if apart_s > _ONE_CLOCK_S:
         return "log", f"{sentence}, so they are of two clocks"
-    if without:
-        return "log", f"{_comment(without[0])} has no stamps that advance with its messages"
-    if max(apart_s, widest[0]) <= _EXACT_S:
-        return "log", f"stamps and times of recording advance together, to {max(apart_s, widest[0]):.2g} s"
-    if apart_s >= widest[0]:
+    if stampless_topics:
+        return "log", f"{_comment(stampless_topics[0])} has no stamps that advance with its messages"
+    if max(apart_s, widest_spread[0]) <= _EXACT_S:
+        return (
+            "log",
+            f"stamps and times of recording advance together, to {max(apart_s, widest_spread[0]):.2g} s",
+        )
+    if apart_s >= widest_spread[0]:
         return "header", sentence
-    return "header", f"{_comment(widest[1])} is recorded with a delay that varies by {widest[0]:.3g} s"
+    return (
+        "header",
+        f"{_comment(widest_spread[1])} is recorded with a delay that varies by {widest_spread[0]:.3g} s",
+    )
 
 
 def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
@@ -745,26 +793,26 @@ def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, i
     So all of these topics have a message at the first sample.
     """
     topics = [suggestion.topic for suggestion in active]
-    begins = [first_ns.get(topic.name, FOREVER) for topic in topics]
-    often = max(topic.count or 0 for topic in topics)
+    begin_times_ns = [first_ns.get(topic.name, FOREVER) for topic in topics]
+    greatest_count = max(topic.count or 0 for topic in topics)
     # topics with at least half as many messages as the most frequent one
-    together = [
-        (begin, topic)
-        for begin, topic in zip(begins, topics, strict=True)
-        if begin <= min(begins) + _TOGETHER_NS and 2 * (topic.count or 0) >= often
+    eligible_topics = [
+        (begin_ns, topic)
+        for begin_ns, topic in zip(begin_times_ns, topics, strict=True)
+        if begin_ns <= min(begin_times_ns) + _TOGETHER_NS and 2 * (topic.count or 0) >= greatest_count
     ]
-    return max(together, key=itemgetter(0))[1] if together else topics[0]
+    return max(eligible_topics, key=itemgetter(0))[1] if eligible_topics else topics[0]
 
 
 def _unused_line(suggestion: TopicSuggestion, axes: _Axes) -> str:
-    topic, what = yaml_text(suggestion.topic.name), _description(suggestion.topic)
-    aside = suggestion.aside
+    topic, description = yaml_text(suggestion.topic.name), _description(suggestion.topic)
+    reason_aside = suggestion.aside
     if suggestion.entry and suggestion.axes != axes and not suggestion.is_transforms:
-        aside = aside or f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
+        reason_aside = reason_aside or f"{_AXES[suggestion.axes]}: for a mapping of its own with y down"
     if suggestion.entry or suggestion.signals:
-        reason = f"; {aside}" if aside else ""
-        return f"  # {topic}: {suggestion.entry or suggestion.signals}    # {what}{reason}"
-    return "; ".join([f"  # {topic}: {what}", *suggestion.remarks])
+        reason = f"; {reason_aside}" if reason_aside else ""
+        return f"  # {topic}: {suggestion.entry or suggestion.signals}    # {description}{reason}"
+    return "; ".join([f"  # {topic}: {description}", *suggestion.remarks])
 
 
 def _description(topic: Topic) -> str:

@@ -177,22 +177,22 @@ class Extractor:
         Raises:
             FieldError: the path of the stamp does not resolve.
         """
-        first = next(iter(self._elements(message)), None)
-        if first is None:
+        first_object = next(iter(self._elements(message)), None)
+        if first_object is None:
             return self._stamp_of_empty(message)
-        self._bind_time(first, message)
+        self._bind_time(first_object, message)
         if self._time is None:
             return None
-        return self._time.nanoseconds([message if self._time.path.from_message else first])[0]
+        return self._time.nanoseconds([message if self._time.path.from_message else first_object])[0]
 
     def _stamp_of_empty(self, message: object) -> int | None:
-        time = self._time
-        if time is None or not time.path.from_message:
+        time_getter = self._time
+        if time_getter is None or not time_getter.path.from_message:
             if self._time_of_empty is None:
                 stamps = [stamp for stamp in self.layout.stamp if FieldPath.of(stamp.field).from_message]
                 self._time_of_empty = bind_time(stamps, message, message)
-            time = self._time_of_empty
-        return None if time is None else time.nanoseconds([message])[0]
+            time_getter = self._time_of_empty
+        return None if time_getter is None else time_getter.nanoseconds([message])[0]
 
     def read(self, messages: Sequence[object], places: Integers, *, is_early: bool = False) -> DetectionChunk:
         """Extract the objects of some messages.
@@ -205,13 +205,17 @@ class Extractor:
             FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
                 from the others. Only a FieldError describes the difference.
         """
-        values, index, order = self._flatten(messages)
+        values, message_indices, list_keys = self._flatten(messages)
         # such as moveit_msgs/PlanningScene
         if messages and "is_diff" in field_names(messages[0]):
             get = lenient_getter(style_of(messages[0]))
             self.differences += sum(bool(get(message, "is_diff")) for message in messages)
-        of_message = [messages[number] for number in index] if self.namer.needs_messages else None
-        objects = _Objects(values, index, self.namer.codes(values, order, of_message))
+        message_of_object = (
+            [messages[message_index] for message_index in message_indices]
+            if self.namer.needs_messages
+            else None
+        )
+        objects = _Objects(values, message_indices, self.namer.codes(values, list_keys, message_of_object))
         deleted: list[tuple[int, int]] = []
         scene_stamps_ns = self._scene_stamps_ns
         if self.layout.solids == "marker":
@@ -249,8 +253,10 @@ class Extractor:
         """Return detections in which objects keep their first class, or have their class in their name."""
         names, classes = detections.name.tolist(), detections.class_code.tolist()
         if self.layout.class_changes == "first":
-            first = self._first_classes
-            classes = [first.setdefault(name, code) for name, code in zip(names, classes, strict=True)]
+            first_classes = self._first_classes
+            classes = [
+                first_classes.setdefault(name, code) for name, code in zip(names, classes, strict=True)
+            ]
             return replace(detections, class_code=np.array(classes, np.int64))
         # the name depends only on the class, so that it is the same in a window and in the whole log
         names = [self._name_of_class(name, code) for name, code in zip(names, classes, strict=True)]
@@ -321,17 +327,23 @@ class Extractor:
                     numbers[row, column] = nan
                     self.unset[path.text] += 1
 
-    def _count_corners(self, lists: Sequence[Any]) -> None:
+    def _count_corners(self, corner_lists: Sequence[Any]) -> None:
         """Count the boxes of a chunk by the direction from their first to their second corner."""
-        counts, points = points_from_lists([corners for corners in lists if len(corners)])
-        first = (np.cumsum(counts) - counts)[counts == 2]
-        along = points[first + 1] - points[first] if len(first) else points[:0]
-        self.boxes += len(along)
-        self.leftward += int(np.count_nonzero(along[:, 0] < 0))
-        self.downward += int(np.count_nonzero(along[:, 1] < 0))
-        for corner, number in enumerate((first, first + 1) if len(first) else ()):
-            self.corner_low[corner] = np.fmin(self.corner_low[corner], np.fmin.reduce(points[number, :2]))
-            self.corner_high[corner] = np.fmax(self.corner_high[corner], np.fmax.reduce(points[number, :2]))
+        corner_counts, points = points_from_lists([corners for corners in corner_lists if len(corners)])
+        first_corners = (np.cumsum(corner_counts) - corner_counts)[corner_counts == 2]
+        diagonals = points[first_corners + 1] - points[first_corners] if len(first_corners) else points[:0]
+        self.boxes += len(diagonals)
+        self.leftward += int(np.count_nonzero(diagonals[:, 0] < 0))
+        self.downward += int(np.count_nonzero(diagonals[:, 1] < 0))
+        for corner, point_indices in enumerate(
+            (first_corners, first_corners + 1) if len(first_corners) else ()
+        ):
+            self.corner_low[corner] = np.fmin(
+                self.corner_low[corner], np.fmin.reduce(points[point_indices, :2])
+            )
+            self.corner_high[corner] = np.fmax(
+                self.corner_high[corner], np.fmax.reduce(points[point_indices, :2])
+            )
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the indices of their messages, and their indices, or keys, in their lists."""
@@ -342,11 +354,14 @@ class Extractor:
             list(iter_elements(self._path, messages[0]))
             self._list = list_getter(self._path, messages[0]) or self._elements
         lists = list(map(self._list, messages)) if self._list is not None else []
-        keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
-        order: list[int | str] = list(chain.from_iterable(keys))
+        keys = (
+            map(str, keys_of(holder)) if isinstance(holder, Mapping) else range(len(holder))
+            for holder in lists
+        )
+        list_keys: list[int | str] = list(chain.from_iterable(keys))
         lists = list(map(elements_of, lists))
-        index = np.repeat(np.arange(len(lists)), list(map(len, lists))).tolist()
-        return list(chain.from_iterable(lists)), index, order
+        message_indices = np.repeat(np.arange(len(lists)), list(map(len, lists))).tolist()
+        return list(chain.from_iterable(lists)), message_indices, list_keys
 
     def _elements(self, message: object) -> list[object]:
         return [message] if self._path is None else list(iter_elements(self._path, message))
@@ -364,7 +379,7 @@ class Extractor:
         stamps_ns = dict(self._scene_stamps_ns)
         starts = np.searchsorted(entities.message, np.arange(len(messages) + 1)).tolist()
         stamps = [_stamp_of_scene(entity) for entity in entities.values]
-        for number, message in enumerate(messages):
+        for message_index, message in enumerate(messages):
             get = lenient_getter(style_of(message))
             for deletion in get(message, "deletions") or ():
                 # a deletion without a timestamp concerns all entities so far
@@ -376,9 +391,9 @@ class Extractor:
                 deleted_names = [name for name in names if stamps_ns.get(name, 0) <= stamp_ns]
                 for name in deleted_names:
                     stamps_ns.pop(name, None)
-                deleted += [(number, name) for name in deleted_names]
-            reported = slice(starts[number], starts[number + 1])
-            stamps_ns.update(zip(entities.name[reported], stamps[reported], strict=True))
+                deleted += [(message_index, name) for name in deleted_names]
+            message_entities = slice(starts[message_index], starts[message_index + 1])
+            stamps_ns.update(zip(entities.name[message_entities], stamps[message_entities], strict=True))
         return deleted, stamps_ns
 
     def _bind_time(self, example: object, message: object) -> None:
@@ -394,10 +409,12 @@ class Extractor:
         if binding.frame is None or not objects.values:
             return None
         get, from_message = binding.frame
-        frames = [str(get(part)).removeprefix("/") for part in (messages if from_message else objects.values)]
+        frames = [str(get(root)).removeprefix("/") for root in (messages if from_message else objects.values)]
         if binding.outer_frame is not None and not all(frames):
-            outer = [str(binding.outer_frame(message)).removeprefix("/") for message in messages]
-            frames = [frame or outer[index] for frame, index in zip(frames, objects.message, strict=True)]
+            outer_frames = [str(binding.outer_frame(message)).removeprefix("/") for message in messages]
+            frames = [
+                frame or outer_frames[index] for frame, index in zip(frames, objects.message, strict=True)
+            ]
         self.noted_frames.update(frames)
         if not self._needs_frame:
             return None
@@ -411,8 +428,8 @@ class Extractor:
             return
         from_message = self._time.path.from_message
         if not self._needs_frame:
-            first = messages[:1] if from_message else objects.values[:1]
-            stamps = self._time.nanoseconds(first)
+            first_root = messages[:1] if from_message else objects.values[:1]
+            stamps = self._time.nanoseconds(first_root)
             chunk.noted_stamps = list(zip(chunk.places[:1].tolist(), stamps, strict=False))
         elif from_message:
             stamps = self._time.nanoseconds(messages)
@@ -420,7 +437,10 @@ class Extractor:
             if binding.own_stamp is not None:
                 own_stamps = binding.own_stamp.nanoseconds(objects.values)
                 # a stamp of 0 means a stamp that was not set
-                chunk.stamps = [stamp or outer for stamp, outer in zip(own_stamps, chunk.stamps, strict=True)]
+                chunk.stamps = [
+                    stamp or message_stamp
+                    for stamp, message_stamp in zip(own_stamps, chunk.stamps, strict=True)
+                ]
             chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
         else:
             chunk.stamps = self._time.nanoseconds(objects.values)
@@ -443,19 +463,19 @@ def _stamp_of_scene(entity: Any) -> int:
 
 def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int, int]]]:
     """Return the added markers, and (message, name) of each deleted marker."""
-    deleted: list[tuple[int, int]] = []
+    deletions: list[tuple[int, int]] = []
     if not objects.values:
-        return objects, deleted
+        return objects, deletions
     get = lenient_getter(style_of(objects.values[0]))
     actions = [get(marker, "action") for marker in objects.values]
     if not any(actions):
-        return objects, deleted
+        return objects, deletions
     for action, message, name in zip(actions, objects.message, objects.name, strict=True):
         if action == MARKER_DELETE_ALL:
-            deleted.append((message, EVERY_OBJECT))
+            deletions.append((message, EVERY_OBJECT))
         elif action == MARKER_DELETE:
-            deleted.append((message, name))
-    return objects.where([action == MARKER_ADD or not action for action in actions]), deleted
+            deletions.append((message, name))
+    return objects.where([action == MARKER_ADD or not action for action in actions]), deletions
 
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
@@ -592,26 +612,26 @@ class TopicReader:
         """
 
         def read(message: object) -> int | None:
-            time_ns = self._stamp(message)
-            if time_ns is not None and not 0 <= time_ns <= LATEST_NS:
-                raise ContentError(f"its stamp {time_ns} ns lies outside the times of a log")
+            stamp_ns = self._stamp(message)
+            if stamp_ns is not None and not 0 <= stamp_ns <= LATEST_NS:
+                raise ContentError(f"its stamp {stamp_ns} ns lies outside the times of a log")
             # a stamp of 0 was not set; simulators send it before they have a time
-            return time_ns or (0 if self.planned.is_static else None)
+            return stamp_ns or (0 if self.planned.is_static else None)
 
-        times = self._read_each(read, messages, log_times_ns, good)
+        stamps_ns = self._read_each(read, messages, log_times_ns, good)
         # None occurs for an empty list in a message without a header
-        has_stamp = np.array([time_ns is not None for time_ns in times], np.bool_)
+        has_stamp = np.array([time_ns is not None for time_ns in stamps_ns], np.bool_)
         self.unstamped += int(np.count_nonzero(good & ~has_stamp))
         good &= has_stamp
         if not self._is_stamped and good.any():
             self._is_stamped = True
-            first = int(good.argmax())
-            unit = unit_of_stamp(times[first] or 0, log_times_ns[first])
+            first_index = int(good.argmax())
+            unit = unit_of_stamp(stamps_ns[first_index] or 0, log_times_ns[first_index])
             if unit != "ns":
                 raise self._misfit_error(
                     f"stamps in {unit} are read as ns; write `stamp: {{field: PATH, unit: {unit}}}`"
                 )
-        return np.array([time_ns or 0 for time_ns in times], np.int64)
+        return np.array([time_ns or 0 for time_ns in stamps_ns], np.int64)
 
     def read(self, log_times_ns: Integers, contents: Sequence[Any]) -> TopicColumns:
         """Read objects and signals.
@@ -625,18 +645,25 @@ class TopicReader:
         good = np.ones(len(contents), np.bool_)
         chunks: list[DetectionChunk] = []
         signals: list[list[float]] = []
-        times = log_times_ns.tolist()
-        size = _chunk_size(contents)
-        for begin in range(0, len(contents), size):
-            messages, at = contents[begin : begin + size], times[begin : begin + size]
+        all_times_ns = log_times_ns.tolist()
+        chunk_size = _chunk_size(contents)
+        for begin in range(0, len(contents), chunk_size):
+            messages, chunk_times_ns = (
+                contents[begin : begin + chunk_size],
+                all_times_ns[begin : begin + chunk_size],
+            )
             # a view, so that flags cleared in it are cleared in `good`
-            part = good[begin : begin + size]
+            is_chunk_good = good[begin : begin + chunk_size]
             if not self.decodes_on_arrival:
-                messages = self.decode(messages, at, part)
-            values = self._read_each(self._signal_values, messages, at, part) if self._signal_fields else []
+                messages = self.decode(messages, chunk_times_ns, is_chunk_good)
+            chunk_signals = (
+                self._read_each(self._signal_values, messages, chunk_times_ns, is_chunk_good)
+                if self._signal_fields
+                else []
+            )
             if self.extractor is not None:
-                chunks += self._read_objects(self.extractor, messages, begin, at, part)
-            signals += compress(values, part.tolist())
+                chunks += self._read_objects(self.extractor, messages, begin, chunk_times_ns, is_chunk_good)
+            signals += compress(chunk_signals, is_chunk_good.tolist())
         return TopicColumns(
             good=good,
             detections=None if self.extractor is None else self.extractor.detections(chunks, good),
@@ -654,12 +681,12 @@ class TopicReader:
         """
         if self.unstamped and not self._is_stamped and self.is_mapped:
             raise self._misfit_error(_NO_STAMP)
-        for what, (_, first) in self._misfits.items():
+        for kind, (_, first_reason) in self._misfits.items():
             is_bound = self._signals is not None
-            if what == "objects":
+            if kind == "objects":
                 is_bound = self.extractor is None or self.extractor.is_bound
             if not is_bound:
-                raise self._misfit_error(first)
+                raise self._misfit_error(first_reason)
         if self.extractor is not None and self.extractor.is_bound and self.extractor.unseen:
             paths = ", ".join(self.extractor.unseen)
             raise self._misfit_error(
@@ -667,46 +694,50 @@ class TopicReader:
             )
 
     def _read_each(
-        self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], good: Booleans
+        self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], is_good: Booleans
     ) -> list[Any]:
         """Apply `read` to the good items; report the failures and clear their flags."""
         results: list[Any] = [None] * len(items)
-        for place in np.flatnonzero(good).tolist():
+        for index in np.flatnonzero(is_good).tolist():
             try:
-                results[place] = read(items[place])
+                results[index] = read(items[index])
             except (*MISFITS, LogError) as error:
-                good[place] = False
+                is_good[index] = False
                 reason = str(error)
                 if not isinstance(error, FieldError | LogError):
                     reason = f"the message differs from the others: {error}"
-                self._report(self.name, log_times_ns[place], reason)
+                self._report(self.name, log_times_ns[index], reason)
         return results
 
     def _read_objects(
         self,
         extractor: Extractor,
         messages: Sequence[Any],
-        first: int,
+        first_index: int,
         log_times_ns: Sequence[int],
-        good: Booleans,
+        is_good: Booleans,
     ) -> list[DetectionChunk]:
         """Read the objects of the good messages, together if all of them have the same form.
 
         Args:
             first: index of the first message in its batch.
         """
-        places = np.flatnonzero(good)
+        good_indices = np.flatnonzero(is_good)
         try:
-            return [extractor.read([messages[place] for place in places.tolist()], first + places)]
+            return [
+                extractor.read(
+                    [messages[index] for index in good_indices.tolist()], first_index + good_indices
+                )
+            ]
         except MISFITS:
             pass
 
         # one message has another form; reading each message alone shows which one
-        def read(numbered: tuple[int, object]) -> DetectionChunk:
-            place, message = numbered
+        def read(indexed_message: tuple[int, object]) -> DetectionChunk:
+            index, message = indexed_message
             was_bound = extractor.is_bound
             try:
-                return extractor.read([message], np.array([place]))
+                return extractor.read([message], np.array([index]))
             except ContentError:
                 # a bad value is no evidence against the mapping
                 raise
@@ -715,7 +746,7 @@ class TopicReader:
                     self._count_misfit("objects", error)
                 raise
 
-        chunks = self._read_each(read, list(enumerate(messages, first)), log_times_ns, good)
+        chunks = self._read_each(read, list(enumerate(messages, first_index)), log_times_ns, is_good)
         return [chunk for chunk in chunks if chunk is not None]
 
     def _signal_values(self, message: object) -> list[float]:
@@ -730,34 +761,38 @@ class TopicReader:
     def _bind_signal(self, signal: SignalMapping, message: object) -> Get:
         path = FieldPath.of(signal.field)
         walk(path, message)
-        get, numbers = _getter_of_set_values(path, message), names_from_unit(signal.unit)
-        names = enum_names(path, message)
-        if names and not (numbers and numbers.keys().isdisjoint(names.values())):
-            number = get
+        get_value, number_by_name = _getter_of_set_values(path, message), names_from_unit(signal.unit)
+        enum_name_by_number = enum_names(path, message)
+        if enum_name_by_number and not (
+            number_by_name and number_by_name.keys().isdisjoint(enum_name_by_number.values())
+        ):
+            get_number = get_value
 
-            def get(message: object) -> object:
+            def get_value(message: object) -> object:
                 # the name of an enum, as in ProtoJSON; a number without a name stays a number
-                code = number(message)
-                return names.get(code, str(code) if numbers and code is not None else code)
+                code = get_number(message)
+                return enum_name_by_number.get(
+                    code, str(code) if number_by_name and code is not None else code
+                )
 
         try:
-            _number(get(message))
+            _number(get_value(message))
         except (TypeError, OverflowError):
             raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
 
         invalid = with_single_precision(() if self.planned.mapping is None else self.planned.mapping.invalid)
 
         def number_of(message: object) -> float:
-            value = get(message)
+            value = get_value(message)
             if invalid and value in invalid:
                 return nan
-            if not (numbers and isinstance(value, str)):
+            if not (number_by_name and isinstance(value, str)):
                 return _number(value)
-            if value not in numbers:
+            if value not in number_by_name:
                 texts = self.unnamed.setdefault(signal.name, {})
                 if len(texts) < _MOST_UNNAMED:
                     texts.setdefault(value[:_LONGEST_UNNAMED])
-            return numbers.get(value, nan)
+            return number_by_name.get(value, nan)
 
         return number_of
 
@@ -784,17 +819,17 @@ class TopicReader:
             raise self._misfit_error(_NO_STAMP)
         return self._time.nanoseconds([message])[0]
 
-    def _count_misfit(self, what: str, error: Exception) -> None:
+    def _count_misfit(self, kind: str, error: Exception) -> None:
         """Count a misfitting message before the first that fits.
 
         Raises:
             UsageError: there were many misfitting messages.
         """
-        count, first = self._misfits.get(what, (0, ""))
+        misfit_count, first_reason = self._misfits.get(kind, (0, ""))
         reason = str(error) if isinstance(error, FieldError) else f"its messages are not as expected: {error}"
-        self._misfits[what] = count + 1, first or reason
-        if count + 1 >= _PATIENCE:
-            raise self._misfit_error(first)
+        self._misfits[kind] = misfit_count + 1, first_reason or reason
+        if misfit_count + 1 >= _PATIENCE:
+            raise self._misfit_error(first_reason)
 
     def _misfit_error(self, reason: str) -> UsageError:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
@@ -820,8 +855,10 @@ def _getter_of_set_values(path: FieldPath, example: object) -> Get:
 
 def unit_of_stamp(stamp: int, log_time_ns: int) -> str:
     """Return the unit in which a stamp is within an hour of the recording of its message, otherwise ns."""
-    near = (unit for unit, ns in UNITS_NS.items() if abs(stamp * ns - log_time_ns) < 3600 * 10**9)
-    return next(near, "ns")
+    near_units = (
+        unit for unit, unit_ns in UNITS_NS.items() if abs(stamp * unit_ns - log_time_ns) < 3600 * 10**9
+    )
+    return next(near_units, "ns")
 
 
 class ClockStep(NamedTuple):
@@ -880,47 +917,62 @@ class PendingMessages:
         The order is by time, then sequence number, then arrival. A message recorded after a step back of the
         clock gets a time right after the messages before the step.
         """
-        none = np.empty(0, np.int64)
-        columns = zip((none, none, none, none), *self._columns, strict=True)
-        times, sequences, log_times, recorded = map(np.concatenate, columns)
+        no_integers = np.empty(0, np.int64)
+        columns = zip((no_integers, no_integers, no_integers, no_integers), *self._columns, strict=True)
+        times_ns, sequence_numbers, log_times_ns, record_numbers = map(np.concatenate, columns)
         contents = self._contents
-        if not (recorded[1:] > recorded[:-1]).all() or not (times[1:] >= times[:-1]).all():
-            times = self._without_steps(times, sequences, recorded, upto_ns)
-        if len(times) and not (times[1:] > times[:-1]).all():
+        if not (record_numbers[1:] > record_numbers[:-1]).all() or not (times_ns[1:] >= times_ns[:-1]).all():
+            times_ns = self._without_steps(times_ns, sequence_numbers, record_numbers, upto_ns)
+        if len(times_ns) and not (times_ns[1:] > times_ns[:-1]).all():
             # a stable sort, so that the order of arrival decides last
-            order = np.lexsort((sequences, times))
-            times, sequences, log_times = times[order], sequences[order], log_times[order]
-            recorded, contents = recorded[order], [contents[i] for i in order.tolist()]
-        count = int(np.searchsorted(times, upto_ns, "right"))
-        self._columns = [(times[count:], sequences[count:], log_times[count:], recorded[count:])]
-        self._contents = contents[count:]
-        self.taken_ns = max(self.taken_ns, int(times[:count].max(initial=-1)))
-        return times[:count], log_times[:count], contents[:count]
+            time_order = np.lexsort((sequence_numbers, times_ns))
+            times_ns, sequence_numbers, log_times_ns = (
+                times_ns[time_order],
+                sequence_numbers[time_order],
+                log_times_ns[time_order],
+            )
+            record_numbers, contents = record_numbers[time_order], [contents[i] for i in time_order.tolist()]
+        end = int(np.searchsorted(times_ns, upto_ns, "right"))
+        self._columns = [
+            (
+                times_ns[end:],
+                sequence_numbers[end:],
+                log_times_ns[end:],
+                record_numbers[end:],
+            )
+        ]
+        self._contents = contents[end:]
+        self.taken_ns = max(self.taken_ns, int(times_ns[:end].max(initial=-1)))
+        return times_ns[:end], log_times_ns[:end], contents[:end]
 
     def _without_steps(
-        self, times_ns: Integers, sequences: Integers, recorded: Integers, upto_ns: int
+        self, times_ns: Integers, sequence_numbers: Integers, record_numbers: Integers, upto_ns: int
     ) -> Integers:
         """Return times without steps back, if sequence numbers of the log increase across the steps."""
-        order = np.argsort(recorded, kind="stable")
-        times = times_ns[order]
-        back = np.flatnonzero(times[1:] < times[:-1] - LEAST_STEP_NS)
+        record_order = np.argsort(record_numbers, kind="stable")
+        recorded_times_ns = times_ns[record_order]
+        step_indices = np.flatnonzero(recorded_times_ns[1:] < recorded_times_ns[:-1] - LEAST_STEP_NS)
         # sequence numbers of the log do not order messages on the clock of the sender
-        is_sorted = self._has_own_clock or not (np.diff(sequences[order]) > 0).all()
-        if is_sorted and len(back):
+        is_sorted = self._has_own_clock or not (np.diff(sequence_numbers[record_order]) > 0).all()
+        if is_sorted and len(step_indices):
             # steps of later messages wait, because messages recorded before them may still arrive
-            back = back[times[back + 1] <= upto_ns]
-            back = back[np.argsort(times[back + 1], kind="stable")]
-        if not len(back):
+            step_indices = step_indices[recorded_times_ns[step_indices + 1] <= upto_ns]
+            step_indices = step_indices[np.argsort(recorded_times_ns[step_indices + 1], kind="stable")]
+        if not len(step_indices):
             return times_ns
-        at = int(back[0])
-        self.first_step = self.first_step or ClockStep(int(times[at]), int(times[at + 1]), is_sorted)
+        first_step = int(step_indices[0])
+        self.first_step = self.first_step or ClockStep(
+            int(recorded_times_ns[first_step]), int(recorded_times_ns[first_step + 1]), is_sorted
+        )
         if is_sorted:
             return times_ns
         # strictly increasing, so that a message recorded later is valid later
-        number = np.arange(len(times))
-        moved = np.empty_like(times)
-        moved[order] = np.maximum.accumulate(times - number) + number
-        return moved
+        message_numbers = np.arange(len(recorded_times_ns))
+        moved_times_ns = np.empty_like(recorded_times_ns)
+        moved_times_ns[record_order] = (
+            np.maximum.accumulate(recorded_times_ns - message_numbers) + message_numbers
+        )
+        return moved_times_ns
 
 
 def _number(value: object) -> float:

@@ -74,21 +74,23 @@ class Events:
 
     def state(self, times_ns: Integers, max_age_ns: int) -> States:
         """Return the state of all N objects at T times."""
-        starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
-        if len(times_ns) == 1 and len(starts):
+        object_starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
+        if len(times_ns) == 1 and len(object_starts):
             # vectorised over objects, because a running system has one time and many objects
-            at = starts + np.add.reduceat(self.time_ns <= times_ns, starts, dtype=np.int64) - 1
-            columns = self._standing(at, starts, times_ns, max_age_ns)
-            return States(self.name[starts], *(column[None] for column in columns))
-        ends = np.append(starts[1:], len(self.name))[: len(starts)]
-        states = np.zeros((3, len(times_ns), len(starts)), np.int64)
-        for column, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
-            at = np.searchsorted(self.time_ns[start:end], times_ns, "right") - 1 + start
-            states[:, :, column] = self._standing(at, start, times_ns, max_age_ns)
-        return States(self.name[starts], *states)
+            event_indices = (
+                object_starts + np.add.reduceat(self.time_ns <= times_ns, object_starts, dtype=np.int64) - 1
+            )
+            columns = self._standing(event_indices, object_starts, times_ns, max_age_ns)
+            return States(self.name[object_starts], *(column[None] for column in columns))
+        ends = np.append(object_starts[1:], len(self.name))[: len(object_starts)]
+        state_columns = np.zeros((3, len(times_ns), len(object_starts)), np.int64)
+        for object_index, (start, end) in enumerate(zip(object_starts.tolist(), ends.tolist(), strict=True)):
+            event_indices = np.searchsorted(self.time_ns[start:end], times_ns, "right") - 1 + start
+            state_columns[:, :, object_index] = self._standing(event_indices, start, times_ns, max_age_ns)
+        return States(self.name[object_starts], *state_columns)
 
     def _standing(
-        self, at: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
+        self, event_indices: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
     ) -> tuple[Integers, Integers, Integers]:
         """Return rows, class codes and report times at some times.
 
@@ -96,13 +98,13 @@ class Events:
             at: index of the last event up to each time; below `starts` if the object has no event so far.
             starts: index of the first event of the object.
         """
-        has_appeared = at >= starts
-        at = np.maximum(at, starts)
-        row = self.row[at]
-        is_old = times_ns - self.time_ns[at] > max_age_ns
-        is_absent = ~has_appeared | (row == LEFT) | (times_ns >= self.expires_ns[at])
-        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, row))
-        return rows, self.class_code[at], self.time_ns[at]
+        has_appeared = event_indices >= starts
+        event_indices = np.maximum(event_indices, starts)
+        event_rows = self.row[event_indices]
+        is_old = times_ns - self.time_ns[event_indices] > max_age_ns
+        is_absent = ~has_appeared | (event_rows == LEFT) | (times_ns >= self.expires_ns[event_indices])
+        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, event_rows))
+        return rows, self.class_code[event_indices], self.time_ns[event_indices]
 
 
 class States(NamedTuple):
@@ -138,31 +140,31 @@ def events_from_messages(
         is_complete: whether objects missing from a message have left.
     """
     name, message, lifetime_ns = detections.name, detections.message, detections.lifetime_ns
-    expires = np.full(len(name), FOREVER_NS, np.int64)
+    expires_ns = np.full(len(name), FOREVER_NS, np.int64)
     if lifetime_ns is not None:
-        limited = np.flatnonzero(lifetime_ns > 0)
-        expires[limited] = times_ns[message[limited]] + lifetime_ns[limited]
+        limited_indices = np.flatnonzero(lifetime_ns > 0)
+        expires_ns[limited_indices] = times_ns[message[limited_indices]] + lifetime_ns[limited_indices]
     left_name, left_message = np.empty(0, np.int64), np.empty(0, np.int64)
     if is_complete:
         left_name, left_message = _left_out(name, message, alive.name, len(times_ns))
     if deletions := _named_deletions(detections, alive):
-        deleted = np.array(deletions, np.int64)
-        left_message = np.concatenate([left_message, deleted[:, 0]])
-        left_name = np.concatenate([left_name, deleted[:, 1]])
+        deletion_pairs = np.array(deletions, np.int64)
+        left_message = np.concatenate([left_message, deletion_pairs[:, 0]])
+        left_name = np.concatenate([left_name, deletion_pairs[:, 1]])
     every_name = np.concatenate([left_name, name])
     every_message = np.concatenate([left_message, message])
     # departures come first in the stable sort, so that an object deleted and reported by a message exists
-    order = np.lexsort((every_message, every_name))
-    count = len(left_name)
+    event_order = np.lexsort((every_message, every_name))
+    left_count = len(left_name)
 
-    def column(of_left: int, of_detected: Integers) -> Integers:
-        return np.concatenate([np.full(count, of_left, np.int64), of_detected])[order]
+    def column(left_value: int, detected_values: Integers) -> Integers:
+        return np.concatenate([np.full(left_count, left_value, np.int64), detected_values])[event_order]
 
     return Events(
-        name=every_name[order],
-        time_ns=times_ns[every_message[order]],
+        name=every_name[event_order],
+        time_ns=times_ns[every_message[event_order]],
         row=column(LEFT, rows),
-        expires_ns=column(FOREVER_NS, expires),
+        expires_ns=column(FOREVER_NS, expires_ns),
         class_code=column(0, detections.class_code),
     )
 
@@ -179,16 +181,20 @@ def _named_deletions(detections: Detections, alive: Events) -> list[tuple[int, i
     ]
 
 
-def _left_out(name: Integers, message: Integers, alive: Integers, messages: int) -> tuple[Integers, Integers]:
+def _left_out(
+    name: Integers, message: Integers, alive_names: Integers, batch_size: int
+) -> tuple[Integers, Integers]:
     """Return names that are in one message and missing from the next one, and the index of the next one."""
-    every_name = np.concatenate([alive, name])
+    every_name = np.concatenate([alive_names, name])
     # objects alive before the batch count as detected in message -1, just before the first
-    every_message = np.concatenate([np.full(len(alive), -1, np.int64), message])
-    order = np.lexsort((every_message, every_name))
-    name, message = every_name[order], every_message[order]
-    following = np.append(np.where(name[1:] == name[:-1], message[1:], messages), messages)[: len(name)]
-    left = np.flatnonzero((following > message + 1) & (message + 1 < messages))
-    return name[left], message[left] + 1
+    every_message = np.concatenate([np.full(len(alive_names), -1, np.int64), message])
+    name_order = np.lexsort((every_message, every_name))
+    name, message = every_name[name_order], every_message[name_order]
+    next_message = np.append(np.where(name[1:] == name[:-1], message[1:], batch_size), batch_size)[
+        : len(name)
+    ]
+    left_indices = np.flatnonzero((next_message > message + 1) & (message + 1 < batch_size))
+    return name[left_indices], message[left_indices] + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +228,14 @@ class ObservationRows:
     def blank(cls, class_code: Integers) -> ObservationRows:
         """Return unknown observations with known classes."""
         count = len(class_code)
-        nowhere = FootprintBatch.unknown(count)
-        return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
+        footprints = FootprintBatch.unknown(count)
+        return cls(
+            footprints,
+            np.full(count, np.nan),
+            np.zeros(count),
+            class_code,
+            np.zeros(count, np.bool_),
+        )
 
 
 def rows_from_detections(
@@ -241,16 +253,16 @@ def rows_from_detections(
         concave: treatment of polygons that are not convex.
         report: receiver of invalid footprints: index of the object, and the rest of the sentence.
     """
-    poses, solids, count = detections.poses, detections.solids, len(detections.name)
-    unknown = np.zeros(count, np.bool_)
+    poses, solids, object_count = detections.poses, detections.solids, len(detections.name)
+    is_unknown = np.zeros(object_count, np.bool_)
     covariance = detections.covariance
     if transforms is not None:
         poses, solids = poses.transform(transforms), _transform_solids(solids, transforms)
-        unknown = ~transforms.known
+        is_unknown = ~transforms.known
         if covariance is not None:
-            turn = transforms.rotation
-            covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
-    shapes = footprints_from_solids(solids, count)
+            rotation = transforms.rotation
+            covariance = rotation @ covariance @ np.swapaxes(rotation, 1, 2)
+    shapes = footprints_from_solids(solids, object_count)
     if detections.height is not None:
         heights = poses.position[:, 2, None] + detections.height
         shapes = replace(shapes, bottom=heights[:, 0], top=heights[:, 1])
@@ -258,31 +270,34 @@ def rows_from_detections(
     uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
     # each detection is checked as a separate sample, so that an invalid one does not affect others
-    indices = np.arange(count, dtype=np.int64)
-    readable, checked, faults = check_observations(
+    indices = np.arange(object_count, dtype=np.int64)
+    is_readable, footprints, faults = check_observations(
         Observations(
             times_ns=indices,
             sample=indices,
-            name=np.zeros(count, np.int64),
+            name=np.zeros(object_count, np.int64),
             names=("",),
             class_code=detections.class_code,
             classes=(None,) * (int(detections.class_code.max(initial=-1)) + 1),
             yaw=yaw,
             uncertainty=uncertainty,
             shapes=shapes,
-            invalid=unknown,
+            invalid=is_unknown,
             signals={},
         ),
         concave=concave,
     )
-    for index, what in faults.items():
-        report(index, what.removeprefix("object ''"))
-    rows = ObservationRows(checked, yaw, uncertainty, detections.class_code, readable)
-    if not faults and not unknown.any():
+    for index, fault in faults.items():
+        report(index, fault.removeprefix("object ''"))
+    rows = ObservationRows(footprints, yaw, uncertainty, detections.class_code, is_readable)
+    if not faults and not is_unknown.any():
         return rows
-    unknown[list(faults)] = True
-    both = concatenate_tables([rows, ObservationRows.blank(detections.class_code)])
-    return replace(select(both, np.where(unknown, count + indices, indices)), is_valid=readable & ~unknown)
+    is_unknown[list(faults)] = True
+    rows_and_blanks = concatenate_tables([rows, ObservationRows.blank(detections.class_code)])
+    return replace(
+        select(rows_and_blanks, np.where(is_unknown, object_count + indices, indices)),
+        is_valid=is_readable & ~is_unknown,
+    )
 
 
 def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
@@ -298,8 +313,8 @@ def _radius(covariance: Floats) -> Floats:
     """
     a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     # the larger eigenvalue of [[a, b], [b, d]]
-    largest = (a + d) / 2 + np.hypot((a - d) / 2, b)
-    return np.asarray(np.where((a < 0) | (d < 0), np.nan, np.sqrt(np.maximum(largest, 0.0))))
+    largest_variance = (a + d) / 2 + np.hypot((a - d) / 2, b)
+    return np.asarray(np.where((a < 0) | (d < 0), np.nan, np.sqrt(np.maximum(largest_variance, 0.0))))
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
@@ -347,12 +362,12 @@ class Tracker:
 
     def __post_init__(self) -> None:
         self._rows = ObservationRows.blank(np.empty(0, np.int64))
-        self._added: list[ObservationRows] = []
+        self._added_rows: list[ObservationRows] = []
         self._events = {name: Events.none() for name in self.readers}
-        self._reported: dict[str, Integers] = {}
+        self._reported_ns: dict[str, Integers] = {}
         self._placed_messages: dict[str, Booleans] = {}
         self._begun_ns: dict[str, int] = {}
-        self._unplaced_at: dict[str, list[Integers]] = defaultdict(list)
+        self._unplaced_ns: dict[str, list[Integers]] = defaultdict(list)
         # times of the first messages of lost topics after the loss; FOREVER_NS before such a message
         self._lost_until_ns: dict[str, int] = {}
         self._following: dict[int, _Following] = {}
@@ -365,8 +380,8 @@ class Tracker:
             for name, reader in self.readers.items()
             if reader.is_mapped
         }
-        self._unheard = {
-            name: _unheard(reader.planned) for name, reader in self.readers.items() if reader.is_mapped
+        self._unheard_spans = {
+            name: _unheard_span(reader.planned) for name, reader in self.readers.items() if reader.is_mapped
         }
 
     def advance(self, upto_ns: int) -> tuple[Integers, Integers]:
@@ -376,7 +391,7 @@ class Tracker:
             Times of messages of the sampled topic (of all topics without one), and of fallback topics.
         """
         self._advances += 1
-        sampled, others = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        sampled_ns, fallback_ns = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for name, reader in self.readers.items():
             if not reader.pending:
                 continue
@@ -399,32 +414,39 @@ class Tracker:
                     self._count_replacements(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 if columns.signals.size:
                     self.evidence[name].add_signals(columns.signals)
-                for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
-                    before_ns, before = self._signals.get((name, index), (times_ns[:0], values[:0]))
-                    series = np.concatenate([before_ns, times_ns]), np.concatenate([before, values])
-                    self._signals[name, index] = series
+                for signal_index, values in enumerate(columns.signals.T if len(times_ns) else ()):
+                    earlier_ns, earlier_values = self._signals.get(
+                        (name, signal_index), (times_ns[:0], values[:0])
+                    )
+                    series = np.concatenate([earlier_ns, times_ns]), np.concatenate([earlier_values, values])
+                    self._signals[name, signal_index] = series
             if reader.is_mapped and len(times_ns):
                 self._note_messages(reader.planned, times_ns, is_placed)
             if self.plan.sampled_topic in (None, name):
-                sampled.append(times_ns)
+                sampled_ns.append(times_ns)
             elif name in self.plan.fallback_topics:
-                others.append(times_ns)
+                fallback_ns.append(times_ns)
         self._store_additions()
-        return np.concatenate(sampled), np.concatenate(others)
+        return np.concatenate(sampled_ns), np.concatenate(fallback_ns)
 
     def _note_messages(self, planned: PlannedTopic, times_ns: Integers, is_placed: Booleans) -> None:
         """Note the times of a topic's messages, and whether transforms place their objects."""
         name = planned.name
         self._begun_ns.setdefault(name, int(times_ns[0]))
-        latest_ns, latest = self._reported.get(name, times_ns[:0])[-1:], self._placed_messages.get(name)
-        self._reported[name] = np.concatenate([latest_ns, times_ns])
+        latest_ns, latest_placed = (
+            self._reported_ns.get(name, times_ns[:0])[-1:],
+            self._placed_messages.get(name),
+        )
+        self._reported_ns[name] = np.concatenate([latest_ns, times_ns])
         self._placed_messages[name] = np.concatenate(
-            [is_placed[:0] if latest is None else latest[-1:], is_placed]
+            [is_placed[:0] if latest_placed is None else latest_placed[-1:], is_placed]
         )
         if planned.max_age_ns >= FOREVER_NS:
-            stays = planned.layout is not None and planned.layout.stays
-            why = "since the topic is latched" if planned.is_latched else "as markers do" if stays else ""
-            self.remarks.lasting[name] = why or "by its `max_age: forever`"
+            is_kept = planned.layout is not None and planned.layout.stays
+            reason = (
+                "since the topic is latched" if planned.is_latched else "as markers do" if is_kept else ""
+            )
+            self.remarks.lasting[name] = reason or "by its `max_age: forever`"
         if not planned.is_static:
             start_ns, end_ns = self.window_ns
             self.remarks.messages[name].add(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
@@ -437,42 +459,42 @@ class Tracker:
         """
         if not len(times_ns):
             return Trace.empty()
-        codes, rows, classes, reported_ns = self._states(times_ns, newest_ns)
+        name_codes, rows, classes, reported_ns = self._states(times_ns, newest_ns)
         self._store_additions()
-        names = [self.names.by_code[code] for code in codes.tolist()]
-        appears = (rows != ABSENT).any(axis=0).tolist()
-        order = sorted((i for i in range(len(names)) if appears[i]), key=names.__getitem__)
-        rows, classes, reported_ns = rows[:, order], classes[:, order], reported_ns[:, order]
-        stored, is_stale = self._rows, rows == STALE
+        names = [self.names.by_code[code] for code in name_codes.tolist()]
+        has_appeared = (rows != ABSENT).any(axis=0).tolist()
+        name_order = sorted((i for i in range(len(names)) if has_appeared[i]), key=names.__getitem__)
+        rows, classes, reported_ns = rows[:, name_order], classes[:, name_order], reported_ns[:, name_order]
+        stored_rows, is_stale = self._rows, rows == STALE
         # unknown rows are numbered downwards from -2
-        is_valid = np.append(stored.is_valid, False)[np.where(rows >= 0, rows, -1)]
-        numbered = np.where((rows == ABSENT) | is_valid, rows, -2 - rows)
+        is_valid = np.append(stored_rows.is_valid, False)[np.where(rows >= 0, rows, -1)]
+        row_numbers = np.where((rows == ABSENT) | is_valid, rows, -2 - rows)
         if is_stale.any():
             # a stale object keeps only its class: one blank row for each class, after the other rows
-            numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
-            blank = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
-            stored = concatenate_tables([stored, blank])
+            row_numbers = np.where(is_stale, -2 - (len(stored_rows) + classes), row_numbers)
+            blank_rows = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
+            stored_rows = concatenate_tables([stored_rows, blank_rows])
         # codes depend on the order of messages, on which a trace must not depend
         by_code = self.classes.by_code
         classes_of = class_order(by_code)
-        places = {name: place for place, name in enumerate(classes_of)}
-        rank = np.array([places[name] for name in by_code], np.int64)
-        used, numbered = renumber_rows(numbered)
-        stored = select(stored, used)
+        class_places = {name: place for place, name in enumerate(classes_of)}
+        class_rank = np.array([class_places[name] for name in by_code], np.int64)
+        used_rows, row_numbers = renumber_rows(row_numbers)
+        stored_rows = select(stored_rows, used_rows)
         signals, signals_reported_ns = self._signal_columns(times_ns, newest_ns)
         return Trace(
             times_ns=times_ns,
-            names=tuple(names[i] for i in order),
-            rows=numbered,
-            footprints=stored.shapes,
-            yaw=stored.yaw,
-            uncertainty=stored.uncertainty,
-            class_code=rank[stored.class_code] if len(rank) else stored.class_code,
+            names=tuple(names[i] for i in name_order),
+            rows=row_numbers,
+            footprints=stored_rows.shapes,
+            yaw=stored_rows.yaw,
+            uncertainty=stored_rows.uncertainty,
+            class_code=class_rank[stored_rows.class_code] if len(class_rank) else stored_rows.class_code,
             classes=classes_of,
             signals=signals,
             reported_ns=None if (reported_ns == times_ns[:, None])[rows >= 0].all() else reported_ns,
             signals_reported_ns=signals_reported_ns,
-            lasting=frozenset(names[i] for i in order if self._is_lasting(int(codes[i]))),
+            lasting=frozenset(names[i] for i in name_order if self._is_lasting(int(name_codes[i]))),
             spans=self._spans(times_ns) if self.plan.mapping.trims_ends else (),
         )
 
@@ -489,11 +511,11 @@ class Tracker:
             if not reader.is_mapped:
                 continue
             judged_ns = times_ns[self._is_judged(reader.planned, times_ns)]
-            heard_ns = self._reported.get(topic, times_ns[:0])
+            heard_ns = self._reported_ns.get(topic, times_ns[:0])
             first_ns, last_ns = judged_ns[[0, -1]].tolist() if len(judged_ns) else (None, None)
             spans.append(
                 replace(
-                    self._unheard[topic],
+                    self._unheard_spans[topic],
                     objects=self._objects_of.get(topic, frozenset()),
                     begun_ns=self._begun_ns.get(topic),
                     heard_ns=int(heard_ns[-1]) if len(heard_ns) else None,
@@ -501,20 +523,20 @@ class Tracker:
                     last_ns=last_ns,
                 )
             )
-        self._unplaced_at.clear()
+        self._unplaced_ns.clear()
         return tuple(spans)
 
     def _is_judged(self, planned: PlannedTopic, times_ns: Integers) -> Booleans:
         """Return for each sample whether a topic has begun, is not silent, and is placed by transforms."""
-        begun_ns, heard_ns = self._begun_ns.get(planned.name), self._reported.get(planned.name)
+        begun_ns, heard_ns = self._begun_ns.get(planned.name), self._reported_ns.get(planned.name)
         if begun_ns is None or heard_ns is None:
             return np.zeros(len(times_ns), np.bool_)
-        at = np.maximum(np.searchsorted(heard_ns, times_ns, "right") - 1, 0)
-        is_placed = self._placed_messages[planned.name][at]
-        is_old = times_ns - heard_ns[at] > planned.max_age_ns
+        message_indices = np.maximum(np.searchsorted(heard_ns, times_ns, "right") - 1, 0)
+        is_placed = self._placed_messages[planned.name][message_indices]
+        is_old = times_ns - heard_ns[message_indices] > planned.max_age_ns
         is_judged = (times_ns >= begun_ns) & is_placed & ~is_old
-        if unplaced := self._unplaced_at.get(planned.name):
-            is_judged &= ~np.isin(times_ns, np.concatenate(unplaced))
+        if unplaced_ns := self._unplaced_ns.get(planned.name):
+            is_judged &= ~np.isin(times_ns, np.concatenate(unplaced_ns))
         return np.asarray(is_judged)
 
     def forget(self, upto_ns: int) -> None:
@@ -522,34 +544,38 @@ class Tracker:
         if self._advances < _OLD_ADVANCES and len(self._rows) < _OLD_ROWS:
             return
         self._advances = 0
-        used = [np.empty(0, np.int64)]
+        used_rows = [np.empty(0, np.int64)]
         for name, events in self._events.items():
-            last = events.last()
-            last = select(last, np.flatnonzero(last.expires_ns > upto_ns))
-            self._events[name] = last
-            used.append(last.row)
-        last_rows = np.concatenate(used)
-        number = np.zeros(len(self._rows), np.int64)
-        number[last_rows] = np.arange(len(last_rows))
+            last_events = events.last()
+            last_events = select(last_events, np.flatnonzero(last_events.expires_ns > upto_ns))
+            self._events[name] = last_events
+            used_rows.append(last_events.row)
+        last_rows = np.concatenate(used_rows)
+        new_numbers = np.zeros(len(self._rows), np.int64)
+        new_numbers[last_rows] = np.arange(len(last_rows))
         self._rows = select(self._rows, last_rows)
-        for name, last in self._events.items():
-            self._events[name] = replace(last, row=number[last.row])
+        for name, last_events in self._events.items():
+            self._events[name] = replace(last_events, row=new_numbers[last_events.row])
         self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
         rows_left = set(last_rows.tolist())
-        self._following = {int(number[row]): e for row, e in self._following.items() if row in rows_left}
+        self._following = {
+            int(new_numbers[row]): following for row, following in self._following.items() if row in rows_left
+        }
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
         """Make the objects and signals of some topics unknown from a time on; objects continue to exist."""
         for topic in topics:
             self._begun_ns.pop(topic, None)
-            last = self._events[topic].last()
-            last = select(last, np.flatnonzero(last.expires_ns > time_ns))
-            rows = self._add(ObservationRows.blank(last.class_code))
-            at = np.full(len(rows), time_ns, np.int64)
-            forever = np.full(len(rows), FOREVER_NS, np.int64)
-            self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
+            last_events = self._events[topic].last()
+            last_events = select(last_events, np.flatnonzero(last_events.expires_ns > time_ns))
+            rows = self._add(ObservationRows.blank(last_events.class_code))
+            lost_ns = np.full(len(rows), time_ns, np.int64)
+            expires_ns = np.full(len(rows), FOREVER_NS, np.int64)
+            self._events[topic] = Events(
+                last_events.name, lost_ns, rows, expires_ns, last_events.class_code
+            ).after(last_events)
             # without reports, the loss counts neither as a pause nor as a silence of the topic
-            self._reported.pop(topic, None)
+            self._reported_ns.pop(topic, None)
         self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {
             key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
@@ -570,34 +596,36 @@ class Tracker:
             reader.name, times_ns, _superseded_messages(detections, times_ns, is_complete=is_complete)
         )
 
-        def report(index: int, what: str) -> None:
-            name = self.names.by_code[int(detections.name[index])]
-            log_ns = int(log_times_ns[detections.message[index]])
-            self.report(reader.name, log_ns, f"object {name!r}{what}")
+        def report(repeated_index: int, fault: str) -> None:
+            name = self.names.by_code[int(detections.name[repeated_index])]
+            log_ns = int(log_times_ns[detections.message[repeated_index]])
+            self.report(reader.name, log_ns, f"object {name!r}{fault}")
 
         transforms = self._transforms(reader, detections, times_ns, log_times_ns)
         rows = rows_from_detections(detections, transforms, self.plan.mapping.axes, self.concave, report)
         self.evidence[reader.name].add_objects(detections, rows.shapes, rows.yaw, rows.uncertainty, times_ns)
-        number = self._add(rows)
-        for place in self._follows(reader, detections).tolist():
-            frame = (detections.frames or ())[place]
-            self._following[int(number[place])] = _Following(frame, detections, place)
-        again = _repeated_names(detections) if is_complete else []
-        if again:
-            for index in again:
-                report(index, " is there twice in one message; name each object once")
+        row_numbers = self._add(rows)
+        for index in self._follows(reader, detections).tolist():
+            frame = (detections.frames or ())[index]
+            self._following[int(row_numbers[index])] = _Following(frame, detections, index)
+        repeated_indices = _repeated_names(detections) if is_complete else []
+        if repeated_indices:
+            for repeated_index in repeated_indices:
+                report(repeated_index, " is there twice in one message; name each object once")
             # unknown, because either of the two may be right
-            number[again] = self._add(ObservationRows.blank(detections.class_code[again]))
-        before = self._events[reader.name]
-        alive = before.last()
+            row_numbers[repeated_indices] = self._add(
+                ObservationRows.blank(detections.class_code[repeated_indices])
+            )
+        earlier_events = self._events[reader.name]
+        alive = earlier_events.last()
         events = events_from_messages(
             detections,
             times_ns,
-            number,
+            row_numbers,
             alive=alive,
             is_complete=is_complete,
         )
-        self._events[reader.name] = events.after(before)
+        self._events[reader.name] = events.after(earlier_events)
         is_placed = np.ones(len(times_ns), np.bool_)
         if transforms is not None:
             is_placed[detections.message[~transforms.known]] = False
@@ -610,58 +638,65 @@ class Tracker:
         for rows, reported_ns in zip(states.rows.T, states.reported_ns.T, strict=True):
             for row in np.unique(rows).tolist():
                 if row in self._following:
-                    where = np.flatnonzero(rows == row)
-                    rows[where] = self._rows_at(topic, self._following[row], times_ns[where])
+                    sample_indices = np.flatnonzero(rows == row)
+                    rows[sample_indices] = self._rows_at(
+                        topic, self._following[row], times_ns[sample_indices]
+                    )
                     # a transform counts as a report at the time of the sample
-                    reported_ns[where] = times_ns[where]
+                    reported_ns[sample_indices] = times_ns[sample_indices]
 
     def _rows_at(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
         """Return the rows of an object that moves with a frame, at some times."""
         mapping, (frame, detections, index) = self.plan.mapping, following
-        fixed, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
+        fixed_frame, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
         log_ns = times_ns if self.plan.by_log_time else None
         poses_of_frame = self.tree.between(
-            fixed, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
+            fixed_frame, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
         )
         self._count_missing(topic, frame, times_ns[~poses_of_frame.known])
-        self._unplaced_at[topic].append(times_ns[~poses_of_frame.known])
+        self._unplaced_ns[topic].append(times_ns[~poses_of_frame.known])
         # equal transforms in a row share one observation
-        changed = _changes(poses_of_frame)
-        repeated, moved = detections.repeat(index, len(changed)), poses_of_frame.select(changed)
+        changed_indices = _changes(poses_of_frame)
+        copies, changed_transforms = (
+            detections.repeat(index, len(changed_indices)),
+            poses_of_frame.select(changed_indices),
+        )
         # faults were reported on arrival
-        rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
-        return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
+        rows = rows_from_detections(
+            copies, changed_transforms, mapping.axes, self.concave, lambda index, what: None
+        )
+        return self._add(rows)[np.searchsorted(changed_indices, np.arange(len(times_ns)), "right") - 1]
 
     def _count_missing(self, topic: str, frame: str, times_ns: Integers) -> None:
         if len(times_ns):
             is_known = frame in self.tree.names
             self.remarks.missing.add((topic, frame, is_known), times_ns)
 
-    def _count_replacements(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
+    def _count_replacements(self, topic: str, times_ns: Integers, replaced_indices: Integers) -> None:
         """Count messages that are replaced, wholly or in part, by a later message of the same time."""
         start_ns, end_ns = self.window_ns
-        at = times_ns[replaced]
-        at = at[(at >= start_ns) & (at < end_ns)]
-        if len(at):
-            self.remarks.replaced.add(topic, at)
+        replaced_ns = times_ns[replaced_indices]
+        replaced_ns = replaced_ns[(replaced_ns >= start_ns) & (replaced_ns < end_ns)]
+        if len(replaced_ns):
+            self.remarks.replaced.add(topic, replaced_ns)
 
     def _store_additions(self) -> None:
-        if self._added:
-            self._rows = concatenate_tables([self._rows, *self._added])
-            self._added = []
+        if self._added_rows:
+            self._rows = concatenate_tables([self._rows, *self._added_rows])
+            self._added_rows = []
 
     def _add(self, rows: ObservationRows) -> Integers:
         """Add observations; return their row numbers."""
-        first = len(self._rows) + sum(map(len, self._added))
-        self._added.append(rows)
-        return np.arange(first, first + len(rows), dtype=np.int64)
+        first_row = len(self._rows) + sum(map(len, self._added_rows))
+        self._added_rows.append(rows)
+        return np.arange(first_row, first_row + len(rows), dtype=np.int64)
 
-    def _claim_names(self, topic: str, names: Integers) -> None:
-        codes = set(names.tolist())
-        new = {self.names.by_code[code] for code in codes.difference(self._topic_of_name)}
-        if new:
-            self._objects_of[topic] = self._objects_of.get(topic, frozenset()) | new
-        for code in codes:
+    def _claim_names(self, topic: str, name_codes: Integers) -> None:
+        distinct_codes = set(name_codes.tolist())
+        new_names = {self.names.by_code[code] for code in distinct_codes.difference(self._topic_of_name)}
+        if new_names:
+            self._objects_of[topic] = self._objects_of.get(topic, frozenset()) | new_names
+        for code in distinct_codes:
             owner = self._topic_of_name.setdefault(code, topic)
             if owner != topic:
                 raise UsageError(
@@ -673,41 +708,53 @@ class Tracker:
         self, reader: TopicReader, detections: Detections, times_ns: Integers, log_times_ns: Integers
     ) -> Transforms | None:
         """Return fixed_from_frame of each object; None if all objects are in the fixed frame."""
-        fixed = self.plan.mapping.fixed_frame
-        if detections.frames is None or fixed is None:
+        fixed_frame = self.plan.mapping.fixed_frame
+        if detections.frames is None or fixed_frame is None:
             return None
-        codes = Codes()
-        of_frame = np.array([codes[frame] for frame in detections.frames], np.int64)
-        count = len(of_frame)
-        result = Transforms.unknown(count)
+        frame_codes = Codes()
+        frame_of_object = np.array([frame_codes[frame] for frame in detections.frames], np.int64)
+        object_count = len(frame_of_object)
+        transforms = Transforms.unknown(object_count)
         clock_ns, log_ns = times_ns[detections.message], log_times_ns[detections.message]
-        stamp_ns = np.zeros(count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
+        stamp_ns = np.zeros(object_count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
         # a stamp of 0 means a stamp that was not set
-        stamped = stamp_ns != 0
-        follows = self._follows(reader, detections)
+        has_stamp = stamp_ns != 0
+        following_indices = self._follows(reader, detections)
         # objects that move with frames are placed later, at the times of samples
-        result.put(follows, Transforms.identity(len(follows)))
-        stays = np.ones(count, np.bool_)
-        stays[follows] = False
-        for frame, code in codes.items():
+        transforms.put(following_indices, Transforms.identity(len(following_indices)))
+        is_placed_now = np.ones(object_count, np.bool_)
+        is_placed_now[following_indices] = False
+        for frame, code in frame_codes.items():
             for by_stamp in (False, True):
-                objects = np.flatnonzero(stays & (of_frame == code) & (stamped == by_stamp))
-                if not len(objects):
-                    continue
-                at, log = (stamp_ns if by_stamp else clock_ns)[objects], log_ns[objects]
-                between = self.tree.between(
-                    fixed, frame, at, by_stamp=by_stamp, log_ns=log, longest_ns=reader.planned.between_ns
+                object_indices = np.flatnonzero(
+                    is_placed_now & (frame_of_object == code) & (has_stamp == by_stamp)
                 )
-                result.put(objects, between)
-                missing = clock_ns[objects[~between.known]]
-                if by_stamp and len(missing):
-                    first = int((~between.known).argmax())
-                    self.remarks.stamps.setdefault(reader.name, (int(at[first]), int(log[first])))
+                if not len(object_indices):
+                    continue
+                at_ns, object_log_ns = (
+                    (stamp_ns if by_stamp else clock_ns)[object_indices],
+                    log_ns[object_indices],
+                )
+                frame_transforms = self.tree.between(
+                    fixed_frame,
+                    frame,
+                    at_ns,
+                    by_stamp=by_stamp,
+                    log_ns=object_log_ns,
+                    longest_ns=reader.planned.between_ns,
+                )
+                transforms.put(object_indices, frame_transforms)
+                missing_ns = clock_ns[object_indices[~frame_transforms.known]]
+                if by_stamp and len(missing_ns):
+                    first_missing = int((~frame_transforms.known).argmax())
+                    self.remarks.stamps.setdefault(
+                        reader.name, (int(at_ns[first_missing]), int(object_log_ns[first_missing]))
+                    )
                 # only observations that may be valid in the window are counted
                 start_ns, end_ns = self.window_ns
-                is_near = (missing < end_ns) & (missing >= start_ns - reader.planned.max_age_ns)
-                self._count_missing(reader.name, frame, missing[is_near])
-        return result
+                is_near = (missing_ns < end_ns) & (missing_ns >= start_ns - reader.planned.max_age_ns)
+                self._count_missing(reader.name, frame, missing_ns[is_near])
+        return transforms
 
     def _follows(self, reader: TopicReader, detections: Detections) -> Integers:
         """Return the indices of objects that move with their frames."""
@@ -719,17 +766,17 @@ class Tracker:
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
         """Return for each time whether it lies in a pause of the topic that is longer than `max_gap`."""
-        most_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported.get(topic)
+        max_gap_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported_ns.get(topic)
         planned = self.readers[topic].planned
-        if most_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
+        if max_gap_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
             return np.zeros(len(times_ns), np.bool_)
-        first = self.readers[topic].pending.first_ns
+        waiting_ns = self.readers[topic].pending.first_ns
         # if no message follows, the pause lasts at least until the newest time
-        following = newest_ns if first is None else first
-        after = np.searchsorted(reported_ns, times_ns, "right")
-        before_ns = reported_ns[np.maximum(after - 1, 0)]
-        next_ns = np.append(reported_ns, following)[after]
-        return np.asarray((after > 0) & (next_ns - before_ns > most_ns) & (times_ns > before_ns))
+        following_ns = newest_ns if waiting_ns is None else waiting_ns
+        next_index = np.searchsorted(reported_ns, times_ns, "right")
+        before_ns = reported_ns[np.maximum(next_index - 1, 0)]
+        next_ns = np.append(reported_ns, following_ns)[next_index]
+        return np.asarray((next_index > 0) & (next_ns - before_ns > max_gap_ns) & (times_ns > before_ns))
 
     def _states(self, times_ns: Integers, newest_ns: int) -> States:
         """Return the states of the objects of all topics at some times."""
@@ -739,44 +786,50 @@ class Tracker:
             rows, in_gap = state.rows, self._in_gap(topic, times_ns, newest_ns)
             rows[in_gap[:, None] & (rows >= 0)] = STALE
             is_stale = (rows == STALE) & (times_ns >= self._lost_until_ns.get(topic, 0))[:, None]
-            for column in np.flatnonzero(is_stale.any(axis=0)).tolist():
-                name = self.names.by_code[int(state.names[column])]
-                self.remarks.count_stale(topic, name, times_ns, is_stale[:, column], in_gap)
+            for object_index in np.flatnonzero(is_stale.any(axis=0)).tolist():
+                name = self.names.by_code[int(state.names[object_index])]
+                self.remarks.count_stale(topic, name, times_ns, is_stale[:, object_index], in_gap)
             self._place_following(topic, times_ns, state)
             states.append(state)
         names, *columns = zip(*states, strict=True)
-        return States(np.concatenate(names), *(np.concatenate(column, axis=1) for column in columns))
+        return States(
+            np.concatenate(names), *(np.concatenate(object_index, axis=1) for object_index in columns)
+        )
 
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int
     ) -> tuple[dict[str, Floats], dict[str, Integers]]:
         """Return the signals, and report times of signals that were reported before a sample."""
         columns: dict[str, Floats] = {}
-        reported: dict[str, Integers] = {}
-        unknown: list[tuple[str, str, Booleans, Booleans]] = []
+        report_times_ns: dict[str, Integers] = {}
+        stale_signals: list[tuple[str, str, Booleans, Booleans]] = []
         for (topic, index), (reported_ns, values) in self._signals.items():
             planned = self.readers[topic].planned
             if planned.mapping is None:
                 continue
-            at = np.searchsorted(reported_ns, times_ns, "right") - 1
-            is_old = times_ns - reported_ns[at] > planned.max_age_ns
+            report_indices = np.searchsorted(reported_ns, times_ns, "right") - 1
+            is_old = times_ns - reported_ns[report_indices] > planned.max_age_ns
             in_gap = self._in_gap(topic, times_ns, newest_ns)
-            column = np.where((at < 0) | is_old | in_gap, np.nan, values[at])
+            signal_values = np.where((report_indices < 0) | is_old | in_gap, np.nan, values[report_indices])
             name = planned.mapping.signals[index].name
-            is_stale = (at >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
-            unknown.append((topic, name, is_stale, in_gap))
+            is_stale = (
+                (report_indices >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
+            )
+            stale_signals.append((topic, name, is_stale, in_gap))
             # if several topics report one signal, the first with a value is used
-            first = columns.get(name, np.full(len(times_ns), np.nan))
-            reported[name] = np.where(np.isnan(first), reported_ns[at], reported.get(name, times_ns))
-            columns[name] = np.where(np.isnan(first), column, first)
-        for topic, name, is_stale, in_gap in unknown:
+            earlier_values = columns.get(name, np.full(len(times_ns), np.nan))
+            report_times_ns[name] = np.where(
+                np.isnan(earlier_values), reported_ns[report_indices], report_times_ns.get(name, times_ns)
+            )
+            columns[name] = np.where(np.isnan(earlier_values), signal_values, earlier_values)
+        for topic, name, is_stale, in_gap in stale_signals:
             self.remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
-        earlier = {
+        earlier_reports = {
             name: times
-            for name, times in reported.items()
+            for name, times in report_times_ns.items()
             if (times != times_ns)[~np.isnan(columns[name])].any()
         }
-        return columns, earlier
+        return columns, earlier_reports
 
 
 class _Counts(dict[Any, tuple[int, int]]):
@@ -824,14 +877,17 @@ class Remarks:
 
     def add_pauses(self) -> None:
         """Add remarks on pauses of topics, unless all of a topic's pauses are also pauses of the samples."""
-        pauses = self.samples.longest_first()
+        sample_pauses = self.samples.longest_first()
         for topic, messages in sorted(self.messages.items()):
             if topic in self.lasting:
                 continue
             topic_pauses = messages.longest_first()
             is_common = all(
-                any(at < start + length and start < at + long for at, long in pauses)
-                for start, length in topic_pauses
+                any(
+                    sample_start_ns < start_ns + length_ns and start_ns < sample_start_ns + sample_length_ns
+                    for sample_start_ns, sample_length_ns in sample_pauses
+                )
+                for start_ns, length_ns in topic_pauses
             )
             remark = messages.remark(f"{topic}: messages", self._mapping.max_gap_ns)
             if not is_common and remark is not None:
@@ -839,19 +895,22 @@ class Remarks:
 
     def add_silences(self) -> None:
         """Add remarks on topics that stopped after regular messages, and whose last message stays valid."""
-        for topic, why in sorted(self.lasting.items()):
+        for topic, reason in sorted(self.lasting.items()):
             messages = self.messages[topic]
             last_ns, end_ns, usual_ns = messages.last_ns, self.samples.last_ns, messages.usual_ns
             if last_ns is None or end_ns is None or not messages.is_regular:
                 continue
             if end_ns - last_ns > LONG_PAUSE * usual_ns:
-                stops = Sentence(f"{topic}: its messages stop at ", Instant(last_ns, 0))
-                usual = (
+                beginning = Sentence(f"{topic}: its messages stop at ", Instant(last_ns, 0))
+                usual_text = (
                     f", where one usually comes every {usual_ns / 1e9:.3g} s; the last one stays valid until "
                 )
                 self.add(
                     Sentence(
-                        stops, usual, Instant(end_ns, 0), f", {why}; a shorter `max_age` makes it unknown"
+                        beginning,
+                        usual_text,
+                        Instant(end_ns, 0),
+                        f", {reason}; a shorter `max_age` makes it unknown",
                     )
                 )
 
@@ -862,55 +921,60 @@ class Remarks:
         """Return all remarks and remove them."""
         texts = [*self._texts, *self._missing_texts(), *self._stale_texts()]
         for topic, count in sorted(self.skipped.items()):
-            were = "object was" if count == 1 else "objects were"
-            texts.append(f"{topic}: {count} {were} left out, without a solid: lines, arrows or texts")
+            subject = "object was" if count == 1 else "objects were"
+            texts.append(f"{topic}: {count} {subject} left out, without a solid: lines, arrows or texts")
         for topic, (count, first_ns) in sorted(self.replaced.items()):
-            was = "message was" if count == 1 else "messages were"
-            first = f"{topic}: {count} {was} left out, the first at "
+            message_subject = "message was" if count == 1 else "messages were"
+            beginning = f"{topic}: {count} {message_subject} left out, the first at "
             texts.append(
-                Sentence(first, Instant(first_ns, 0), ": of those with the same time the last counts")
+                Sentence(beginning, Instant(first_ns, 0), ": of those with the same time the last counts")
             )
-        for noted in (self._texts, self.missing, self.stale, self.skipped, self.replaced):
-            noted.clear()
+        for collection in (self._texts, self.missing, self.stale, self.skipped, self.replaced):
+            collection.clear()
         return tuple(Sentence(f"{self._name}: ", text) for text in texts)
 
     def _missing_texts(self) -> Iterator[Sentence]:
-        fixed = self._mapping.fixed_frame
+        fixed_frame = self._mapping.fixed_frame
         for (topic, frame, is_known), (count, first_ns) in sorted(self.missing.items()):
-            reason = f"no transform from {frame!r} to {fixed!r} at that time"
+            reason = f"no transform from {frame!r} to {fixed_frame!r} at that time"
             if not frame:
                 reason = "its messages name no frame; give one with `frame`"
             elif not is_known:
-                reason = f"no transform to {fixed!r} names the frame {frame!r}"
+                reason = f"no transform to {fixed_frame!r} names the frame {frame!r}"
             elif topic in self.stamps:
                 reason += _doubt_of_stamp(*self.stamps[topic])
-            are = "observation is" if count == 1 else "observations are"
+            subject = "observation is" if count == 1 else "observations are"
             yield Sentence(
-                f"{topic}: {count} {are} unknown, the first at ", Instant(first_ns, 0), f": {reason}"
+                f"{topic}: {count} {subject} unknown, the first at ", Instant(first_ns, 0), f": {reason}"
             )
 
     def _stale_texts(self) -> Iterator[Sentence]:
         by_topic: dict[tuple[str, bool], list[tuple[str, int, int]]] = {}
         for (topic, is_gap, name), (count, first_ns) in sorted(self.stale.items()):
             by_topic.setdefault((topic, is_gap), []).append((name, count, first_ns))
-        for (topic, is_gap), stale in by_topic.items():
+        for (topic, is_gap), stale_counts in by_topic.items():
             reason = "the topic was silent for longer than `max_gap`"
             if not is_gap:
                 # the reason does not call the topic silent, because other objects may have been reported
                 reason = "no report came for longer than max_age; `max_age: forever` keeps the last one"
-            names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])
-            more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
-            are = "is" if len(stale) == 1 else "are"
-            most = max(count for _, count, _ in stale)
-            first_ns = min(first for _, _, first in stale)
+            names = ", ".join(name for name, _, _ in stale_counts[:_MOST_NAMES])
+            more_text = (
+                f" and {len(stale_counts) - _MOST_NAMES} more" if len(stale_counts) > _MOST_NAMES else ""
+            )
+            verb = "is" if len(stale_counts) == 1 else "are"
+            most_samples = max(count for _, count, _ in stale_counts)
+            first_ns = min(first for _, _, first in stale_counts)
             yield Sentence(
-                f"{topic}: {names}{more} {are} unknown in up to {plural(most, 'sample')}, the first at ",
+                (
+                    f"{topic}: {names}{more_text} {verb} unknown in up to {plural(most_samples, 'sample')},"
+                    " the first at "
+                ),
                 Instant(first_ns, 0),
                 f": {reason}",
             )
 
 
-def _unheard(planned: PlannedTopic) -> TopicSpan:
+def _unheard_span(planned: PlannedTopic) -> TopicSpan:
     """Return the span of a topic before its first message."""
     entry, layout = planned.mapping, planned.layout
     return TopicSpan(
@@ -942,8 +1006,8 @@ def _superseded_messages(detections: Detections, times_ns: Integers, *, is_compl
     if is_complete or not has_successor.any():
         return np.flatnonzero(has_successor)
     message = detections.message
-    order = np.lexsort((message, detections.name, times_ns[message]))
-    name, time_ns, message = detections.name[order], times_ns[message[order]], message[order]
+    name_order = np.lexsort((message, detections.name, times_ns[message]))
+    name, time_ns, message = detections.name[name_order], times_ns[message[name_order]], message[name_order]
     has_later_message = (
         (name[1:] == name[:-1]) & (time_ns[1:] == time_ns[:-1]) & (message[1:] != message[:-1])
     )
@@ -953,18 +1017,20 @@ def _superseded_messages(detections: Detections, times_ns: Integers, *, is_compl
 def _changes(transforms: Transforms) -> Integers:
     """Return the index of the first transform, and of each transform that differs from its predecessor."""
     rotation, translation, is_known = transforms
-    changed = np.ones(len(is_known), np.bool_)
-    changed[1:] = (
+    is_changed = np.ones(len(is_known), np.bool_)
+    is_changed[1:] = (
         (rotation[1:] != rotation[:-1]).any(axis=(1, 2))
         | (translation[1:] != translation[:-1]).any(axis=1)
         | (is_known[1:] != is_known[:-1])
     )
-    return np.flatnonzero(changed)
+    return np.flatnonzero(is_changed)
 
 
 def _repeated_names(detections: Detections) -> list[int]:
     """Return the indices of detections that repeat a name within a message."""
-    order = np.lexsort((detections.name, detections.message))
-    message, name = detections.message[order], detections.name[order]
-    again: list[int] = order[1:][(message[1:] == message[:-1]) & (name[1:] == name[:-1])].tolist()
-    return again
+    name_order = np.lexsort((detections.name, detections.message))
+    message, name = detections.message[name_order], detections.name[name_order]
+    repeated_indices: list[int] = name_order[1:][
+        (message[1:] == message[:-1]) & (name[1:] == name[:-1])
+    ].tolist()
+    return repeated_indices

@@ -105,10 +105,10 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     """
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
-    dot = np.einsum("ij,ij->i", first, second)
+    dot_product = np.einsum("ij,ij->i", first, second)
     # q and -q are the same rotation; the shorter arc ends at the nearer one
-    second = np.where(dot[:, None] < 0, -second, second)
-    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
+    second = np.where(dot_product[:, None] < 0, -second, second)
+    angle = np.arccos(np.clip(np.abs(dot_product), 0.0, 1.0))
     sine = np.sin(angle)
     # linear interpolation for nearly equal quaternions, for which the quotient below tends to 0 / 0
     is_close = sine < _LEAST_NORM
@@ -162,8 +162,8 @@ class Transforms(NamedTuple):
 
     def put(self, places: Integers, others: Transforms) -> None:
         """Set the transforms at some indices in place, to collect a result."""
-        for whole, part in zip(self, others, strict=True):
-            whole[places] = part
+        for column, other_column in zip(self, others, strict=True):
+            column[places] = other_column
 
     def select(self, places: Integers) -> Transforms:
         return Transforms(self.rotation[places], self.translation[places], self.known[places])
@@ -278,8 +278,8 @@ class FrameTree:
         """
         entry = _Entry(stamp_ns, clock_ns, parent, pose, log_ns)
         if (reason := _reason_to_ignore(child, entry)) is not None:
-            count, first, first_child = self._ignored.get(reason, (0, entry, child))
-            self._ignored[reason] = count + 1, first, first_child
+            ignored_count, first_entry, first_child = self._ignored.get(reason, (0, entry, child))
+            self._ignored[reason] = ignored_count + 1, first_entry, first_child
             return
         frame = self._children.setdefault(child, _Child())
         if is_static:
@@ -288,11 +288,11 @@ class FrameTree:
             last_ns = frame.static[-1].stamp_ns if frame.static else -1
             if stamp_ns == 0 or stamp_ns < last_ns:
                 entry = entry._replace(stamp_ns=max(clock_ns, last_ns))
-        entries, others = (frame.static, frame.moving)[:: 1 if is_static else -1]
+        entries, other_entries = (frame.static, frame.moving)[:: 1 if is_static else -1]
         if entries and (is_static or entries[-1].parent != parent):
             self._contradict(child, entries[-1], entry)
-        if others and not entries:
-            self._contradict(child, others[-1], entry, is_mixed=True)
+        if other_entries and not entries:
+            self._contradict(child, other_entries[-1], entry, is_mixed=True)
         if not is_static:
             self.newest_stamp_ns = stamp_ns
             if frame.moving:
@@ -306,15 +306,15 @@ class FrameTree:
         If the next transform steps forward again, there was no restart: two programs with different clocks
         send the frame in turn.
         """
-        old, before, child.restart = child.moving[-1], child.restart, None
-        if before in self._restarts and new.stamp_ns >= before.old.stamp_ns - DISORDER_NS:
-            self._restarts.remove(before)
+        old, earlier_restart, child.restart = child.moving[-1], child.restart, None
+        if earlier_restart in self._restarts and new.stamp_ns >= earlier_restart.old.stamp_ns - DISORDER_NS:
+            self._restarts.remove(earlier_restart)
             # cached series depend on the runs
             self._series.clear()
         if new.stamp_ns >= old.stamp_ns - DISORDER_NS or new.log_ns < old.log_ns:
             if new.stamp_ns < old.stamp_ns - LEAST_STEP_NS:
-                count, *first = self._steps.get(name, (0, old, new))
-                self._steps[name] = count + 1, first[0], first[1]
+                step_count, *first_step = self._steps.get(name, (0, old, new))
+                self._steps[name] = step_count + 1, first_step[0], first_step[1]
             return
         restart = child.restart = _Restart(old, new)
         if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
@@ -326,11 +326,11 @@ class FrameTree:
     def forget_before(self, clock_ns: int) -> None:
         """Drop the moving transforms of messages before a time, except the last one of each child."""
         for name, child in self._children.items():
-            keep = [entry for entry in child.moving if entry.clock_ns >= clock_ns]
-            if len(keep) < len(child.moving):
+            newer_entries = [entry for entry in child.moving if entry.clock_ns >= clock_ns]
+            if len(newer_entries) < len(child.moving):
                 self._look_for_jumps(name, [entry for entry in child.moving if entry.clock_ns < clock_ns])
                 # the last one is kept for its parent, and as the start of the next interpolation
-                child.moving = keep or child.moving[-1:]
+                child.moving = newer_entries or child.moving[-1:]
         self._series.clear()
 
     def forget_moving(self) -> None:
@@ -370,114 +370,123 @@ class FrameTree:
         count = len(times_ns)
         if target == source or not count:
             return Transforms.identity(count)
-        ask = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
-        result = Transforms.unknown(count)
-        for run in self._by_run(ask):
-            for part in self._by_parents(run):
-                result.put(part.places, self._in_one_tree(target, source, part))
-        return result
+        question = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
+        transforms = Transforms.unknown(count)
+        for run in self._by_run(question):
+            for part_question in self._by_parents(run):
+                transforms.put(part_question.places, self._in_one_tree(target, source, part_question))
+        return transforms
 
-    def _by_run(self, ask: _Question) -> list[_Question]:
+    def _by_run(self, question: _Question) -> list[_Question]:
         """Divide a question by run, and into stamps near to and far from the times of recording."""
-        times_ns, log_ns = ask.times_ns, ask.log_ns
+        times_ns, log_ns = question.times_ns, question.log_ns
         if log_ns is None:
-            return [ask]
+            return [question]
         runs = np.searchsorted([restart.new.log_ns for restart in self._restarts], log_ns, "right")
-        if ask.by_stamp:
+        if question.by_stamp:
             for number, (old, new) in enumerate(self._restarts, 1):
                 # an observation may come before the first transform of its run
                 is_early = np.abs(times_ns - new.stamp_ns) < np.abs(times_ns - old.stamp_ns)
                 runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = number
         # even for stamps near to the times of recording, odd for stamps far from them
-        kinds = 2 * runs + (ask.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
+        run_kinds = 2 * runs + (question.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
         return [
-            ask.part(kinds == kind)._replace(run=kind // 2, is_apart=kind % 2 > 0)
-            for kind in np.unique(kinds).tolist()
+            question.part(run_kinds == run_kind)._replace(run=run_kind // 2, is_apart=run_kind % 2 > 0)
+            for run_kind in np.unique(run_kinds).tolist()
         ]
 
-    def _by_parents(self, ask: _Question) -> list[_Question]:
+    def _by_parents(self, question: _Question) -> list[_Question]:
         """Divide a question into parts in which each frame has a single parent."""
-        keys = [np.zeros(len(ask.times_ns), np.int64)]
+        parent_columns = [np.zeros(len(question.times_ns), np.int64)]
         for name in self._children:
-            series, times_ns = self._series_of(name, ask)
+            series, times_ns = self._series_of(name, question)
             if len(series.parents) > 1:
-                keys.append(series.parent[series.at(times_ns)])
-        if len(keys) == 1:
-            return [ask]
-        _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
-        group = group.reshape(-1)
-        return [ask.part(group == number) for number in range(int(group.max()) + 1)]
+                parent_columns.append(series.parent[series.at(times_ns)])
+        if len(parent_columns) == 1:
+            return [question]
+        _, group_of_time = np.unique(np.stack(parent_columns), axis=1, return_inverse=True)
+        group_of_time = group_of_time.reshape(-1)
+        return [question.part(group_of_time == group) for group in range(int(group_of_time.max()) + 1)]
 
-    def _in_one_tree(self, target: str, source: str, ask: _Question) -> Transforms:
-        up = self._ancestors(source, ask)
-        down = self._ancestors(target, ask)
-        common = next((frame for frame in up if frame in down), None)
-        if common is None:
-            return Transforms.unknown(len(ask.times_ns))
-        common_from_source = self._climb(up[: up.index(common)], ask)
-        common_from_target = self._climb(down[: down.index(common)], ask)
+    def _in_one_tree(self, target: str, source: str, question: _Question) -> Transforms:
+        source_ancestors = self._ancestors(source, question)
+        target_ancestors = self._ancestors(target, question)
+        common_frame = next((frame for frame in source_ancestors if frame in target_ancestors), None)
+        if common_frame is None:
+            return Transforms.unknown(len(question.times_ns))
+        common_from_source = self._climb(source_ancestors[: source_ancestors.index(common_frame)], question)
+        common_from_target = self._climb(target_ancestors[: target_ancestors.index(common_frame)], question)
         return common_from_target.inverse().after(common_from_source)
 
-    def _ancestors(self, frame: str, ask: _Question) -> list[str]:
+    def _ancestors(self, frame: str, question: _Question) -> list[str]:
         """Return the chain of a frame, its parent and so on up to the root, at the first time."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
-            series, times_ns = self._series_of(chain[-1], ask)
+            series, times_ns = self._series_of(chain[-1], question)
             if not series.parents:
                 break
             parent = series.parents[int(series.parent[series.at(times_ns[:1])][0])]
             if parent in chain:
                 loop = chain[chain.index(parent) :]
-                first = loop.index(min(loop))
-                self._loops.setdefault((*loop[first:], *loop[: first + 1]))
+                first_index = loop.index(min(loop))
+                self._loops.setdefault((*loop[first_index:], *loop[: first_index + 1]))
                 break
             chain.append(parent)
         return chain
 
-    def _climb(self, frames: list[str], ask: _Question) -> Transforms:
+    def _climb(self, frames: list[str], question: _Question) -> Transforms:
         """Return the transform from the first frame of a chain to the parent of the last frame."""
-        total = Transforms.identity(len(ask.times_ns))
+        transforms = Transforms.identity(len(question.times_ns))
         for frame in frames:
-            total = self._step(frame, ask).after(total)
-        return total
+            transforms = self._step(frame, question).after(transforms)
+        return transforms
 
-    def _step(self, frame: str, ask: _Question) -> Transforms:
+    def _step(self, frame: str, question: _Question) -> Transforms:
         """Return parent_from_child at each time."""
-        series, times_ns = self._series_of(frame, ask)
-        last, newest = len(series.times_ns) - 1, series.at(times_ns)
-        is_still = newest < series.still
+        series, times_ns = self._series_of(frame, question)
+        last_index, newest_indices = len(series.times_ns) - 1, series.at(times_ns)
+        is_still = newest_indices < series.still
         if is_still.all():
-            poses = series.poses[newest]
+            poses = series.poses[newest_indices]
             return _transforms(poses[:, :3], poses[:, 3:], is_still)
-        after = np.searchsorted(series.times_ns, times_ns, "left")
-        inside = after <= last
-        after = np.minimum(after, last)
+        next_indices = np.searchsorted(series.times_ns, times_ns, "left")
+        is_inside = next_indices <= last_index
+        next_indices = np.minimum(next_indices, last_index)
         # at the time of a transform nothing is interpolated
-        before = np.where(inside & (series.times_ns[after] == times_ns), after, after - inside)
-        is_known = (before >= 0) | is_still
-        before, after = np.where(is_still, newest, np.maximum(before, 0)), np.where(is_still, newest, after)
-        start, end = series.times_ns[before], series.times_ns[after]
-        is_hole = end - start > ask.longest_ns
-        if (is_known & inside & is_hole).any():
-            longest = int((end - start)[is_known & inside].max())
-            at_ns = int(series.clock_ns[before][is_known & inside & is_hole][0])
-            if longest > self._holes.get(frame, (0, 0))[0]:
-                self._holes[frame] = longest, at_ns
-        is_between = inside & ~is_hole
-        is_held = ask.holds & ~is_between & (times_ns - start <= ask.longest_ns)
+        previous_indices = np.where(
+            is_inside & (series.times_ns[next_indices] == times_ns), next_indices, next_indices - is_inside
+        )
+        is_known = (previous_indices >= 0) | is_still
+        previous_indices, next_indices = (
+            np.where(is_still, newest_indices, np.maximum(previous_indices, 0)),
+            np.where(is_still, newest_indices, next_indices),
+        )
+        start_ns, end_ns = series.times_ns[previous_indices], series.times_ns[next_indices]
+        is_hole = end_ns - start_ns > question.longest_ns
+        if (is_known & is_inside & is_hole).any():
+            longest_ns = int((end_ns - start_ns)[is_known & is_inside].max())
+            hole_ns = int(series.clock_ns[previous_indices][is_known & is_inside & is_hole][0])
+            if longest_ns > self._holes.get(frame, (0, 0))[0]:
+                self._holes[frame] = longest_ns, hole_ns
+        is_between = is_inside & ~is_hole
+        is_held = question.holds & ~is_between & (times_ns - start_ns <= question.longest_ns)
         is_known &= is_between | is_held
-        span = np.where(end > start, end - start, 1)
+        span_ns = np.where(end_ns > start_ns, end_ns - start_ns, 1)
         # no interpolation between poses in different parents: the earlier pose holds
-        moves = is_between & (end > start) & (series.parent[before] == series.parent[after])
-        share = np.where(moves, (times_ns - start) / span, 0.0)
-        first, second = series.poses[before], series.poses[after]
-        translation = first[:, :3] + share[:, None] * (second[:, :3] - first[:, :3])
-        quaternions = slerp(first[:, 3:], second[:, 3:], share)
+        is_moving = (
+            is_between
+            & (end_ns > start_ns)
+            & (series.parent[previous_indices] == series.parent[next_indices])
+        )
+        share = np.where(is_moving, (times_ns - start_ns) / span_ns, 0.0)
+        start_poses, end_poses = series.poses[previous_indices], series.poses[next_indices]
+        translation = start_poses[:, :3] + share[:, None] * (end_poses[:, :3] - start_poses[:, :3])
+        quaternions = slerp(start_poses[:, 3:], end_poses[:, 3:], share)
         return _transforms(
-            translation, np.where((share == 0.0)[:, None], first[:, 3:], quaternions), is_known
+            translation, np.where((share == 0.0)[:, None], start_poses[:, 3:], quaternions), is_known
         )
 
-    def _series_of(self, frame: str, ask: _Question) -> tuple[_Series, Integers]:
+    def _series_of(self, frame: str, question: _Question) -> tuple[_Series, Integers]:
         """Return the ordered transforms of a frame for a question, and the times to look up in them.
 
         Static transforms of all runs are used, but only those before the first moving transform of the frame.
@@ -485,11 +494,15 @@ class FrameTree:
         of recording.
         """
         child = self._children.get(frame, _Child())
-        clock, run, times_ns = "stamp_ns" if ask.by_stamp else "clock_ns", ask.run, ask.times_ns
+        clock, run, times_ns = (
+            "stamp_ns" if question.by_stamp else "clock_ns",
+            question.run,
+            question.times_ns,
+        )
         if not child.moving:
             run = None
-            if ask.is_apart and ask.log_ns is not None:
-                clock, times_ns = "log_ns", ask.log_ns
+            if question.is_apart and question.log_ns is not None:
+                clock, times_ns = "log_ns", question.log_ns
         series_of_frame = self._series.setdefault(frame, {})
         if (clock, run) not in series_of_frame:
             moving = [entry for entry in child.moving if run is None or self._run_of(entry) == run]
@@ -506,16 +519,16 @@ class FrameTree:
         key = child, is_mixed, old.parent == new.parent
         if key in self._contradictions:
             return
-        what, counting = f"frame {child!r} has two parents,", "newest counts"
-        places = " and ".join(f"{entry.parent!r} at {_place(entry)}" for entry in (old, new))
+        subject, rule = f"frame {child!r} has two parents,", "newest counts"
+        parent_places = " and ".join(f"{entry.parent!r} at {_place(entry)}" for entry in (old, new))
         if is_mixed:
-            what, counting = f"frame {child!r} is sent static and moving, in", "moving ones count"
+            subject, rule = f"frame {child!r} is sent static and moving, in", "moving ones count"
         elif old.parent == new.parent:
-            what = f"the static transform of {child!r} in {new.parent!r} changes"
-            places = f"from {_place(old)} to {_place(new)}"
-        since = Instant(new.clock_ns, 0)
+            subject = f"the static transform of {child!r} in {new.parent!r} changes"
+            parent_places = f"from {_place(old)} to {_place(new)}"
+        second_since = Instant(new.clock_ns, 0)
         self._contradictions[key] = Sentence(
-            f"{what} {places}, the second from ", since, f" on: the {counting}"
+            f"{subject} {parent_places}, the second from ", second_since, f" on: the {rule}"
         )
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
@@ -534,64 +547,76 @@ class FrameTree:
         def apart(first: Floats, second: Floats) -> Floats:
             # the absolute value, because q and -q are the same rotation
             cosine = np.abs(np.einsum("ij,ij->i", first[:, 3:], second[:, 3:]))
-            turn = 2 * np.arccos(np.minimum(cosine, 1.0))
-            return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
+            turns = 2 * np.arccos(np.minimum(cosine, 1.0))
+            return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turns)
 
         # two poses of one publisher may have poses of other publishers between them
         lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
-        aside = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
-        usual = min(float(np.quantile(distances, 0.3)) for distances in aside.values())
+        distances_by_lag = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
+        usual_distance = min(float(np.quantile(distances, 0.3)) for distances in distances_by_lag.values())
 
-        def jumps_of(times: int) -> Integers:
-            jumps = np.zeros(len(poses), np.bool_)
+        def jumps_of(factor: int) -> Integers:
+            is_jump = np.zeros(len(poses), np.bool_)
             for lag in lags:
-                over = aside[lag]
-                between = [aside[by][: len(over)] for by in range(1, lag)]
-                between += [aside[by][lag - by :][: len(over)] for by in range(1, lag)]
-                least = np.min(between, axis=0)
-                jumps[: len(over)] |= (least > max(_LEAST_JUMP, times * usual)) & (over * times < least)
-            return np.flatnonzero(jumps)
+                returns = distances_by_lag[lag]
+                distances_between = [distances_by_lag[step][: len(returns)] for step in range(1, lag)]
+                distances_between += [
+                    distances_by_lag[step][lag - step :][: len(returns)] for step in range(1, lag)
+                ]
+                least_distances = np.min(distances_between, axis=0)
+                is_jump[: len(returns)] |= (least_distances > max(_LEAST_JUMP, factor * usual_distance)) & (
+                    returns * factor < least_distances
+                )
+            return np.flatnonzero(is_jump)
 
         # noise causes few jumps, and hardly any of ten times the usual motion
         jumps = jumps_of(5)
         jumps = jumps if len(jumps) > 0.05 * len(poses) else jumps_of(10)
         if len(jumps):
-            least = aside[1][jumps]
-            at = int(jumps[0])
-            count, most, *example = self._jumps.get(name, (0, 0.0, entries[at], entries[at + 1]))
-            most = max(most, float(least.max()))
-            self._jumps[name] = count + len(jumps), most, example[0], example[1]
+            least_distances = distances_by_lag[1][jumps]
+            first_jump = int(jumps[0])
+            jump_count, greatest_jump, *example = self._jumps.get(
+                name, (0, 0.0, entries[first_jump], entries[first_jump + 1])
+            )
+            greatest_jump = max(greatest_jump, float(least_distances.max()))
+            self._jumps[name] = jump_count + len(jumps), greatest_jump, example[0], example[1]
 
     def remarks(self) -> list[str]:
         """Return remarks on transforms that were ignored, contradict each other, jump or pause."""
         for name, child in self._children.items():
             self._look_for_jumps(name, child.moving)
         texts: list[str] = []
-        for reason, (count, first, owner) in self._ignored.items():
-            were = "transform was" if count == 1 else "transforms were"
-            of = f", the first of {owner!r} in {first.parent!r} at "
-            texts.append(Sentence(f"{count} {were} left out{of}", Instant(first.clock_ns, 0), f": {reason}"))
+        for reason, (entry_count, first_entry, owner) in self._ignored.items():
+            subject = "transform was" if entry_count == 1 else "transforms were"
+            clause = f", the first of {owner!r} in {first_entry.parent!r} at "
+            texts.append(
+                Sentence(
+                    f"{entry_count} {subject} left out{clause}",
+                    Instant(first_entry.clock_ns, 0),
+                    f": {reason}",
+                )
+            )
         texts += self._contradictions.values()
-        doubtful = [child.restart for child in self._children.values()]
-        if restarts := [restart for restart in self._restarts if restart not in doubtful]:
+        child_restarts = [child.restart for child in self._children.values()]
+        if restarts := [restart for restart in self._restarts if restart not in child_restarts]:
             rule = "earlier ones do not count from there on; cut the log there to evaluate each run by itself"
-            why = f", as when a simulation restarts: {rule}"
-            texts.append(_stepping("transforms", len(restarts), *restarts[0], why))
+            consequence = f", as when a simulation restarts: {rule}"
+            texts.append(_stepping("transforms", len(restarts), *restarts[0], consequence))
         if self._steps:
-            name, (count, old, new) = min(self._steps.items(), key=lambda step: step[1][2].clock_ns)
-            others = len(self._steps) - 1
-            of = f"{name!r} and {plural(others, 'other frame')}" if others else repr(name)
+            name, (entry_count, old, new) = min(self._steps.items(), key=lambda step: step[1][2].clock_ns)
+            other_count = len(self._steps) - 1
+            clause = f"{name!r} and {plural(other_count, 'other frame')}" if other_count else repr(name)
             rule = (
                 "they are sorted by stamp, as if of two senders; if a clock was set back, cut the log there"
             )
-            texts.append(_stepping(of, count, old, new, f": {rule}"))
-        for name, (count, most, old, new) in sorted(self._jumps.items()):
-            if count < _MANY_JUMPS:
+            texts.append(_stepping(clause, entry_count, old, new, f": {rule}"))
+        for name, (entry_count, greatest_jump, old, new) in sorted(self._jumps.items()):
+            if entry_count < _MANY_JUMPS:
                 continue
             texts.append(
                 Sentence(
-                    f"frame {name!r} jumps in {new.parent!r} by up to {most:.3g} and back, {count} times,"
-                    f" such as from {_place(old)} to {_place(new)} at ",
+                    f"frame {name!r} jumps in {new.parent!r} by up to {greatest_jump:.3g} and back,"
+                    f" {entry_count} times, such as from {_place(old)} to {_place(new)} at ",
                     Instant(new.clock_ns, 0),
                     ": if several programs send it, the newest counts",
                 )
@@ -640,19 +665,22 @@ def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
         clock: attribute of entries with the time.
         first_ns: time before which transforms are static.
     """
-    times = np.array([getattr(entry, clock) for entry in entries], np.int64)
-    order = np.argsort(times, kind="stable")
-    ordered = times[order]
-    keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(order)]]
-    distinct = [entries[i] for i in keep.tolist()]
-    number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in distinct))}
+    times_ns = np.array([getattr(entry, clock) for entry in entries], np.int64)
+    time_order = np.argsort(times_ns, kind="stable")
+    ordered_ns = times_ns[time_order]
+    last_indices = time_order[np.append(ordered_ns[1:] != ordered_ns[:-1], True)[: len(time_order)]]
+    distinct_entries = [entries[i] for i in last_indices.tolist()]
+    parent_numbers = {
+        parent: index
+        for index, parent in enumerate(dict.fromkeys(entry.parent for entry in distinct_entries))
+    }
     return _Series(
-        int(np.count_nonzero(times[keep] < first_ns)),
-        times[keep],
-        np.array([entry.clock_ns for entry in distinct], np.int64),
-        list(number),
-        np.array([number[entry.parent] for entry in distinct], np.int64),
-        np.array([entry.pose for entry in distinct], np.float64),
+        int(np.count_nonzero(times_ns[last_indices] < first_ns)),
+        times_ns[last_indices],
+        np.array([entry.clock_ns for entry in distinct_entries], np.int64),
+        list(parent_numbers),
+        np.array([parent_numbers[entry.parent] for entry in distinct_entries], np.int64),
+        np.array([entry.pose for entry in distinct_entries], np.float64),
     )
 
 
@@ -670,10 +698,14 @@ def _reason_to_ignore(child: str, entry: _Entry) -> str | None:
     return None
 
 
-def _stepping(of: str, count: int, old: _Entry, new: _Entry, why: str) -> Sentence:
-    times = "" if count == 1 else f" {count} times, first"
-    back = f"{(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s"
-    return Sentence(f"the stamps of {of} step back{times} by {back} at ", Instant(new.clock_ns, 0), why)
+def _stepping(subject: str, count: int, old: _Entry, new: _Entry, consequence: str) -> Sentence:
+    times_text = "" if count == 1 else f" {count} times, first"
+    step_text = f"{(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s"
+    return Sentence(
+        f"the stamps of {subject} step back{times_text} by {step_text} at ",
+        Instant(new.clock_ns, 0),
+        consequence,
+    )
 
 
 def _place(entry: _Entry) -> str:
@@ -682,8 +714,8 @@ def _place(entry: _Entry) -> str:
 
 def _transforms(translation: Floats, quaternions: Floats, is_known: NDArray[np.bool_]) -> Transforms:
     rotation, _ = matrices_from_quaternions(np.ascontiguousarray(quaternions))
-    finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
-    return Transforms(rotation, np.asarray(translation), is_known & finite)
+    is_finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
+    return Transforms(rotation, np.asarray(translation), is_known & is_finite)
 
 
 _SECONDS = ("sec", "secs", "seconds")
@@ -710,8 +742,8 @@ class TransformReader:
             FieldError, AttributeError, LookupError, TypeError, ValueError: the message has no transforms.
         """
         for transform in self._each(message):
-            child, parent, seconds, rest, *pose = self._values(transform)
-            stamp_ns = _nanoseconds(seconds, rest)
+            child, parent, seconds, nanoseconds, *pose = self._values(transform)
+            stamp_ns = _nanoseconds(seconds, nanoseconds)
             # tf wrote names with a slash in front, which tf2 does not have
             tree.add(
                 str(child).removeprefix("/"),
@@ -726,8 +758,8 @@ class TransformReader:
     def stamp(self, message: object) -> int | None:
         """Return the stamp of the first transform of a message; None without one."""
         for transform in self._each(message):
-            _, _, seconds, rest, *_ = self._values(transform)
-            return _nanoseconds(seconds, rest)
+            _, _, seconds, nanoseconds, *_ = self._values(transform)
+            return _nanoseconds(seconds, nanoseconds)
         return None
 
     def _each(self, message: object) -> Iterator[Any]:
@@ -745,24 +777,26 @@ class TransformReader:
 
 def _getter(example: object) -> Get:
     """Return a getter of child, parent, seconds, nanoseconds, x, y, z and the quaternion x, y, z, w."""
-    names = field_names(example)
-    in_header = "header" in names
+    example_fields = field_names(example)
+    in_header = "header" in example_fields
     stamp, parent = ("header.stamp", "header.frame_id") if in_header else ("timestamp", "parent_frame_id")
-    place = "transform." if "transform" in names else ""
+    prefix = "transform." if "transform" in example_fields else ""
     paths = ["child_frame_id", parent]
-    for parts in (_SECONDS, _REST):
-        fields = [f"{stamp}.{part}" for part in parts]
-        existing = [field for field in fields if leads_somewhere(FieldPath.of(field), example)]
-        if not existing:
+    for alternatives in (_SECONDS, _REST):
+        stamp_paths = [f"{stamp}.{field_name}" for field_name in alternatives]
+        existing_paths = [
+            stamp_path for stamp_path in stamp_paths if leads_somewhere(FieldPath.of(stamp_path), example)
+        ]
+        if not existing_paths:
             raise FieldError(f"{stamp} is not a time; a transform has a stamp")
-        paths.append(existing[0])
-    paths += [f"{place}translation.{axis}" for axis in "xyz"]
-    paths += [f"{place}rotation.{axis}" for axis in "xyzw"]
+        paths.append(existing_paths[0])
+    paths += [f"{prefix}translation.{axis}" for axis in "xyz"]
+    paths += [f"{prefix}rotation.{axis}" for axis in "xyzw"]
     return tuple_getter([FieldPath.of(path) for path in paths], example)
 
 
-def _nanoseconds(seconds: Any, rest: Any) -> int:
-    time_ns = int(seconds) * 1_000_000_000 + int(rest)
+def _nanoseconds(seconds: Any, nanoseconds: Any) -> int:
+    time_ns = int(seconds) * 1_000_000_000 + int(nanoseconds)
     if abs(time_ns) > LATEST_NS:
         raise FieldError(f"its stamp {time_ns} ns lies outside the times of a log")
     return time_ns
