@@ -42,7 +42,7 @@ from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
-"""Messages before the first trace, few for an early first sample; the number doubles for each trace."""
+"""Limit of messages before the first trace, low for an early first sample. It doubles after each trace."""
 _LONGEST_STEP: Final = 8_192
 """Limit of messages between two traces."""
 
@@ -50,13 +50,13 @@ _STEP_BYTES: Final = 2**23
 """Size limit of messages between two traces, bytes."""
 
 _MOST_STEPS = 100_000
-"""Limit of samples between two messages; more of them show a jump of the clock."""
+"""Limit of samples between two messages. A longer gap is a jump of the clock."""
 
 _ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
-"""Least jump back, in nanoseconds, between two clocks, such as simulated time and time since 1970."""
+"""Least jump back that shows two clocks, nanoseconds, such as simulated time and time since 1970."""
 
 _MOST_AT_ONCE = 1_000_000
-"""Limit of samples between messages of one step, which are in memory together."""
+"""Limit of samples per step, because all samples of a step are in memory together."""
 
 
 class _Assembling:
@@ -65,8 +65,8 @@ class _Assembling:
     Args:
         name: name of the log, for errors and remarks.
         decoder: function from a topic to its decoder.
-        start_ns, end_ns: window of the samples, without its end. Messages outside the window may be added and
-            affect the samples.
+        start_ns, end_ns: half-open window of the samples. Messages before the window may be added, because
+            they affect its samples.
         on_time_jump: effect of a jump back by more than the plan's `late_ns`: an error or the end of the log.
     """
 
@@ -130,7 +130,7 @@ class _Assembling:
         self._message_count = 0
         self._channel_by_topic: dict[str, int] = {}
         self.jump: Sentence | None = None
-        """Jump of time that ended the log; None without one."""
+        """Jump of time that ended the log; None without a jump."""
 
     @property
     def is_finished(self) -> bool:
@@ -218,11 +218,11 @@ class _Assembling:
             )
 
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return the losses since the last call, each with its place."""
+        """Return the faults since the last call, each with its topic and time."""
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
 
     def find_doubts(self) -> tuple[Doubt, ...]:
-        """Return the assumptions that messages so far contradict and the mapping does not accept."""
+        """Return doubts about the messages so far, without doubts that the mapping accepts."""
         doubts = contradictions(self._tracker.evidence, self._plan.mapping)
         return tuple(doubt for doubt in doubts if isinstance(doubt, Doubt) and not doubt.is_accepted)
 
@@ -241,7 +241,7 @@ class _Assembling:
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
     def _add_step(self, messages: MessageColumns) -> None:
-        """Pass messages with transforms to the frame tree, and others to the readers of their topics."""
+        """Pass transforms to the frame tree, and other messages to the readers of their topics."""
         topics = messages.topics
         topic_numbers = map(self._number_of_topic.get, topics, repeat(-1))
         topic_of_message = np.fromiter(topic_numbers, np.int64, len(messages))
@@ -264,7 +264,7 @@ class _Assembling:
     def _of_publisher(
         self, planned: PlannedTopic, message_indices: Integers, messages: MessageColumns
     ) -> Integers:
-        """Return the places of messages from the publisher that the mapping selects.
+        """Return the indices of messages from the selected publisher.
 
         Raises:
             UsageError: the topic lacks this publisher.
@@ -286,9 +286,9 @@ class _Assembling:
         return of_publisher
 
     def _stamp(self, reader: TopicReader, message_indices: Integers, messages: MessageColumns) -> _Stamped:
-        """Return the messages of one topic with their times on its clock.
+        """Return the messages of one topic with times on the topic's clock.
 
-        They are decoded if the reader `decodes_on_arrival`, as for stamps and transforms.
+        The messages are decoded if the reader `decodes_on_arrival`, for example for stamps or transforms.
         """
         contents: list[Any] = [messages.payloads[place] for place in message_indices.tolist()]
         clock = reader.planned.clock
@@ -310,12 +310,12 @@ class _Assembling:
         """Update the newest time of the log; return the number of messages before a jump that ends the log.
 
         Raises:
-            LogError: time jumps back, and a jump does not end the log.
+            LogError: time jumps back, and `on_time_jump` is "error".
         """
         moving_batches = [batch for batch in batches if batch.reader.advances_time]
         no_integers = np.empty(0, np.int64)
         message_indices = np.concatenate([no_integers, *(batch.message_indices for batch in moving_batches)])
-        # in the order of arrival over all topics, in which a jump is defined
+        # jumps are defined in the order of arrival over all topics
         arrival_order = np.argsort(message_indices, kind="stable")
         times_ns = np.concatenate([no_integers, *(batch.times_ns for batch in moving_batches)])[arrival_order]
         if self._begin_ns is None and len(times_ns):
@@ -384,9 +384,9 @@ class _Assembling:
         return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
-        """Return the final samples up to a time.
+        """Return the new final samples up to a time.
 
-        A late message from before that time is valid only after it.
+        Messages that arrive later with earlier times are valid only after that time.
 
         Args:
             is_last: whether the log ends here, so that no message waits.
@@ -402,7 +402,7 @@ class _Assembling:
             return Trace.empty()
         start_ns, end_ns = self._window_ns
         start_ns = max(start_ns, self._settled_ns + 1)
-        # NaN and infinity in logs are no reason for NumPy's warnings: they make objects unknown
+        # NumPy does not warn, because NaN and infinity in logs make objects unknown
         with np.errstate(all="ignore"):
             sampled_ns, fallback_ns = self._tracker.advance(upto_ns)
             fallback_ns = self._silences.sampled_in(fallback_ns)
@@ -412,14 +412,14 @@ class _Assembling:
             trace = self._tracker.trace(times_ns, newest_ns)
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
-        # rarely, because a search through all transforms takes longer than a sample
+        # not in every call, because searching all transforms takes longer than a sample
         if upto_ns - self._forgot_ns > DISORDER_NS:
             self._tree.forget_before(upto_ns - HISTORY_NS)
             self._forgot_ns = upto_ns
         return trace
 
     def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
-        """Note arrived messages of a topic, which are decoded if its reader `decodes_on_arrival`."""
+        """Note arrived messages of a topic; `contents` are decoded if the reader `decodes_on_arrival`."""
 
     def _columns(self, messages: Sequence[Message]) -> MessageColumns:
         if not messages:
@@ -428,7 +428,7 @@ class _Assembling:
         log_ns, publish_ns, sequence_numbers = (np.array(column, np.int64) for column in number_columns)
         record_numbers = self._message_count + np.arange(len(messages))
         self._message_count += len(messages)
-        # a topic keeps its channel number between calls, because a new number would be another publisher
+        # a topic keeps its channel number between calls, because a new number would mean another publisher
         channel_by_topic = self._channel_by_topic
         channels = {
             channel_by_topic.setdefault(topic, len(channel_by_topic)): Channel(topic, "", None)
@@ -444,13 +444,13 @@ class _Assembling:
 
 
 class Assembler(_Assembling):
-    """Assembler of the samples of one log; for the other arguments see `_Assembling`.
+    """Assembler of the samples of one log; see `_Assembling` for the other arguments.
 
-    Add thousands of messages per call, because it works on columns. The samples do not depend on the division
-    into calls.
+    Add thousands of messages per call, because the assembler works on columns. The samples do not depend on
+    the division into calls.
 
     Args:
-        goes_on: returns whether the log has messages after the last one that is added; by default, no.
+        goes_on: function that returns whether the log has messages after the added ones; by default False.
     """
 
     _step_limit, _step_count, _step_bytes = _FIRST_STEP, 0, 0
@@ -512,12 +512,12 @@ class Assembler(_Assembling):
                 self._add_transforms(reader, time_by_clock[reader.planned.clock], log_ns, contents[0])
 
     def move_faults(self, target: FaultList) -> None:
-        """Move all faults to another list, with the count of faults beyond the limit of the list."""
+        """Move all faults to another list, including the number of faults beyond the list's limit."""
         self._faults.move_to(target)
 
 
 class _Stamped(NamedTuple):
-    """Messages of one topic: places among all arrived messages, times and contents."""
+    """Messages of one topic: indices among all arrived messages, times and contents."""
 
     reader: TopicReader
     message_indices: Integers
@@ -573,7 +573,7 @@ class _SampleTimes:
         return sample_times_ns
 
     def note(self, time_ns: int) -> bool:
-        """Note an extra sample; return whether there is an earlier sample and none at or after its time."""
+        """Note an extra sample; return False unless there is a sample, and the last sample is earlier."""
         comes_after = 0 <= self._last_ns < time_ns
         if comes_after:
             self._last_ns = time_ns
@@ -585,8 +585,8 @@ class _SampleTimes:
         if self._from_ns is None or upto_ns < self._from_ns:
             return np.empty(0, np.int64)
         begin_ns = max(self._from_ns, self._last_ns + 1)
-        # multiples of the step since the epoch, so that samples do not depend on the window; integer
-        # division, because floats do not resolve nanoseconds since 1970
+        # multiples are counted from the epoch, so that samples do not depend on the window. Division is in
+        # integers, because floats do not resolve nanoseconds since 1970.
         first_multiple, stop_multiple = -(-begin_ns // step_ns), upto_ns // step_ns + 1
         marks_ns = np.unique(np.concatenate([[begin_ns, upto_ns], times_ns[times_ns > begin_ns]]))
         gaps_ns = np.diff(marks_ns)
@@ -608,15 +608,15 @@ class _SampleTimes:
 
 
 class _Silences:
-    """Silences of the sampled topic that are longer than a limit, in which fallback topics are sampled.
+    """Long silences of the sampled topic, in which fallback topics are sampled.
 
-    The limit depends only on the two messages before the silence, and is at most the plan's
-    `longest_silence_ns`. So the decision is the same for a log, a window of it and a running system.
+    The limit of a silence depends only on the two messages before it, and is at most the plan's
+    `longest_silence_ns`. So a log, a window of the log and a running system give the same decision.
 
     Attributes:
-        first_ns: time of the first message of the sampled topic; None without one.
-        before_ns: time of the first sample before that message; None without one.
-        goes_on: returns whether the log has messages after those that are read.
+        first_ns: time of the sampled topic's first message; None without a message.
+        before_ns: time of the first sample before `first_ns`; None without such a sample.
+        goes_on: function that returns whether the log has messages after the last message read.
     """
 
     def __init__(
@@ -627,9 +627,10 @@ class _Silences:
         self._sampled_pending = None if plan.sampled_topic is None else readers[plan.sampled_topic].pending
         self._fallback_pending = [readers[topic].pending for topic in sorted(plan.fallback_topics)]
         self._fallback_begin_ns: int | None = None
-        # times of the sampled topic: the last two before the next samples, and all later ones
+        # message times of the sampled topic: the last two before the next samples, and all later times
         self._past_ns = self._times_ns = np.empty(0, np.int64)
-        # whether fallback topics are sampled after each of these times; the last flag is for before the first
+        # whether fallback topics are sampled after each of `_times_ns`; the last element: before the first
+        # time
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None
@@ -663,7 +664,7 @@ class _Silences:
         is_filled = self._silences(times_ns, known_ns, is_last=is_last)
         if is_last:
             if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
-                # reading ended later than any limit of a silence, so that this one is too long
+                # reading ended after the longest limit, so this silence is too long if the log goes on
                 is_filled[-2] = self.goes_on()
         elif len(times_ns):
             # until the silence after the last message is decided, samples end at that message
@@ -673,7 +674,7 @@ class _Silences:
             # not yet decided whether samples begin at fallback topics
             upto_ns = min(upto_ns, self._fallback_begin_ns - 1)
         self._times_ns, self._is_filled = times_ns, is_filled
-        # past messages stay past, even if this request ends before them
+        # past messages stay past, even if this request ends before these messages
         past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
         self._past_ns = times_ns[times_ns <= past_ns][-2:]
         if len(times_ns) and self.first_ns is None:
@@ -687,7 +688,7 @@ class _Silences:
         """
         limits_ns = np.full(len(times_ns), self._greatest_limit_ns)
         limits_ns[1:] = np.clip(LONG_PAUSE * np.diff(times_ns), self._least_limit_ns, self._greatest_limit_ns)
-        # if no message has arrived up to `known_ns`, the next one is later
+        # if no message has arrived up to `known_ns`, the next message is later
         next_ns = np.append(times_ns, known_ns if is_last else known_ns + 1)
         if is_last and len(times_ns):
             # after the last message, a silence beyond the usual intervals is sampled to the end of the log
@@ -700,7 +701,7 @@ class _Silences:
         return np.append(next_ns[1:] - times_ns > limits_ns, begins_late)
 
     def sampled_in(self, others_ns: Integers) -> Integers:
-        """Return the times of fallback topics that are sampled, from times up to the `limit`."""
+        """Return the sampled times among times of fallback topics up to the `limit`."""
         message_index = np.searchsorted(self._times_ns, others_ns, "right") - 1
         is_sampled = self._is_filled[message_index]
         start_ns, end_ns = self._window_ns
@@ -710,7 +711,7 @@ class _Silences:
         return sampled_ns
 
     def _note(self, fallback_ns: Integers, message_index: Integers) -> None:
-        """Note samples at fallback topics, with the index of the sampled topic's message before each."""
+        """Note samples at fallback topics, with the index of the sampled topic's preceding message."""
         before_ns = fallback_ns[message_index < 0]
         if len(before_ns) and self.before_ns is None:
             self.before_ns = int(before_ns.min())
@@ -724,7 +725,7 @@ class _Silences:
             self._first_pause_ns = self._first_pause_ns[0], int(later_ns[0]) if len(later_ns) else None
 
     def remarks(self, sampled_topic: str, fallback_topics: str) -> Iterator[str]:
-        """Yield remarks on samples at fallback topics, after the last sample."""
+        """Yield remarks on samples at fallback topics; call it after the last sample."""
         subject = f"samples are taken at {sampled_topic}, which "
         if self.before_ns is not None and self.first_ns is None:
             yield f"samples are taken at {fallback_topics}, since {sampled_topic} has no message"
@@ -751,7 +752,7 @@ class _Silences:
 
 
 _MOMENT_S: Final = 0.001
-"""Time in which messages of one time arrive, if all messages arrive in the order of time, seconds."""
+"""Span in which messages with equal times arrive, if all messages arrive in the order of time, seconds."""
 
 _MOST_HELD: Final = 4_096
 """Limit of observations that wait for transforms; further observations do not wait."""
@@ -770,7 +771,7 @@ sample: {topic: /boxes}
 
 
 def rehearse() -> None:
-    """Assemble a few samples of invented messages, so that the first real ones need no compilation."""
+    """Assemble a few samples of invented messages, so that the first real samples need no compilation."""
     ring_corners = [[0, 0], [2, 0], [2, 2], [1, 1]]
     contents: dict[str, Any] = {
         "/boxes": {
@@ -796,7 +797,7 @@ class _Held(NamedTuple):
 
     Attributes:
         time_ns: time of its message on the clock of the samples.
-        at_ns: time of the transforms: its stamp, or the time of its message.
+        at_ns: time of the transforms: the observation's stamp, or the time of its message.
         by_stamp: whether `at_ns` is a stamp.
         until_s: deadline, seconds.
     """
@@ -813,9 +814,8 @@ class LiveAssembler(_Assembling):
     """Assembler of the samples of a running system.
 
     Callers pass the time of their clock, `now_s`, in seconds. A sample is final when every topic has reached
-    its time. At the latest it is final `max_delay_s` after the first message of that time or a later time. So
-    the samples are equal to those of a log of the same messages, for any interleaving of topics within that
-    delay.
+    its time, or `max_delay_s` after the first message at or after its time. So the samples equal the samples
+    of a log of the same messages, if topics interleave within that delay.
 
     Args:
         in_order: whether the server stamps messages when it sends them, so that messages of all topics arrive
@@ -823,7 +823,7 @@ class LiveAssembler(_Assembling):
 
     Attributes:
         late: number of messages that arrived after the samples of their time.
-        overdue: number of observations whose transforms did not arrive in time, so that they are unknown.
+        overdue: number of observations that are unknown because their transforms did not arrive in time.
         overdue_frame: topic and frame of the last overdue observation.
     """
 
@@ -900,16 +900,16 @@ class LiveAssembler(_Assembling):
         return {planned.name for planned in self._plan.planned if planned.topic in topics}
 
     def arrived_s(self, time_ns: int) -> float:
-        """Return the arrival time of the first message at or after the time of a sample; inf if unknown.
+        """Return the arrival time of the first message at or after a sample's time, seconds; inf if unknown.
 
-        Calls have to be in the order of samples, because earlier arrivals are dropped.
+        Call it in the order of samples, because earlier arrivals are dropped.
         """
         while self._arrivals and self._arrivals[0][1] < time_ns:
             self._arrivals.popleft()
         return self._arrivals[0][0] if self._arrivals else inf
 
     def due_s(self) -> float | None:
-        """Return the time of the next call of `add`, even without messages; None if nothing waits."""
+        """Return the time at which `add` must be called, even without messages; None if nothing waits."""
         deadlines_s = [waiting.until_s for waiting in self._held]
         is_settled = self._settled_ns >= self._newest_ns
         if self._deadlines and self._deadlines[-1][1] > self._expired_ns and not is_settled:
@@ -922,7 +922,7 @@ class LiveAssembler(_Assembling):
         return self._settle(self._newest_ns, is_last=True)
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Make the reports of lost topics unknown; return the samples so far and one right after them.
+        """Make reports of lost topics unknown; return the samples so far, and one sample of the loss.
 
         A topic is lost with its connection, or after a silence. Its objects and signals stay unknown until it
         reports them again. Messages of other topics wait as before.
@@ -933,12 +933,12 @@ class LiveAssembler(_Assembling):
         self._now_s = now_s
         self._lost |= newly_lost_topics
         self._held = [waiting for waiting in self._held if waiting.topic not in newly_lost_topics]
-        # lost topics send nothing more, so that samples up to their last message are final
+        # lost topics send no more messages, so samples up to their last message are final
         last_message_ns = min(
             self._newest_ns, max(self._latest_ns_by_topic[topic] for topic in newly_lost_topics)
         )
         trace = self._settle(max(self._upto_ns(now_s), last_message_ns), is_last=True)
-        # one nanosecond later, so that the loss is a sample of its own
+        # one nanosecond later, so that the loss is a separate sample
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return trace
@@ -957,7 +957,8 @@ class LiveAssembler(_Assembling):
         is_late = times_ns <= self._settled_ns
         if not is_late.any():
             return times_ns, ~is_late
-        # as in a log, the next sample shows it, unless a later message of the topic has replaced it
+        # as in a log, the next sample shows a late message, unless a later message of the topic has replaced
+        # it
         is_used = ~is_late | (times_ns > reader.pending.taken_ns) | reader.repeats_times
         for time_ns, log_ns, is_shown in zip(
             times_ns[is_late].tolist(), log_times_ns[is_late].tolist(), is_used[is_late].tolist(), strict=True
@@ -980,7 +981,7 @@ class LiveAssembler(_Assembling):
         back_ns = newest_ns[:-1] - times_ns
         # a message that steps back farther is too late anyway
         back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
-        # one more, because samples are final only before the earliest time that may still come
+        # one nanosecond more, because samples are final only before the earliest time that may still come
         self._step_back_ns[name] = max(self._step_back_ns[name], int(back_ns.max(initial=-1)) + 1)
         if name in self._transform_topics:
             self._are_transforms_new = True
@@ -999,7 +1000,7 @@ class LiveAssembler(_Assembling):
             except MISFITS:
                 # the fault is reported when the objects are read
                 continue
-            # markers locked to a moving frame need its transform in every sample
+            # markers locked to a moving frame need the frame's transform in every sample
             self._follows_frames = self._follows_frames or any(chunk.locked)
             stamps = chunk.stamps or [0] * len(chunk.name)
             for frame, stamp_ns in dict.fromkeys(zip(chunk.frames or (), stamps, strict=False)):
@@ -1011,7 +1012,7 @@ class LiveAssembler(_Assembling):
     def _upto_ns(self, now_s: float) -> int:
         """Return the time up to which samples are final."""
         newest_ns = self._newest_ns
-        # a topic that has stepped back in time may step back as far again
+        # a topic that has stepped back in time may step back by the same amount again
         reached_ns = (
             self._latest_ns_by_topic[topic] - self._step_back_ns[topic] for topic in self._awaited_topics
         )
@@ -1055,7 +1056,8 @@ class LiveAssembler(_Assembling):
             log_ns = time_ns if self._plan.by_log_time else None
             is_placeable = tree.between(fixed_frame, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
             if by_stamp:
-                # a stamp far behind the newest one may follow a reset clock: the next transform shows it
+                # a stamp far behind the newest stamp may follow a reset of the clock, which the next
+                # transform shows
                 is_placeable = is_placeable & (
                     (at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns)
                 )

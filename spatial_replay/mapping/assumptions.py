@@ -33,12 +33,12 @@ class Assumption:
     Attributes:
         name: name for `accept` in a mapping.
         assumed: the assumption, for the documentation.
-        measured: the measurement, and its limit, for the documentation.
-        check: function that returns the contradiction as a clause, to follow the topic and a colon; None
-            without a contradiction.
+        measured: the measurement with its limit, for the documentation.
+        check: function that returns the contradiction as a clause to follow "TOPIC: "; None without a
+            contradiction.
         remedy: key that resolves the contradiction.
-        is_remark: whether sound but unusual data look the same, so that verdicts are not doubtful.
-        is_about_signals: whether signals of the topic depend on the assumption, too.
+        is_remark: whether a contradiction is only a remark, because unusual but sound data look the same.
+        is_about_signals: whether the topic's signals also depend on the assumption.
     """
 
     name: str
@@ -51,9 +51,10 @@ class Assumption:
 
 
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
-    """Yield contradictions of the assumptions: doubts, or remarks if the data may be sound but unusual.
+    """Yield contradictions of the assumptions: doubts, or remarks if the data may be unusual but sound.
 
-    A contradiction in many topics is one sentence. Accepted names without a contradiction are remarks, too.
+    One sentence covers a contradiction in many topics. Accepted names without a contradiction are also
+    remarks.
     """
     uncontradicted = dict.fromkeys(mapping.accept)
     for evidence in log.values():
@@ -98,7 +99,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
 
 
 def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
-    """Return groups of topics, one per sentence: all topics if there are many, otherwise by equal clauses."""
+    """Return groups of topics, one per sentence: one group if topics are many, else by equal clauses."""
     if len(clauses) >= _MANY_TOPICS:
         return [list(clauses)]
     groups: dict[str, list[str]] = {}
@@ -120,7 +121,7 @@ def _unit_of_log_times(evidence: TopicEvidence, log: Log) -> str | None:
     first_ns, last_ns = arrivals.first_ns, arrivals.last_ns
     if evidence.planned.clock == "header" or arrivals.messages <= _FEW or first_ns is None or last_ns is None:
         return None
-    # the mean period, not the shortest: messages within a burst are close in any unit
+    # the mean period, because messages within a burst are close in any unit
     period_ns = arrivals.mean_period_s * 1e9
     for unit, unit_ns in list(UNITS_NS.items())[1:]:
         year = _year(first_ns * unit_ns)
@@ -162,7 +163,7 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, planned = evidence.arrivals, evidence.planned
     if planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays):
         return None
-    # messages repeated with their first stamp are wrong only if objects are in frames that move
+    # messages repeated with one stamp are wrong only if objects are in moving frames
     if not evidence.uses_stamps or not (arrivals.stamps_vary or evidence.uses_frames):
         return None
     still_s, usual_s = arrivals.longest_still_s, arrivals.log_period_s.median
@@ -179,7 +180,7 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _LONG_STILL_S, _LONG_STILL = 0.3, 5
-"""Longest time without a new stamp: seconds, and usual periods of the topic."""
+"""Limits of the time without a new stamp: seconds, and usual periods of the topic."""
 
 
 def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
@@ -187,7 +188,7 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     passed_s, log_s = arrivals.stamps_passed_s, arrivals.log_passed_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps and passed_s > 0 and log_s > 0):
         return None
-    # a simulation may run at any rate, except by exactly the factor of a unit
+    # a simulation may run at any rate, except exactly at the factor between two units
     factor = passed_s / log_s
     if not any(
         abs(factor * unit_factor - 1) < _UNIT_ERROR or abs(factor / unit_factor - 1) < _UNIT_ERROR
@@ -208,7 +209,7 @@ _FACTORS: Final = (1e3, 1e6, 1e9)
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
     lateness_s = [topic.arrivals.lateness_s for topic in log.values() if topic.has_moving_stamps]
-    # sorted by distance from the log's clock, because the nearer of two clocks is taken as right
+    # sorted by distance from the log's clock, because the nearer of two clocks counts as right
     medians_s = sorted((late_s.median for late_s in lateness_s), key=abs)
     late_s = evidence.arrivals.lateness_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps):
@@ -226,7 +227,7 @@ def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _OTHER_CLOCK_S, _SLOWEST_S, _STEADY_S = 5.0, 600.0, 0.5
-"""Limits of delays, seconds: between two clocks, of the slowest computation, and of a steady spread."""
+"""Limits, seconds: delay between two clocks, delay of the slowest computation, spread of a steady delay."""
 
 
 def _signed_s(late_s: float) -> str:
@@ -243,7 +244,7 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
         or upright_count > _FEW_UPRIGHT * quaternion_count
     ):
         return None
-    # a tag on a table, seen from above, is upside down; in the other order it seems upright and not turned
+    # a tag on a table, seen from above, is upside down. In the other order it seems upright and unturned.
     if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * quaternion_count):
         return None
     other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
@@ -280,7 +281,7 @@ _LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
 
 
 def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
-    """Return whether angles may be unwrapped: they begin within a turn, and steps are below half a turn."""
+    """Return whether angles may be unwrapped. They begin within a turn, and steps are below half a turn."""
     return evidence.first_turn <= turn and evidence.motions.turn_step < turn / 2
 
 
@@ -289,7 +290,7 @@ def _radians(evidence: TopicEvidence, log: Log) -> str | None:
     greatest_angle = max(angles.greatest, -angles.least)
     if layout is None or abs(layout.angle_scale) != 1.0 or not greatest_angle > MANY_TURNS:
         return None
-    # degrees stay within 360; read as radians, they would turn more than once a second, which few robots do
+    # degrees stay within 360. Read as radians, they turn more than once a second, which few robots do.
     is_fast = evidence.motions.turn_rate.quantile(0.9) > 2 * pi and greatest_angle <= _A_TURN
     if _is_unwrapped(evidence, 2 * pi) and not is_fast:
         return None
@@ -342,7 +343,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
-    # a straight path is no evidence, because a robot may go sideways; a heading next to fixes is from north
+    # a straight path is no evidence, because a robot may go sideways. A heading next to fixes is from north.
     is_straight = abs(motions.course) > _STRAIGHT
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
     if keys is None or (is_straight and not ("north" in keys and is_compass)):
@@ -357,7 +358,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _compass(evidence: TopicEvidence, log: Log) -> str | None:
-    """Return a clause on the zero of an angle next to fixes, unless motions confirm it."""
+    """Return a clause on the zero of an angle next to fixes, unless motions confirm the angle."""
     yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
     courses = evidence.motions.courses
     goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW
@@ -376,9 +377,10 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
 _FEW_STEPS: Final = 20
 """Least number of steps for a comparison of yaw and course."""
 _STRAIGHT, _CLOSE = 0.8, 0.95
-"""Lengths of mean unit vectors: of courses on a straight path, of differences for a fitting angle."""
+"""Least lengths of mean unit vectors: courses on a straight path, differences from a fitting angle."""
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
-"""Length of a steady mean unit vector, and limits of its angle: as read, and for another angle, radians."""
+"""Least length of a steady mean unit vector, and limits of its angle in radians: as read, in another
+reading."""
 
 
 def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
@@ -391,7 +393,7 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     if not (abs(evidence.low[:2]).max() <= 360 and abs(evidence.high[:2]).max() <= 360):
         return None
-    # a radar may name lateral and longitudinal metres lat and lon; 0.01 degrees a second are 1.1 km a second
+    # a radar may name lateral and longitudinal metres lat and lon. 0.01 degrees a second are 1.1 km a second.
     if evidence.motions.speed.quantile(0.9) > _FAST_DEGREES:
         return None
     low, high = (", ".join(map(number_text, corner[:2].tolist())) for corner in (evidence.low, evidence.high))
@@ -436,7 +438,7 @@ def _no_degrees(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _NO_LATITUDE: Final = 91.0
-"""Latitude for a missing position in AIS (ITU-R M.1371)."""
+"""Latitude of a missing position in AIS (ITU-R M.1371)."""
 
 
 def _far_origin(evidence: TopicEvidence, log: Log) -> str | None:
@@ -494,7 +496,7 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
-    # few returns are sound: each file of a bag has its own channels, and one publisher may replace another
+    # few returns are sound, because each file of a bag has its own channels, and a publisher may be replaced
     if arrivals.returns < max(_FEW, _IN_TURN * arrivals.messages):
         return None
     shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0
@@ -507,7 +509,7 @@ def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _IN_TURN: Final = 0.01
-"""Least share of messages after a change back to an earlier publisher."""
+"""Least share of messages that return to an earlier publisher."""
 
 
 def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
@@ -577,7 +579,7 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     leftward_count, downward_count, box_count = extractor.leftward, extractor.downward, extractor.boxes
     if leftward_count < box_count / 5 and not box_count / 5 < downward_count < box_count * 4 / 5:
         return None
-    # opposite corners in the other order have similar ranges, but sizes do not reach as far as positions
+    # corners in the other order reach as far as the first corners, but sizes do not
     reach = extractor.corner_high - extractor.corner_low
     if min(leftward_count, downward_count) == box_count and (reach[1] > reach[0] / 2).all():
         return None
@@ -601,15 +603,15 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
     other_speeds = [topic.motions.speed.quantile(0.9) for topic in other_topics]
     other_speeds = [speed for speed in other_speeds if speed > 0]
     size, arrivals = evidence.size.median, evidence.arrivals
-    # objects in messages recorded in bursts only seem fast, because times within a burst are close
+    # objects in messages recorded in bursts seem fast, because times within a burst are close
     burst_factor = min(1.0, arrivals.period_s.median / arrivals.mean_period_s)
     usual_speed, speed = (evidence.motions.speed.quantile(share) * burst_factor for share in (0.5, 0.9))
-    # a size from the mapping is in another unit than the places if an object moves 1,000 sizes a second
+    # if an object moves 1,000 sizes a second, the mapping's size and the positions have different units
     if usual_speed > max(_SOUND, _SIZES_A_SECOND * size) and size > 0:
         return f"its objects are {number_text(size)} long and move at {number_text(usual_speed)} a second"
     if not (other_sizes and other_speeds and speed > _THOUSAND * max(other_speeds)):
         return None
-    # a shape from the mapping shows no unit of the log, so that speed decides: no robot is faster than sound
+    # a shape from the mapping does not show the log's unit, so speed decides: no robot is faster than sound
     if not (size > _THOUSAND * max(other_sizes) or speed > _SOUND):
         return None
     return (
@@ -619,7 +621,7 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _THOUSAND, _SOUND, _SIZES_A_SECOND = 200, 343.0, 1_000.0
-"""Least ratio that shows millimetres, speed of sound in metres per second, and sizes per second."""
+"""Least ratio that shows millimetres, speed of sound in metres per second, and limit of sizes per second."""
 
 
 def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
@@ -715,7 +717,7 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FEW_LEAPS, _FAST_LEAP, _FARTHER = 10, 20.0, 3.0
-"""Least number of steps, and limits of a leap and of a comeback in usual speeds."""
+"""Least number of steps; limits of a leap and of a comeback, as multiples of the usual speed."""
 
 _DEGREES: Final = "`yaw: {field: PATH, unit: deg}` reads degrees"
 

@@ -40,9 +40,8 @@ from spatial_replay.mapping.transforms import (
 
 BOX, DISC, CYLINDER, SPHERE, POLYGON, HULL = range(6)
 """Kinds of solids with their three sizes. Box: length, width, height (NaN if flat). Disc: diameter. Cylinder:
-diameters along x and y, height. Sphere: diameters along x, y and z. A polygon has corners in order, a hull
-points in any order. A cylinder that is tilted or not round is replaced by its bounding box, as is a sphere
-that is not round."""
+diameters along x and y, height. Sphere: diameters along x, y and z. A polygon has ordered corners. A hull has
+points in any order. A box replaces a cylinder that is tilted or not round, and a sphere that is not round."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +49,13 @@ class Solids:
     """P solids that make up R objects.
 
     Attributes:
-        owner: (P,) int64, increasing: the object of each solid.
+        owner: (P,) int64, index of each solid's object, never decreasing.
         kind: (P,) int8.
         position: (P, 3), translation of frame_from_solid.
         rotation: (P, 3, 3), rotation of frame_from_solid.
-        size: (P, 3), see the kinds.
-        point_start: (P + 1,) int64, starts of the solids in `points`, then the end of the last.
-        points: (V, 3), in the solid's frame.
+        size: (P, 3), see the kinds of solids.
+        point_start: (P + 1,) int64, start of each solid in `points`, then the number of points.
+        points: (V, 3), coordinates in the solid's frame.
     """
 
     owner: Integers
@@ -84,7 +83,7 @@ class Solids:
 
 
 def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
-    """Return the footprints (R,) of objects; an object has no height if a solid of it has none.
+    """Return the footprints (R,) of objects; an object with a flat solid has no height.
 
     Args:
         count: number of objects, R.
@@ -94,7 +93,7 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     boxes, polygons, hulls, rounds = map(
         np.flatnonzero, (kind == BOX, kind == POLYGON, kind == HULL, _IS_ROUND[kind])
     )
-    # a tilted flat box needs no hexagon, because its projection has four corners
+    # the projection of a tilted flat box has four corners, so it needs no hexagon
     is_tilted = ~np.isnan(size[boxes, 2]) & ~is_upright(solids.rotation[boxes])
     flat_boxes, tilted_boxes = boxes[~is_tilted], boxes[is_tilted]
     rings = [_ring(solids, hull) for hull in hulls.tolist()]
@@ -131,7 +130,7 @@ _IS_ROUND = np.array([False, True, True, True, False, False])
 
 
 def _with_boxes(solids: Solids) -> Solids:
-    """Replace cylinders that are tilted or not round, and spheres that are not round, by boxes."""
+    """Replace tilted cylinders, and cylinders and spheres that are not round, by boxes."""
     kind, size = solids.kind, solids.size
     round_indices = np.flatnonzero((kind == CYLINDER) | (kind == SPHERE))
     kind, size = kind[round_indices], size[round_indices]
@@ -155,9 +154,9 @@ def _rectangles(solids: Solids, box_indices: Integers) -> Floats:
 def _hexagons(solids: Solids, box_indices: Integers) -> Floats:
     """Return the outlines (K, 6, 2) of tilted boxes, seen from above.
 
-    The projection of a box is the Minkowski sum of its three projected axes, a zonogon. The axes are flipped
-    into the upper half plane and ordered by angle. The outline starts at the lowest corner, runs along each
-    axis in this order, and then back along each axis in the same order.
+    A box's projection is a zonogon: the Minkowski sum of its three projected axes. The axes are flipped into
+    the upper half plane and ordered by angle. The outline starts at the lowest corner, runs along each axis
+    in this order, and then back along each axis in the same order.
     """
     axes = np.swapaxes(solids.rotation[box_indices, :2, :] * (solids.size[box_indices, None, :] / 2), 1, 2)
     points_down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
@@ -183,7 +182,7 @@ def _fill_polygons(vertices: Floats, vertex_start: Integers, solids: Solids, pol
 
 
 def _ring(solids: Solids, solid_index: int) -> Floats:
-    """Return the convex hull of a solid's points, seen from above; one NaN if a point is not finite."""
+    """Return a solid's convex hull, seen from above; one NaN corner if a point is not finite."""
     points = solids.points[solids.point_start[solid_index] : solids.point_start[solid_index + 1]]
     placed_points = points @ solids.rotation[solid_index].T + solids.position[solid_index]
     if not np.isfinite(placed_points).all():
@@ -211,7 +210,7 @@ def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
     if len(lowest) == count:
         return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
-    # minimum and maximum keep NaN, so that one solid without a height makes the object one without
+    # minimum and maximum keep NaN, so one solid without a height makes the object's height NaN
     np.minimum.at(bottom, solids.owner, lowest)
     np.maximum.at(top, solids.owner, highest)
     return bottom, top
@@ -229,7 +228,7 @@ _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
 class Solid(NamedTuple):
-    """One solid in the frame of its message; for its numbers see `Solids`."""
+    """One solid in the frame of its message; see `Solids` for its sizes and points."""
 
     kind: int
     position: Numbers
@@ -239,7 +238,7 @@ class Solid(NamedTuple):
 
 
 def lenient_getter(style: Style) -> GetField:
-    """Return a getter of a field by name; for a missing field of a JSON object it returns None."""
+    """Return a getter of a field by name. It returns None for a missing field of a JSON object."""
     return getattr if style == "attributes" else lambda value, name: value.get(name)
 
 
@@ -253,7 +252,7 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         return [Solid(solid_kind, position, quaternion, scale)]
     points = [_vector(point, get) for point in get(marker, "points") or ()]
     if marker_type in (6, 7):
-        # elements of a list marker; `_listed_solids` adds the point, which is in the marker's frame
+        # elements of a list marker, each at a point in the marker's frame, which `_listed_solids` adds
         element_kind = BOX if marker_type == 6 else SPHERE
         return [Solid(element_kind, position, quaternion, scale, (point,)) for point in points]
     if marker_type == 11 and len(points) >= 3:
@@ -270,8 +269,8 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
         for primitive in get(entity, name) or ():
             size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
-                # both scales are 0 if a protobuf sender leaves them unset, which means 1
-                # the cylinder around a cone
+                # a cylinder around a cone. A protobuf sender that leaves the scales unset sends 0, which
+                # means 1.
                 scale = (
                     max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale"))) or 1.0
                 )
@@ -290,7 +289,7 @@ def _triangles(pose: tuple[Numbers, Numbers], corners: Sequence[Numbers]) -> lis
 
 
 def solids_of_perceived_object(perceived_object: Any, get: GetField) -> list[Solid]:
-    """Return the solid of a derived_object_msgs/Object: its shape, otherwise its polygon, or its position."""
+    """Return the solid of a derived_object_msgs/Object: its shape, else its polygon, else a point."""
     # 1 BOX, 2 SPHERE, 3 CYLINDER and 4 CONE: radii and height, not diameters, as in
     # https://github.com/ros2/common_interfaces/blob/humble/shape_msgs/msg/SolidPrimitive.msg
     pose = _pose(get(perceived_object, "pose"), get)
@@ -330,7 +329,7 @@ def _or_one(value: Any) -> float:
 
 
 EVERY_OBJECT = -1
-"""Code for all objects of a topic, instead of the code of a name."""
+"""Name code that stands for all objects of a topic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,21 +358,21 @@ class Detections:
     """R objects in M messages of a topic.
 
     Attributes:
-        message: (R,) int64, increasing: index of each object's message.
+        message: (R,) int64, index of each object's message, never decreasing.
         name, class_code: (R,) int64 codes.
         frames: name of each object's frame; None if all objects are in the fixed frame.
         stamp_ns: (R,) int64; None if messages have no stamps.
         poses: poses of the objects.
         solids: solids of the objects.
-        height: (R, 2) bottom and top above each object's origin; None for the heights of the solids.
-        uncertainty: (R,) radius.
-        covariance: (R, 3, 3) covariance of each position, times the square of the number of standard
-            deviations; or None.
-        lifetime_ns: (R,), 0 for no limit; None if the topic has no lifetimes.
+        height: (R, 2) bottom and top above each object's origin; None if solids give the heights.
+        uncertainty: (R,) radii.
+        covariance: (R, 3, 3) covariances of positions, times the squared number of standard deviations; None
+            if the mapping reads none.
+        lifetime_ns: (R,) lifetimes, 0 for no limit; None if the topic has no lifetimes.
         is_locked: (R,) whether an object moves with its frame; None if no object does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.
         skipped: number of objects without a solid.
-        numbers: (R, W) all numbers that the binding reads, unchanged; None without a binding.
+        numbers: (R, W) all numbers that the binding reads, before conversion; None without a binding.
     """
 
     message: Integers
@@ -427,13 +426,14 @@ class Detections:
 
 @dataclass(slots=True)
 class DetectionChunk:
-    """Objects of a few messages, partly as lists; for other attributes see `Detections`.
+    """Objects of a few messages, partly as lists; see `Detections` for the other attributes.
 
     Attributes:
-        places: index of each message in its batch.
-        deleted, message: messages as indices into `places`.
+        places: index of each message in the batch.
+        deleted, message: as in `Detections`, with messages as indices into `places`.
         numbers: (R, W) all numbers that the binding reads from an object.
-        noted_stamps: (index in the batch, stamp) of messages; only of the first if frames are not read.
+        noted_stamps: (index in the batch, stamp) of each message; only the first message if frames are not
+            read.
         outline_counts: (R,) number of polygons of each object.
         corner_counts: number of corners of each polygon.
         corners: (V, 3) corners of all polygons.
@@ -464,7 +464,8 @@ def detections_from_chunks(
     """Join the chunks of a batch into columns.
 
     Args:
-        good: (N,) whether a message of the batch was read; the result numbers only the good messages.
+        good: (N,) whether each message of the batch was read. Message indices of the result count good
+            messages.
     """
     good_number = np.cumsum(good) - 1
     deleted = [
@@ -531,7 +532,7 @@ def _join_columns(columns: Iterable[Sequence[int]]) -> Integers:
 
 
 def poses_from_numbers(layout: MessageLayout, binding: Binding, numbers: Floats) -> Poses:
-    """Return the poses in the numbers (R, W); objects without an orientation have the axes of their frame."""
+    """Return the poses in numbers (R, W); an object without an orientation has its frame's axes."""
     count = len(numbers)
     position = np.zeros((count, 3))
     if layout.origin is not None:
@@ -549,14 +550,14 @@ def poses_from_numbers(layout: MessageLayout, binding: Binding, numbers: Floats)
 
 
 _EQUATOR_M, _ECCENTRICITY_SQUARED = 6_378_137.0, 6.694379990141316e-3
-"""Ellipsoid of WGS 84: semi-major axis, metres, and squared first eccentricity."""
+"""WGS 84 ellipsoid: semi-major axis in metres, and squared first eccentricity."""
 
 
 def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     """Return metres east and north of an origin (R, 2), in the plane tangent to the ellipsoid at the origin.
 
     Args:
-        fixes: (R, 2 or 3) latitude and longitude in degrees, and maybe a status; a negative status means no
+        fixes: (R, 2 or 3) latitude and longitude in degrees, and maybe a status. A negative status means no
             fix, as in sensor_msgs/NavSatStatus.
         origin: latitude and longitude in degrees.
     """
@@ -576,14 +577,14 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     )
     offsets_m = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
     metres: Floats = offsets_m @ np.stack([east, north], axis=1)
-    # longitudes may run to 360 degrees
+    # longitudes may go up to 360 degrees
     is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
     metres[np.flatnonzero(is_off)] = np.nan
     return metres
 
 
 def heights_from_numbers(binding: Binding, numbers: Floats) -> Floats | None:
-    """Return bottom and top (R, 2) of objects above their origins; None if the binding has no height."""
+    """Return bottom and top (R, 2) above the objects' origins; None if the binding has no height."""
     if not binding.height:
         return None
     count = len(numbers)
@@ -602,7 +603,7 @@ def radii_from_numbers(binding: Binding, numbers: Floats, count: int) -> Floats:
 
 
 def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> Floats | None:
-    """Return the covariances (R, 3, 3) of positions, times the squared number of deviations."""
+    """Return the covariances (R, 3, 3) of positions, times the squared number of standard deviations."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
     covariance_rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
@@ -615,7 +616,7 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
 
 
 def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
-    """Return the solids of objects, at least one per object, and the pose of each object's first solid."""
+    """Return all solids, and the pose of each object's first solid; each object needs a solid."""
     solid_counts = np.array([len(solids) for solids in solid_lists], np.int64)
     solids = list(chain.from_iterable(solid_lists))
     position = _array([solid.position for solid in solids], 3)
@@ -637,7 +638,7 @@ def _listed_solids(solid_lists: list[list[Solid]]) -> tuple[Solids, Poses]:
 
 
 def solids_of_shape(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
-    """Return one solid per object: the shape of the mapping, or of the message, or a point."""
+    """Return one solid per object: the mapping's shape, the message's sizes, or a point."""
     shape = layout.shape
     position = poses.position if shape is None else _origins_of_shape(shape, poses)
     count = len(position)
@@ -677,9 +678,9 @@ def _polygons(
 
     Args:
         outline_counts: (R,) number of polygons of each object.
-        counts: number of corners of each polygon.
-        frames: positions (R, 3) and rotations (R, 3, 3) of the objects' frames; None for corners in the frame
-            of their message.
+        corner_counts: number of corners of each polygon.
+        frames: positions (R, 3) and rotations (R, 3, 3) of the objects' frames; None for corners in the
+            message's frame.
     """
     polygon_count = len(corner_counts)
     owner, kind = (

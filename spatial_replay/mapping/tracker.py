@@ -4,7 +4,7 @@
 arranges them in a timeline, together with the departures of objects. `Events.state` reads the timeline at
 the times of samples.
 
-The tracker holds the last state of every object and signal, so that a log can be processed in parts.
+The tracker holds the last state of every object and signal. So a log can be processed in parts.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from spatial_replay.trace.trace import ABSENT, LONG_PAUSE, Pauses, Trace, class_
 from spatial_replay.trace.units import Axes
 
 LEFT = -1
-"""Code instead of a row, for an object that has left."""
+"""Row number of an object that has left."""
 
 STALE = -2
-"""Code instead of a row, for an existing object whose last observation is too old."""
+"""Row number of an existing object whose last observation is too old."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Events:
 
     Attributes:
         name, time_ns, class_code: (E,) int64.
-        row: (E,) int64, row of the observation, or `LEFT`.
+        row: (E,) int64, row number of the observation, or `LEFT`.
         expires_ns: (E,) int64, time at which the object leaves without another event.
     """
 
@@ -92,10 +92,11 @@ class Events:
     def _standing(
         self, event_indices: Integers, starts: Integers | int, times_ns: Integers, max_age_ns: int
     ) -> tuple[Integers, Integers, Integers]:
-        """Return rows, class codes and report times at some times.
+        """Return an object's row numbers, class codes and report times at some times.
 
         Args:
-            at: index of the last event up to each time; below `starts` if the object has no event so far.
+            event_indices: index of the last event up to each time; below `starts` before the object's first
+                event.
             starts: index of the first event of the object.
         """
         has_appeared = event_indices >= starts
@@ -112,7 +113,7 @@ class States(NamedTuple):
 
     Attributes:
         names: (N,), distinct codes.
-        rows: (T, N), each a row, `ABSENT` or `STALE`.
+        rows: (T, N), row numbers, `ABSENT` or `STALE`.
         classes: (T, N), codes.
         reported_ns: (T, N), time of the last report.
     """
@@ -137,7 +138,7 @@ def events_from_messages(
         times_ns: (M,) time of each message.
         rows: (R,) row of each detection.
         alive: last earlier event of each object that has not left.
-        is_complete: whether objects missing from a message have left.
+        is_complete: whether an object missing from a message has left.
     """
     name, message, lifetime_ns = detections.name, detections.message, detections.lifetime_ns
     expires_ns = np.full(len(name), FOREVER_NS, np.int64)
@@ -153,7 +154,7 @@ def events_from_messages(
         left_name = np.concatenate([left_name, deletion_pairs[:, 1]])
     every_name = np.concatenate([left_name, name])
     every_message = np.concatenate([left_message, message])
-    # departures come first in the stable sort, so that an object deleted and reported by a message exists
+    # departures come first in the stable sort, so that an object deleted and reported by one message exists
     event_order = np.lexsort((every_message, every_name))
     left_count = len(left_name)
 
@@ -184,9 +185,9 @@ def _named_deletions(detections: Detections, alive: Events) -> list[tuple[int, i
 def _left_out(
     name: Integers, message: Integers, alive_names: Integers, batch_size: int
 ) -> tuple[Integers, Integers]:
-    """Return names that are in one message and missing from the next one, and the index of the next one."""
+    """Return names that are in a message but not in the next message, and the next message's index."""
     every_name = np.concatenate([alive_names, name])
-    # objects alive before the batch count as detected in message -1, just before the first
+    # objects alive before the batch count as detected in message -1, just before message 0
     every_message = np.concatenate([np.full(len(alive_names), -1, np.int64), message])
     name_order = np.lexsort((every_message, every_name))
     name, message = every_name[name_order], every_message[name_order]
@@ -245,13 +246,13 @@ def rows_from_detections(
     concave: Concave,
     report: Callable[[int, str], None],
 ) -> ObservationRows:
-    """Transform detections into the fixed frame; rows without a transform or a valid footprint are blank.
+    """Transform detections into the fixed frame; rows without a transform, or a valid footprint, are blank.
 
     Args:
         transforms: fixed_from_frame of each object; None if all objects are in the fixed frame.
-        axes: axes of the fixed frame, from which rows are converted to ours.
+        axes: axes of the fixed frame; rows are converted to the axes of samples.
         concave: treatment of polygons that are not convex.
-        report: receiver of invalid footprints: index of the object, and the rest of the sentence.
+        report: receiver of invalid footprints: index of the object, and the sentence without its subject.
     """
     poses, solids, object_count = detections.poses, detections.solids, len(detections.name)
     is_unknown = np.zeros(object_count, np.bool_)
@@ -269,7 +270,7 @@ def rows_from_detections(
     uncertainty = detections.uncertainty if covariance is None else _radius(covariance)
     uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
-    # each detection is checked as a separate sample, so that an invalid one does not affect others
+    # each detection is checked as a separate sample, so that an invalid detection does not affect others
     indices = np.arange(object_count, dtype=np.int64)
     is_readable, footprints, faults = check_observations(
         Observations(
@@ -307,9 +308,9 @@ def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
 
 
 def _radius(covariance: Floats) -> Floats:
-    """Return the longer half axis (R,) of each covariance's ellipse in the plane, from (R, 3, 3).
+    """Return the longer half axis (R,) of each covariance's ellipse in the plane; shape of input (R, 3, 3).
 
-    The result is NaN for a negative variance, which some programs set for an unknown covariance.
+    The result is NaN for a negative variance, because some programs mark an unknown covariance so.
     """
     a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     # the larger eigenvalue of [[a, b], [b, d]]
@@ -318,11 +319,11 @@ def _radius(covariance: Floats) -> Floats:
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
-"""Calls of `advance`, or observations, after which old observations are dropped. Dropping after each call
-would be slow, because a call may process a single message."""
+"""Limits of calls of `advance`, and of stored observations, from which old observations are dropped. Dropping
+after each call would be slow, because a call may process a single message."""
 
 _FAR_NS = 366 * 86_400 * 10**9
-"""Difference of stamp and recording that shows another clock or unit, nanoseconds."""
+"""Least difference between stamp and log time that shows another clock or unit, nanoseconds."""
 
 _MOST_NAMES = 8
 """Limit of names in one remark."""
@@ -342,11 +343,11 @@ class _Following(NamedTuple):
 
 @dataclass
 class Tracker:
-    """The state of every object and signal between two parts of a log.
+    """Tracker of every object and signal over the parts of a log.
 
     Attributes:
         names, classes: codes that all topics share.
-        window_ns: start and end of the window of samples, without its end.
+        window_ns: start and end of the half-open window of samples.
         report: receiver of lost observations.
     """
 
@@ -368,7 +369,7 @@ class Tracker:
         self._placed_messages: dict[str, Booleans] = {}
         self._begun_ns: dict[str, int] = {}
         self._unplaced_ns: dict[str, list[Integers]] = defaultdict(list)
-        # times of the first messages of lost topics after the loss; FOREVER_NS before such a message
+        # time of each lost topic's first message after the loss; FOREVER_NS until such a message
         self._lost_until_ns: dict[str, int] = {}
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
@@ -388,7 +389,8 @@ class Tracker:
         """Process the pending messages up to a time.
 
         Returns:
-            Times of messages of the sampled topic (of all topics without one), and of fallback topics.
+            Message times of the sampled topic, and of fallback topics. Without a sampled topic, the first
+            array has the times of all topics.
         """
         self._advances += 1
         sampled_ns, fallback_ns = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -430,7 +432,7 @@ class Tracker:
         return np.concatenate(sampled_ns), np.concatenate(fallback_ns)
 
     def _note_messages(self, planned: PlannedTopic, times_ns: Integers, is_placed: Booleans) -> None:
-        """Note the times of a topic's messages, and whether transforms place their objects."""
+        """Note the times of a topic's messages, and whether transforms place the objects of each message."""
         name = planned.name
         self._begun_ns.setdefault(name, int(times_ns[0]))
         latest_ns, latest_placed = (
@@ -466,15 +468,15 @@ class Tracker:
         name_order = sorted((i for i in range(len(names)) if has_appeared[i]), key=names.__getitem__)
         rows, classes, reported_ns = rows[:, name_order], classes[:, name_order], reported_ns[:, name_order]
         stored_rows, is_stale = self._rows, rows == STALE
-        # unknown rows are numbered downwards from -2
+        # unknown rows have the numbers -2, -3 and so on
         is_valid = np.append(stored_rows.is_valid, False)[np.where(rows >= 0, rows, -1)]
         row_numbers = np.where((rows == ABSENT) | is_valid, rows, -2 - rows)
         if is_stale.any():
-            # a stale object keeps only its class: one blank row for each class, after the other rows
+            # a stale object keeps only its class, so one blank row per class follows the other rows
             row_numbers = np.where(is_stale, -2 - (len(stored_rows) + classes), row_numbers)
             blank_rows = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
             stored_rows = concatenate_tables([stored_rows, blank_rows])
-        # codes depend on the order of messages, on which a trace must not depend
+        # class codes depend on the order of messages, but a trace must not depend on that order
         by_code = self.classes.by_code
         classes_of = class_order(by_code)
         class_places = {name: place for place, name in enumerate(classes_of)}
@@ -499,13 +501,13 @@ class Tracker:
         )
 
     def _is_lasting(self, name: int) -> bool:
-        """Return whether an object keeps its place until its next report."""
+        """Return whether an object stays valid until its next report."""
         planned = self.readers[self._topic_of_name[name]].planned
         # static transforms count as reports in every sample
         return planned.is_lasting and not planned.is_static
 
     def _spans(self, times_ns: Integers) -> tuple[TopicSpan, ...]:
-        """Return the span of each mapped topic: the samples in which it could be judged."""
+        """Return the span of each mapped topic: the samples that its messages cover."""
         spans = []
         for topic, reader in self.readers.items():
             if not reader.is_mapped:
@@ -527,7 +529,7 @@ class Tracker:
         return tuple(spans)
 
     def _is_judged(self, planned: PlannedTopic, times_ns: Integers) -> Booleans:
-        """Return for each sample whether a topic has begun, is not silent, and is placed by transforms."""
+        """Return for each sample whether a topic has begun, is not silent, and has transforms."""
         begun_ns, heard_ns = self._begun_ns.get(planned.name), self._reported_ns.get(planned.name)
         if begun_ns is None or heard_ns is None:
             return np.zeros(len(times_ns), np.bool_)
@@ -563,7 +565,7 @@ class Tracker:
         }
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
-        """Make the objects and signals of some topics unknown from a time on; objects continue to exist."""
+        """Make objects and signals of some topics unknown from a time on; the objects continue to exist."""
         for topic in topics:
             self._begun_ns.pop(topic, None)
             last_events = self._events[topic].last()
@@ -574,7 +576,7 @@ class Tracker:
             self._events[topic] = Events(
                 last_events.name, lost_ns, rows, expires_ns, last_events.class_code
             ).after(last_events)
-            # without reports, the loss counts neither as a pause nor as a silence of the topic
+            # without reports, the loss is neither a pause nor a silence of the topic
             self._reported_ns.pop(topic, None)
         self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {
@@ -586,7 +588,7 @@ class Tracker:
     def _take_detections(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
     ) -> Booleans:
-        """Store the objects of messages; return whether transforms place the objects of each message (M,)."""
+        """Store the objects of messages; return whether transforms place each message's objects (M,)."""
         if detections.skipped:
             self.remarks.skipped[reader.name] += detections.skipped
         self._claim_names(reader.name, detections.name)
@@ -612,7 +614,7 @@ class Tracker:
         if repeated_indices:
             for repeated_index in repeated_indices:
                 report(repeated_index, " is there twice in one message; name each object once")
-            # unknown, because either of the two may be right
+            # unknown, because either of the two reports may be right
             row_numbers[repeated_indices] = self._add(
                 ObservationRows.blank(detections.class_code[repeated_indices])
             )
@@ -632,7 +634,7 @@ class Tracker:
         return is_placed
 
     def _place_following(self, topic: str, times_ns: Integers, states: States) -> None:
-        """Replace the rows (T, N) of objects that move with frames by rows for each time."""
+        """Replace row numbers (T, N) of objects that move with frames by a row for each time."""
         if not self._following:
             return
         for rows, reported_ns in zip(states.rows.T, states.reported_ns.T, strict=True):
@@ -646,7 +648,7 @@ class Tracker:
                     reported_ns[sample_indices] = times_ns[sample_indices]
 
     def _rows_at(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
-        """Return the rows of an object that moves with a frame, at some times."""
+        """Return the row numbers of an object that moves with a frame, at some times."""
         mapping, (frame, detections, index) = self.plan.mapping, following
         fixed_frame, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
         log_ns = times_ns if self.plan.by_log_time else None
@@ -673,7 +675,7 @@ class Tracker:
             self.remarks.missing.add((topic, frame, is_known), times_ns)
 
     def _count_replacements(self, topic: str, times_ns: Integers, replaced_indices: Integers) -> None:
-        """Count messages that are replaced, wholly or in part, by a later message of the same time."""
+        """Count messages that a later message with the same time replaces, wholly or in part."""
         start_ns, end_ns = self.window_ns
         replaced_ns = times_ns[replaced_indices]
         replaced_ns = replaced_ns[(replaced_ns >= start_ns) & (replaced_ns < end_ns)]
@@ -686,7 +688,6 @@ class Tracker:
             self._added_rows = []
 
     def _add(self, rows: ObservationRows) -> Integers:
-        """Add observations; return their row numbers."""
         first_row = len(self._rows) + sum(map(len, self._added_rows))
         self._added_rows.append(rows)
         return np.arange(first_row, first_row + len(rows), dtype=np.int64)
@@ -765,7 +766,7 @@ class Tracker:
         return np.flatnonzero(False if detections.is_locked is None else detections.is_locked)
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
-        """Return for each time whether it lies in a pause of the topic that is longer than `max_gap`."""
+        """Return for each time whether it is in a pause of the topic longer than `max_gap`."""
         max_gap_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported_ns.get(topic)
         planned = self.readers[topic].planned
         if max_gap_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
@@ -799,7 +800,7 @@ class Tracker:
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int
     ) -> tuple[dict[str, Floats], dict[str, Integers]]:
-        """Return the signals, and report times of signals that were reported before a sample."""
+        """Return the signals, and the report times of signals that are older than a sample."""
         columns: dict[str, Floats] = {}
         report_times_ns: dict[str, Integers] = {}
         stale_signals: list[tuple[str, str, Booleans, Booleans]] = []
@@ -816,7 +817,7 @@ class Tracker:
                 (report_indices >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
             )
             stale_signals.append((topic, name, is_stale, in_gap))
-            # if several topics report one signal, the first with a value is used
+            # if several topics report one signal, the first topic with a value is used
             earlier_values = columns.get(name, np.full(len(times_ns), np.nan))
             report_times_ns[name] = np.where(
                 np.isnan(earlier_values), reported_ns[report_indices], report_times_ns.get(name, times_ns)
@@ -833,7 +834,7 @@ class Tracker:
 
 
 class _Counts(dict[Any, tuple[int, int]]):
-    """Counts by key, with the time of the first."""
+    """Counts by key, each with the time of the first event, nanoseconds."""
 
     def add(self, key: Hashable, times_ns: Integers) -> None:
         count, first_ns = self.get(key, (0, int(times_ns[0])))
@@ -847,7 +848,7 @@ class Remarks:
         missing: observations without a transform, by (topic, frame, whether the frame is known).
         stale: samples in which an object or signal is unknown because of a silence, by (topic, whether the
             silence is longer than `max_gap`, name).
-        replaced: messages replaced by a later one of the same time, by topic.
+        replaced: messages replaced by a later message with the same time, by topic.
         skipped: objects without solids, by topic.
         stamps: first stamp without a transform, and log time of its message, by topic.
         samples: intervals between samples.
@@ -869,14 +870,14 @@ class Remarks:
     def count_stale(
         self, topic: str, name: str, times_ns: Integers, stale: Booleans, in_gap: Booleans
     ) -> None:
-        """Count the samples in which an object or a signal is unknown because its topic was silent."""
+        """Count the samples in which an object or signal is unknown because its topic was silent."""
         for is_gap in (False, True):
             stale_ns = times_ns[stale & (in_gap == is_gap)]
             if len(stale_ns):
                 self.stale.add((topic, is_gap, name), stale_ns)
 
     def add_pauses(self) -> None:
-        """Add remarks on pauses of topics, unless all of a topic's pauses are also pauses of the samples."""
+        """Add a remark on each topic's pauses, unless all of these pauses are also pauses of the samples."""
         sample_pauses = self.samples.longest_first()
         for topic, messages in sorted(self.messages.items()):
             if topic in self.lasting:
@@ -992,7 +993,7 @@ def _unheard_span(planned: PlannedTopic) -> TopicSpan:
 
 
 def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
-    """Return a clause on a stamp that is more than a year from the recording of its message, or ""."""
+    """Return a clause on a stamp more than a year from its log time; "" for other stamps."""
     if abs(stamp_ns - log_ns) < _FAR_NS:
         return ""
     year, unit = datetime.fromtimestamp(stamp_ns / 1e9, UTC).year, unit_of_stamp(stamp_ns, log_ns)
@@ -1001,7 +1002,7 @@ def _doubt_of_stamp(stamp_ns: int, log_ns: int) -> str:
 
 
 def _superseded_messages(detections: Detections, times_ns: Integers, *, is_complete: bool) -> Integers:
-    """Return the indices of messages that a later message of the same time replaces, wholly or in part."""
+    """Return the indices of messages that a later message with the same time replaces, wholly or in part."""
     has_successor = np.append(times_ns[1:] == times_ns[:-1], False)
     if is_complete or not has_successor.any():
         return np.flatnonzero(has_successor)
@@ -1015,7 +1016,6 @@ def _superseded_messages(detections: Detections, times_ns: Integers, *, is_compl
 
 
 def _changes(transforms: Transforms) -> Integers:
-    """Return the index of the first transform, and of each transform that differs from its predecessor."""
     rotation, translation, is_known = transforms
     is_changed = np.ones(len(is_known), np.bool_)
     is_changed[1:] = (
@@ -1027,7 +1027,6 @@ def _changes(transforms: Transforms) -> Integers:
 
 
 def _repeated_names(detections: Detections) -> list[int]:
-    """Return the indices of detections that repeat a name within a message."""
     name_order = np.lexsort((detections.name, detections.message))
     message, name = detections.message[name_order], detections.name[name_order]
     repeated_indices: list[int] = name_order[1:][
