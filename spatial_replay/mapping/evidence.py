@@ -55,11 +55,11 @@ class Spread:
     Values that are not finite are ignored. The median is taken from every n-th value.
     """
 
-    __slots__ = ("_held", "_stride", "count", "greatest", "greatest_ns", "least")
+    __slots__ = ("_kept_values", "_stride", "count", "greatest", "greatest_ns", "least")
 
     def __init__(self) -> None:
         self.count, self.least, self.greatest, self.greatest_ns = 0, inf, -inf, 0
-        self._held, self._stride = np.empty(0), 1
+        self._kept_values, self._stride = np.empty(0), 1
 
     def add(self, values: Floats, times_ns: Integers | None = None) -> None:
         """Add values (N,) with their times (N,)."""
@@ -77,20 +77,20 @@ class Spread:
             )
         self.least = min(self.least, float(values.min()))
         # the stride continues over calls, so that the sample does not depend on their sizes
-        kept_values = np.concatenate([self._held, values[-self.count % self._stride :: self._stride]])
+        kept_values = np.concatenate([self._kept_values, values[-self.count % self._stride :: self._stride]])
         while len(kept_values) > _MOST_VALUES:
             kept_values, self._stride = kept_values[::2], 2 * self._stride
-        self._held = kept_values
+        self._kept_values = kept_values
         self.count += len(values)
 
     @property
     def median(self) -> float:
         """The median; NaN without values."""
-        return float(np.median(self._held)) if len(self._held) else nan
+        return float(np.median(self._kept_values)) if len(self._kept_values) else nan
 
     def quantile(self, share: float) -> float:
         """Return the quantile at a share from 0 to 1; NaN without values."""
-        return float(np.quantile(self._held, share)) if len(self._held) else nan
+        return float(np.quantile(self._kept_values, share)) if len(self._kept_values) else nan
 
 
 class Moment(NamedTuple):
@@ -145,7 +145,7 @@ class Arrivals:
         self._waiting_messages = 0
         self._waiting_stamps: list[tuple[Integers, ...]] = []
         self._stamp_ns: int | None = None
-        self._since_ns = 0
+        self._stamp_since_ns = 0
 
     def add(self, times_ns: Integers, log_ns: Integers, publish_ns: Integers, channels: Integers) -> None:
         """Add messages in the order of arrival, all (N,)."""
@@ -212,21 +212,21 @@ class Arrivals:
             return
         self.lateness_s.add((log_ns - stamps_ns) / 1e9)
         if self._stamp_ns is None:
-            self._stamp_ns, self._since_ns = int(stamps_ns[0]), int(log_ns[0])
-            self._first_stamp_ns, self._first_stamp_log_ns = self._stamp_ns, self._since_ns
+            self._stamp_ns, self._stamp_since_ns = int(stamps_ns[0]), int(log_ns[0])
+            self._first_stamp_ns, self._first_stamp_log_ns = self._stamp_ns, self._stamp_since_ns
         self.stamps_passed_s = (int(stamps_ns[-1]) - self._first_stamp_ns) / 1e9
         self.log_passed_s = (int(log_ns[-1]) - self._first_stamp_log_ns) / 1e9
         is_new = np.append(stamps_ns[0] != self._stamp_ns, stamps_ns[1:] != stamps_ns[:-1])
         self.stamps_vary = self.stamps_vary or bool(is_new.any())
         # for each message, the log time of the first message with the same stamp
         since_ns = np.where(is_new, log_ns, 0)
-        since_ns[0] = since_ns[0] or self._since_ns
+        since_ns[0] = since_ns[0] or self._stamp_since_ns
         since_ns = np.maximum.accumulate(since_ns)
         still_s = (log_ns - since_ns) / 1e9
         longest_index = int(still_s.argmax())
         if still_s[longest_index] > self.longest_still_s:
             self.longest_still_s, self.still_ns = float(still_s[longest_index]), int(since_ns[longest_index])
-        self._stamp_ns, self._since_ns = int(stamps_ns[-1]), int(since_ns[-1])
+        self._stamp_ns, self._stamp_since_ns = int(stamps_ns[-1]), int(since_ns[-1])
 
 
 _NAME, _MESSAGE, _SECONDS, _X, _Y, _YAW, _TURN, _SIZE, _CLASS, _IS_NEW = range(10)
@@ -284,7 +284,7 @@ class Motions:
         self._courses = np.zeros(len(HEADINGS) + 2, np.complex128)
         self._steps = 0
         self._begin_ns = 0
-        self._tail = np.empty((0, _IS_NEW + 1))
+        self._last_reports = np.empty((0, _IS_NEW + 1))
 
     def add(self, reports: Floats, begin_ns: int, *, turns_back: bool, zero: float, scale: float) -> None:
         """Add reports (R, 10) of objects in the order of messages.
@@ -295,18 +295,20 @@ class Motions:
             zero, scale: interpretation of the angle: zero + scale * number, in radians.
         """
         self._begin_ns = begin_ns
-        reports = np.concatenate([self._tail, reports])
+        reports = np.concatenate([self._last_reports, reports])
         name_codes = reports[:, _NAME].astype(np.int64)
         reports = reports[np.argsort(name_codes, kind="stable")]
         is_same_object = reports[1:, _NAME] == reports[:-1, _NAME]
         # `behind`: number of later reports of the same object
         last_indices = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
         later_count = np.repeat(last_indices, np.diff(last_indices, prepend=-1)) - np.arange(len(reports))
-        self._tail = reports[later_count < _MOST_LEAPS].copy()
-        self._tail[:, _IS_NEW] = 0.0
-        if len(self._tail) > _MOST_ROWS:
-            message = self._tail[:, _MESSAGE]
-            self._tail = self._tail[message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]]
+        self._last_reports = reports[later_count < _MOST_LEAPS].copy()
+        self._last_reports[:, _IS_NEW] = 0.0
+        if len(self._last_reports) > _MOST_ROWS:
+            message = self._last_reports[:, _MESSAGE]
+            self._last_reports = self._last_reports[
+                message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]
+            ]
         new_indices = np.flatnonzero(is_same_object & (reports[1:, _IS_NEW] > 0)) + 1
         if not len(new_indices):
             return

@@ -96,26 +96,26 @@ class MappedSource(FileSource):
         topics = tuple(map(self._with_type, reader.topics()))
         by_name = {topic.name: topic for topic in topics}
         plan = self._plan(reader, topics)
-        mapped = frozenset(plan.topics)
-        names = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
-        channels = _foreign_channels(reader, names)
-        trees = _TreeLog(reader, topics, self.mapping.clock)
-        copied = _CopiedMessages(channels, trees)
-        read = mapped | copied.topics | trees.topics
+        mapped_topics = frozenset(plan.topics)
+        copied_topics = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped_topics)]
+        channels = _foreign_channels(reader, copied_topics)
+        tree_log = _TreeLog(reader, topics, self.mapping.clock)
+        copied_messages = _CopiedMessages(channels, tree_log)
+        read_topics = mapped_topics | copied_messages.topics | tree_log.topics
         first_ns = partial(_first_ns, cache(partial(open_messages, self.path)))
-        moving = {topic.topic for topic in plan.planned if not topic.is_static}
+        moving_topics = {topic.topic for topic in plan.planned if not topic.is_static}
         read_end_ns = FOREVER if end_ns is None or not plan.by_log_time else end_ns + plan.margin_ns
         assembler = Assembler(
             plan,
             lambda topic: reader.decoder(by_name[topic]),
-            goes_on=cache(lambda: read_end_ns < FOREVER and first_ns(moving, read_end_ns) is not None),
+            goes_on=cache(lambda: read_end_ns < FOREVER and first_ns(moving_topics, read_end_ns) is not None),
             name=self.name,
             start_ns=start_ns,
             end_ns=end_ns,
             on_time_jump=self.reading.on_time_jump,
             concave=self.reading.concave,
         )
-        blocks = _Blocks(assembler, reader, copied, start_ns or 0, end_ns)
+        blocks = _Blocks(assembler, reader, copied_messages, start_ns or 0, end_ns)
         blocks.remarks.extend(
             f"{self.name}: it has no topic {topic!r}, which {self.mapping.name} marks as optional"
             for topic in plan.absent
@@ -125,12 +125,12 @@ class MappedSource(FileSource):
         blocks.remarks.extend(remarks_on_copies(self.name, channels.values()))
         files = files_of_bag_around(self.path) if isinstance(self.path, Path) else ()
         if len(files) > 1:
-            what = f"one of the {len(files)} files of a bag; give its folder for all of them"
-            blocks.remarks.append(f"{self.name}: it is {what}")
-        static = list(dict.fromkeys(topic.topic for topic in plan.planned if topic.is_static))
-        if static:
+            description = f"one of the {len(files)} files of a bag; give its folder for all of them"
+            blocks.remarks.append(f"{self.name}: it is {description}")
+        static_topics = list(dict.fromkeys(topic.topic for topic in plan.planned if topic.is_static))
+        if static_topics:
             # static transforms hold after their time, and the first one of a frame also before its time
-            assembler.know_static(open_messages(self.path).iter_messages(static))
+            assembler.know_static(open_messages(self.path).iter_messages(static_topics))
         if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
             sampled_ns = first_ns([plan.sampled_topic])
             fallback_topics = {
@@ -139,13 +139,13 @@ class MappedSource(FileSource):
             is_read = sampled_ns is None or sampled_ns >= plan.first_read_ns(start_ns)
             assembler.know_start(None if is_read else sampled_ns, first_ns(fallback_topics))
         as_recorded = self.reading.on_time_jump == "split"
-        columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
+        columns = _columns(reader, plan, read_topics, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:
-            columns = without_jumps(columns, self.name, mapped, plan.late_ns)
+            columns = without_jumps(columns, self.name, mapped_topics, plan.late_ns)
         for piece in in_pieces(columns):
             # messages that are only copied make no samples and do not advance their time
-            evaluated = piece if read == mapped else piece.of_topics(mapped)
-            yield from blocks.of(assembler.add(evaluated), piece)
+            mapped_piece = piece if read_topics == mapped_topics else piece.of_topics(mapped_topics)
+            yield from blocks.of(assembler.add(mapped_piece), piece)
             if assembler.is_finished:
                 break
         yield from blocks.of(assembler.finish(), MessageColumns(), last=True)
@@ -155,12 +155,12 @@ class MappedSource(FileSource):
 
     def _with_type(self, topic: Topic) -> Topic:
         """Return a topic; a ROS topic without a type in the log gets the type from the mapping."""
-        names = (entry.type for entry in self.mapping.topics if entry.topic == topic.name and entry.type)
-        name = next(names, None)
-        if topic.type or name is None or topic.encoding not in ("ros1", "cdr"):
+        type_names = (entry.type for entry in self.mapping.topics if entry.topic == topic.name and entry.type)
+        type_name = next(type_names, None)
+        if topic.type or type_name is None or topic.encoding not in ("ros1", "cdr"):
             return topic
-        typed = replace(topic, type=full_type_name(name))
-        return replace(typed, unreadable=why_unreadable(typed))
+        typed_topic = replace(topic, type=full_type_name(type_name))
+        return replace(typed_topic, unreadable=why_unreadable(typed_topic))
 
     def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> ReadingPlan:
         """Compare the mapping with the topics of the log.
@@ -169,8 +169,8 @@ class MappedSource(FileSource):
             LogError: a mapped topic cannot be decoded, or is missing from a damaged log.
             UsageError: the mapping does not fit the log.
         """
-        mapped = {*(entry.topic for entry in self.mapping.topics), self.mapping.sampling.topic}
-        reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
+        mapped_names = {*(entry.topic for entry in self.mapping.topics), self.mapping.sampling.topic}
+        reasons = [topic.unreadable for topic in topics if topic.name in mapped_names and topic.unreadable]
         if reasons:
             texts = [f"{self.name}: {reason}" for reason in reasons]
             raise LogError("\n".join([*texts, *reader.take_faults()]))
@@ -244,7 +244,7 @@ class _CopiedMessages:
         """
         self.topics = frozenset(channel.topic for channel in channels.values())
         self.trees = trees
-        self._numbers = list(channels)
+        self._channel_numbers = list(channels)
         self._channels = MappingProxyType(
             {number: copied_channel(channel) for number, channel in channels.items()}
         )
@@ -263,50 +263,59 @@ class _CopiedMessages:
         if not (is_all or len(trace)):
             return Messages()
         waiting = concatenate_tables(self._waiting)
-        times = waiting.log_time_ns
-        if not (times[1:] >= times[:-1]).all():
-            waiting = select(waiting, np.argsort(times, kind="stable"))
-        ready = len(waiting) if is_all else waiting.count_before(int(trace.times_ns[-1]) + 1)
-        evaluated, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
-        self._waiting = [rest] if len(rest) else []
-        self._waiting_bytes = sum(map(len, rest.payloads))
+        times_ns = waiting.log_time_ns
+        if not (times_ns[1:] >= times_ns[:-1]).all():
+            waiting = select(waiting, np.argsort(times_ns, kind="stable"))
+        ready_count = len(waiting) if is_all else waiting.count_before(int(trace.times_ns[-1]) + 1)
+        ready_messages, waiting_rest = (
+            select(waiting, slice(ready_count)),
+            select(waiting, slice(ready_count, None)),
+        )
+        self._waiting = [waiting_rest] if len(waiting_rest) else []
+        self._waiting_bytes = sum(map(len, waiting_rest.payloads))
         # by channel, because a topic may also have a channel of ours
-        copied = select(evaluated, np.flatnonzero(np.isin(evaluated.channel, self._numbers)))
-        ticks = self.trees.ticks(evaluated)
-        raw = copied.raw(self._channels)
-        return merge([raw, ticks]) if len(ticks) else raw
+        copied_messages = select(
+            ready_messages, np.flatnonzero(np.isin(ready_messages.channel, self._channel_numbers))
+        )
+        ticks = self.trees.ticks(ready_messages)
+        raw_messages = copied_messages.raw(self._channels)
+        return merge([raw_messages, ticks]) if len(ticks) else raw_messages
 
 
 class _TreeLog:
     """Converter from logs of Nav2's behaviour trees to ticks, on the clock of the mapping."""
 
     def __init__(self, reader: MessageReader, topics: Iterable[Topic], clock: Clock) -> None:
-        logs = [topic for topic in topics if topic.type == NAV2_LOG and topic.unreadable is None]
-        self.topics = frozenset(topic.name for topic in logs)
+        log_topics = [topic for topic in topics if topic.type == NAV2_LOG and topic.unreadable is None]
+        self.topics = frozenset(topic.name for topic in log_topics)
         self.faults = FaultList()
-        self._channels = reader.channels(self.topics) if logs else {}
-        self._decoders = {topic.name: reader.decoder(topic) for topic in logs}
+        self._channels = reader.channels(self.topics) if log_topics else {}
+        self._decoders = {topic.name: reader.decoder(topic) for topic in log_topics}
         self._trees = {topic: Nav2Tree() for topic in sorted(self.topics)}
         self._nodes: dict[str, tuple[TreeNode, ...]] = {}
         self._clock = clock
-        self._count = 0
+        self._tick_count = 0
 
     def ticks(self, messages: MessageColumns) -> Messages:
         """Return one tick per message of a tree's log."""
         rows = []
-        logs = select(messages, np.flatnonzero(np.isin(messages.channel, list(self._channels))))
-        for message in replace(logs, channels=self._channels).messages():
+        log_messages = select(messages, np.flatnonzero(np.isin(messages.channel, list(self._channels))))
+        for message in replace(log_messages, channels=self._channels).messages():
             try:
                 log: Any = self._decoders[message.topic](message.payload)
             except LogError as error:
                 self.faults.add(f"{message.topic}: {error}")
                 continue
             header_ns = log.timestamp.sec * 10**9 + log.timestamp.nanosec
-            times_ns = {"log": message.log_time_ns, "publish": message.publish_time_ns, "header": header_ns}
+            time_by_clock = {
+                "log": message.log_time_ns,
+                "publish": message.publish_time_ns,
+                "header": header_ns,
+            }
             self._nodes[message.topic] = self._trees[message.topic].add(log)
-            payload = self._tick().payload(times_ns[self._clock])
-            rows.append(Row(0, self._count, message.log_time_ns, message.publish_time_ns, payload))
-            self._count += 1
+            payload = self._tick().payload(time_by_clock[self._clock])
+            rows.append(Row(0, self._tick_count, message.log_time_ns, message.publish_time_ns, payload))
+            self._tick_count += 1
         return Messages.from_rows({0: TREE_CHANNEL}, rows)
 
     def _tick(self) -> TreeTick:
@@ -315,9 +324,9 @@ class _TreeLog:
             return TreeTick(None, *self._nodes.values())
         nodes: list[TreeNode] = []
         for topic in sorted(self._nodes):
-            root = len(nodes)
+            root_index = len(nodes)
             nodes.append(TreeNode(topic, "Tree", None, "RUNNING"))
-            nodes += [node._replace(parent=root) for node in self._nodes[topic]]
+            nodes += [node._replace(parent=root_index) for node in self._nodes[topic]]
         return TreeTick(None, tuple(nodes))
 
 
@@ -325,32 +334,32 @@ def _first_ns(
     open_reader: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
 ) -> int | None:
     """Return the log time of the first message of some topics, at or after a time; None without one."""
-    named = [topic for topic in topics if topic is not None]
-    messages = open_reader().iter_messages(named, log_ns) if named else ()
+    topic_names = [topic for topic in topics if topic is not None]
+    messages = open_reader().iter_messages(topic_names, log_ns) if topic_names else ()
     return next((message.log_time_ns for message in messages), None)
 
 
 def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping[int, Channel]:
     """Return the channels of some topics, without channels that a replay writes from the samples."""
     channels = reader.channels(topics)
-    ours = [number for number, channel in channels.items() if has_our_type(channel)]
+    own_channels = [number for number, channel in channels.items() if has_our_type(channel)]
     # only logs that we wrote have channels of ours; elsewhere, channels with our types are foreign
-    if ours and METADATA in dict(reader.metadata()):
-        return {number: channel for number, channel in channels.items() if number not in ours}
+    if own_channels and METADATA in dict(reader.metadata()):
+        return {number: channel for number, channel in channels.items() if number not in own_channels}
     return channels
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:
     """Return remarks on unmapped topics that cannot be decoded, with their message counts."""
-    sent = [topic for topic in topics if topic.count != 0 and topic.name not in plan.topics]
-    unread = [topic for topic in sent if topic.unreadable]
+    sent_topics = [topic for topic in topics if topic.count != 0 and topic.name not in plan.topics]
+    unread_topics = [topic for topic in sent_topics if topic.unreadable]
     remarks = []
-    for topic in unread[:_MOST_UNREAD]:
-        count = "an unknown number" if topic.count is None else f"{topic.count}"
-        remarks.append(f"{name}: {topic.unreadable}; it is not mapped: messages not read: {count}")
-    if len(unread) > _MOST_UNREAD:
-        more = len(unread) - _MOST_UNREAD
-        remarks.append(f"{name}: of the topics that are not mapped, {more} more cannot be decoded")
+    for topic in unread_topics[:_MOST_UNREAD]:
+        count_text = "an unknown number" if topic.count is None else f"{topic.count}"
+        remarks.append(f"{name}: {topic.unreadable}; it is not mapped: messages not read: {count_text}")
+    if len(unread_topics) > _MOST_UNREAD:
+        more_count = len(unread_topics) - _MOST_UNREAD
+        remarks.append(f"{name}: of the topics that are not mapped, {more_count} more cannot be decoded")
     return remarks
 
 
@@ -366,10 +375,10 @@ def _columns(
     """Iterate over the messages of some topics in a window, and over other messages that affect it."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
         return reader.iter_columns(topics, as_recorded=as_recorded)
-    last = None if end_ns is None else end_ns + plan.margin_ns
-    first = plan.first_read_ns(start_ns or 0)
-    lasting = [topic for topic in plan.topics if plan.lookback_ns(topic) is None]
-    window = reader.iter_columns(topics, first or None, last, as_recorded=as_recorded)
-    if not lasting or not first:
-        return window
-    return chain(reader.iter_columns(lasting, None, first, as_recorded=as_recorded), window)
+    last_ns = None if end_ns is None else end_ns + plan.margin_ns
+    first_ns = plan.first_read_ns(start_ns or 0)
+    lasting_topics = [topic for topic in plan.topics if plan.lookback_ns(topic) is None]
+    window_columns = reader.iter_columns(topics, first_ns or None, last_ns, as_recorded=as_recorded)
+    if not lasting_topics or not first_ns:
+        return window_columns
+    return chain(reader.iter_columns(lasting_topics, None, first_ns, as_recorded=as_recorded), window_columns)

@@ -262,10 +262,12 @@ _LATITUDE, _LONGITUDE = re.compile(r"lat(itude)?", re.I), re.compile(r"lon|lng|l
 
 def geodetic_order(paths: Alternatives) -> Alternatives | None:
     """Return the paths of latitude and longitude among the paths of a position; None without these names."""
-    names = [path.rpartition(".")[2] for path in paths]
-    latitude = [path for path, name in zip(paths, names, strict=True) if _LATITUDE.fullmatch(name)]
-    longitude = [path for path, name in zip(paths, names, strict=True) if _LONGITUDE.fullmatch(name)]
-    return (latitude[0], longitude[0]) if latitude and longitude else None
+    last_names = [path.rpartition(".")[2] for path in paths]
+    latitude_paths = [path for path, name in zip(paths, last_names, strict=True) if _LATITUDE.fullmatch(name)]
+    longitude_paths = [
+        path for path, name in zip(paths, last_names, strict=True) if _LONGITUDE.fullmatch(name)
+    ]
+    return (latitude_paths[0], longitude_paths[0]) if latitude_paths and longitude_paths else None
 
 
 def geodetic_paths(layout: MessageLayout) -> Alternatives | None:
@@ -276,21 +278,31 @@ def geodetic_paths(layout: MessageLayout) -> Alternatives | None:
 def short_type(name: str) -> str:
     """Return `pkg/Name` for the name of a type in ROS 1, ROS 2, protobuf or Foxglove's JSON schemas."""
     words = re.split(r"[/.]|::", name)
-    short = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
-    return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short)
+    short_name = f"{words[0]}/{words[-1]}" if len(words) > 1 else name
+    return re.sub(r"^(ros_)?foxglove_msgs/", "foxglove/", short_name)
 
 
 def name_pattern(layout: MessageLayout, mapping: TopicMapping) -> str:
     """Return a regular expression for the possible names of a topic's objects."""
-    parts = re.split(r"\{([^{}]+)\}", layout.name)
-    texts = [name_from_topic(mapping.topic) if part == "topic" else None for part in parts[1::2]]
-    fields = [".+" if text is None else re.escape(text) for text in texts]
-    literals = [re.escape(part) for part in parts[::2]]
-    template = literals[0] + "".join(field + text for field, text in zip(fields, literals[1:], strict=True))
-    only, without = ("|".join(map(translate, patterns)) for patterns in (mapping.only, mapping.without))
+    template_parts = re.split(r"\{([^{}]+)\}", layout.name)
+    topic_names = [
+        name_from_topic(mapping.topic) if part == "topic" else None for part in template_parts[1::2]
+    ]
+    field_patterns = [".+" if text is None else re.escape(text) for text in topic_names]
+    literals = [re.escape(part) for part in template_parts[::2]]
+    template = literals[0] + "".join(
+        field_pattern + text for field_pattern, text in zip(field_patterns, literals[1:], strict=True)
+    )
+    only_pattern, without_pattern = (
+        "|".join(map(translate, patterns)) for patterns in (mapping.only, mapping.without)
+    )
     if layout.class_changes == "split":
         template += "(_.+)?"
-    return (f"(?={only})" if only else "") + (f"(?!{without})" if without else "") + template
+    return (
+        (f"(?={only_pattern})" if only_pattern else "")
+        + (f"(?!{without_pattern})" if without_pattern else "")
+        + template
+    )
 
 
 def possible_classes(layout: MessageLayout) -> frozenset[str] | None:

@@ -348,15 +348,17 @@ def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> boo
 
     Such lists, for example detections and tracks, have the same objects.
     """
-    near = count = 0
+    shared_count = object_count = 0
     with suppress(FieldError, TypeError):
         for message in messages:
-            places = [_place_of(first, element) for element in _objects_in(first, message)]
+            first_places = [_place_of(first, element) for element in _objects_in(first, message)]
             for element in _objects_in(second, message):
-                place = _place_of(second, element)
-                count += 1
-                near += any(hypot(x - place[0], y - place[1]) < _SAME_PLACE for x, y, *_ in places)
-    return 2 * near > count
+                second_place = _place_of(second, element)
+                object_count += 1
+                shared_count += any(
+                    hypot(x - second_place[0], y - second_place[1]) < _SAME_PLACE for x, y, *_ in first_places
+                )
+    return 2 * shared_count > object_count
 
 
 _SAME_PLACE = 0.2

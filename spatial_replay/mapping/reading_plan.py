@@ -127,54 +127,58 @@ class ReadingPlan:
         faults = _faults_of(mapping, by_name)
         if faults:
             raise UsageError("\n".join(f"{mapping.name}: {fault}" for fault in faults))
-        mapped: dict[str, list[TopicMapping | None]] = {}
+        entries_by_topic: dict[str, list[TopicMapping | None]] = {}
         for entry in mapping.topics:
-            mapped.setdefault(entry.topic, []).append(entry)
+            entries_by_topic.setdefault(entry.topic, []).append(entry)
         needs_frames = mapping.fixed_frame is not None
-        names = [topic for topic in mapped if topic in by_name]
-        others = [topic for topic in topics if needs_frames and topic.name not in mapped]
-        transforms = [topic for topic in others if short_type(topic.type) in TRANSFORM_TYPES]
-        names += [topic.name for topic in transforms if topic.unreadable is None]
-        lost = [
-            (topic.name, topic.unreadable) for topic in transforms if topic.unreadable and topic.count != 0
+        topic_names = [topic for topic in entries_by_topic if topic in by_name]
+        unmapped_topics = [topic for topic in topics if needs_frames and topic.name not in entries_by_topic]
+        transform_topics = [topic for topic in unmapped_topics if short_type(topic.type) in TRANSFORM_TYPES]
+        topic_names += [topic.name for topic in transform_topics if topic.unreadable is None]
+        lost_topics = [
+            (topic.name, topic.unreadable)
+            for topic in transform_topics
+            if topic.unreadable and topic.count != 0
         ]
         is_stepped = mapping.sampling.step_ns is not None
-        sampled = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, by_name)
-        if sampled is not None and sampled not in names:
-            names.append(sampled)
+        sampled_topic = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, by_name)
+        if sampled_topic is not None and sampled_topic not in topic_names:
+            topic_names.append(sampled_topic)
         planned = tuple(
-            _plan_of_topic(mapping, entry, by_name[name], place, needs_frames)
-            for name in names
-            for place, entry in enumerate(mapped.get(name, [None]))
+            _plan_of_topic(mapping, entry, by_name[name], entry_index, needs_frames)
+            for name in topic_names
+            for entry_index, entry in enumerate(entries_by_topic.get(name, [None]))
         )
-        is_whole = all(topic in by_name for topic in mapped)
-        if mapping.origin is not None and is_whole and not any(topic.is_geodetic for topic in planned):
+        has_all_topics = all(topic in by_name for topic in entries_by_topic)
+        if mapping.origin is not None and has_all_topics and not any(topic.is_geodetic for topic in planned):
             raise UsageError(
                 f"{mapping.name}: origin: it has no effect, since no topic has positions in degrees; name"
                 " fields called latitude and longitude as `position`, or leave it out"
             )
         waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
-        fallback_topics = _fallback_topics(planned, sampled)
-        silences_ns = (topic.silence_ns for topic in planned if topic.name == sampled)
+        fallback_topics = _fallback_topics(planned, sampled_topic)
+        silences_ns = (topic.silence_ns for topic in planned if topic.name == sampled_topic)
         silence_ns = max([DEFAULT_MAX_AGE_NS, *silences_ns])
-        longest_silence_ns = max(silence_ns, _LONGEST_SILENCE_NS) if sampled and fallback_topics else 0
+        longest_silence_ns = max(silence_ns, _LONGEST_SILENCE_NS) if sampled_topic and fallback_topics else 0
         wait_ns = late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0)
         return cls(
             mapping=mapping,
-            topics=tuple(names),
+            topics=tuple(topic_names),
             by_log_time=all(topic.clock == "log" for topic in planned),
             late_ns=late_ns,
             wait_ns=wait_ns,
             margin_ns=max(wait_ns, late_ns + longest_silence_ns),
             planned=planned,
-            sampled_topic=sampled,
+            sampled_topic=sampled_topic,
             fallback_topics=fallback_topics,
             silence_ns=silence_ns,
             longest_silence_ns=longest_silence_ns,
-            lost=tuple(lost),
-            absent=tuple(topic for topic in mapped if topic not in by_name),
+            lost=tuple(lost_topics),
+            absent=tuple(topic for topic in entries_by_topic if topic not in by_name),
             remarks=(
-                *_slow_sampling(sampled, [by_name[topic] for topic in mapped if topic in by_name], by_name),
+                *_slow_sampling(
+                    sampled_topic, [by_name[topic] for topic in entries_by_topic if topic in by_name], by_name
+                ),
                 *doubts_of(topics, has_frames=needs_frames, has_stamps=mapping.clock == "header"),
             ),
         )
@@ -208,35 +212,42 @@ class ReadingPlan:
 
     def first_read_ns(self, start_ns: int) -> int:
         """Return the log time from which messages affect a window that starts at `start_ns`."""
-        lookbacks = [self.lookback_ns(topic) for topic in self.topics]
-        return max(0, start_ns - max((lookback for lookback in lookbacks if lookback is not None), default=0))
+        lookbacks_ns = [self.lookback_ns(topic) for topic in self.topics]
+        return max(
+            0,
+            start_ns
+            - max((lookback_ns for lookback_ns in lookbacks_ns if lookback_ns is not None), default=0),
+        )
 
 
 def _faults_of(mapping: LogMapping, by_name: dict[str, Topic]) -> list[str]:
     if not mapping.topics:
         return ["its keys are for data sets of episodes, and this log has messages; name its `topics`"]
     faults: list[str] = []
-    named = [entry.topic for entry in mapping.topics]
-    sampled = mapping.sampling.topic
-    optional = {entry.topic for entry in mapping.topics if entry.optional}
-    for name in [*named, *([sampled] if sampled is not None and sampled not in named else [])]:
-        where = f"topics.{name}" if name in named else "sample.topic"
-        if name in optional and name not in by_name:
-            if name == sampled:
+    mapped_names = [entry.topic for entry in mapping.topics]
+    sampled_topic = mapping.sampling.topic
+    optional_names = {entry.topic for entry in mapping.topics if entry.optional}
+    for name in [
+        *mapped_names,
+        *([sampled_topic] if sampled_topic is not None and sampled_topic not in mapped_names else []),
+    ]:
+        key_path = f"topics.{name}" if name in mapped_names else "sample.topic"
+        if name in optional_names and name not in by_name:
+            if name == sampled_topic:
                 faults.append(
                     f"sample.topic: the log has no topic {name!r}, so no sample can be taken; name one that"
                     " every log has, or {every: 100ms}"
                 )
         elif name not in by_name:
             hint = nearest_hint(name, by_name) or f"its topics are {_topics_in_words(by_name)}"
-            if name in named and not hint.endswith("?"):
+            if name in mapped_names and not hint.endswith("?"):
                 hint += "; where only some logs have it, add `optional: true`"
-            faults.append(f"{where}: the log has no topic {name!r}; {hint}")
+            faults.append(f"{key_path}: the log has no topic {name!r}; {hint}")
         elif (reason := by_name[name].unreadable) is not None:
-            faults.append(f"{where}: its messages cannot be decoded: {reason}")
-    if optional.issuperset(named) and by_name.keys().isdisjoint(named):
-        names = _topics_in_words(by_name)
-        faults.append(f"topics: the log has none of these optional topics; its topics are {names}")
+            faults.append(f"{key_path}: its messages cannot be decoded: {reason}")
+    if optional_names.issuperset(mapped_names) and by_name.keys().isdisjoint(mapped_names):
+        topic_text = _topics_in_words(by_name)
+        faults.append(f"topics: the log has none of these optional topics; its topics are {topic_text}")
     for entry in mapping.topics:
         kind = short_type(entry.type or (by_name[entry.topic].type if entry.topic in by_name else ""))
         if (
@@ -265,10 +276,12 @@ def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
 
     Without objects, all topics are candidates. If the log does not give counts, the first candidate is taken.
     """
-    present = [entry for entry in mapping.topics if entry.topic in by_name]
-    names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
-    counts = [by_name[name].count for name in names]
-    return names[0] if None in counts else max(names, key=lambda name: by_name[name].count or 0)
+    existing_entries = [entry for entry in mapping.topics if entry.topic in by_name]
+    names = [entry.topic for entry in existing_entries if entry.reads_objects] or [
+        entry.topic for entry in existing_entries
+    ]
+    message_counts = [by_name[name].count for name in names]
+    return names[0] if None in message_counts else max(names, key=lambda name: by_name[name].count or 0)
 
 
 def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
@@ -276,14 +289,14 @@ def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> fr
 
     Topics of static transforms, of markers and latched topics are excluded, because they are sent rarely.
     """
-    mapped = [
+    frequent_topics = [
         topic
         for topic in planned
         if topic.mapping is not None
         and not (topic.is_static or topic.is_latched or (topic.layout is not None and topic.layout.stays))
     ]
-    with_objects = [topic for topic in mapped if topic.layout is not None]
-    return frozenset(topic.name for topic in with_objects or mapped if topic.topic != sampled)
+    topics_with_objects = [topic for topic in frequent_topics if topic.layout is not None]
+    return frozenset(topic.name for topic in topics_with_objects or frequent_topics if topic.topic != sampled)
 
 
 _MANY_TIMES = 10
@@ -294,14 +307,18 @@ def _slow_sampling(
     sampled: str | None, mapped: Sequence[Topic], by_name: Mapping[str, Topic]
 ) -> tuple[str, ...]:
     """Return a remark if a mapped topic has many times the messages of the sampled topic."""
-    most = max(mapped, key=lambda topic: topic.count or 0)
-    count = None if sampled is None else by_name[sampled].count
-    if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
+    busiest_topic = max(mapped, key=lambda topic: topic.count or 0)
+    sampled_count = None if sampled is None else by_name[sampled].count
+    if (
+        sampled_count is None
+        or busiest_topic.count is None
+        or busiest_topic.count < _MANY_TIMES * max(sampled_count, 1)
+    ):
         return ()
-    messages = plural(count, "message")
+    messages = plural(sampled_count, "message")
     return (
-        f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
-        f" `sample: {{topic: {most.name}}}` takes one at each of these",
+        f"samples are taken at {sampled}, which has {messages}, where {busiest_topic.name} has"
+        f" {busiest_topic.count}; `sample: {{topic: {busiest_topic.name}}}` takes one at each of these",
     )
 
 
@@ -310,27 +327,29 @@ def doubts_of(
 ) -> Iterator[str]:
     """Yield doubts about a mapping without a fixed frame, or with `clock: log`."""
     topics = tuple(topics)
-    transforms = [topic.name for topic in topics if short_type(topic.type) in TRANSFORM_TYPES]
-    moving = [name for name in transforms if not name.endswith("tf_static")]
-    if len(moving) > 1 and not has_frames:
+    transform_topics = [topic.name for topic in topics if short_type(topic.type) in TRANSFORM_TYPES]
+    moving_topics = [topic_name for topic_name in transform_topics if not topic_name.endswith("tf_static")]
+    if len(moving_topics) > 1 and not has_frames:
         yield (
-            f"transforms come on {' and '.join(moving)}, so frames of one name may be of two robots; without"
-            " `fixed_frame`, coordinates are taken to be in one frame"
+            f"transforms come on {' and '.join(moving_topics)}, so frames of one name may be of two robots;"
+            " without `fixed_frame`, coordinates are taken to be in one frame"
         )
-    clock = next((topic.name for topic in topics if short_type(topic.type) == "rosgraph_msgs/Clock"), None)
-    if clock is not None and not has_stamps:
+    clock_topic = next(
+        (topic.name for topic in topics if short_type(topic.type) == "rosgraph_msgs/Clock"), None
+    )
+    if clock_topic is not None and not has_stamps:
         yield (
-            f"{clock} has simulated time, which may run at another rate than the recording; `clock: header`"
-            " takes the stamps of messages"
+            f"{clock_topic} has simulated time, which may run at another rate than the recording; `clock:"
+            " header` takes the stamps of messages"
         )
 
 
 def _plan_of_topic(
-    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, place: int, needs_frames: bool
+    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, entry_index: int, needs_frames: bool
 ) -> PlannedTopic:
     kind = short_type((entry.type if entry is not None else None) or topic.type)
     # only the first entry of a topic adds its transforms
-    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and place == 0
+    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and entry_index == 0
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
     if layout is not None and GEODETIC in layout.position:
@@ -341,12 +360,12 @@ def _plan_of_topic(
             layout = replace(layout, origin=mapping.origin, position=(paths,))
     if layout is not None and layout.polygon and layout.polygon[-1].rpartition(".")[2] in _GEOMETRIES:
         layout = replace(layout, corner_origin=mapping.origin)
-    stays = topic.latched or (layout is not None and layout.stays)
-    default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
+    stays_valid = topic.latched or (layout is not None and layout.stays)
+    default_age_ns = FOREVER_NS if stays_valid else DEFAULT_MAX_AGE_NS
     mapped_ns = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
-    max_age_ns = FOREVER_NS if is_static else mapped_ns or default
+    max_age_ns = FOREVER_NS if is_static else mapped_ns or default_age_ns
     return PlannedTopic(
-        name=f"{topic.name}[{place}]" if place else topic.name,
+        name=f"{topic.name}[{entry_index}]" if entry_index else topic.name,
         topic=topic.name,
         clock=(entry.clock if entry is not None else None) or mapping.clock,
         mapping=entry,

@@ -99,15 +99,15 @@ def mappable_features(data_set: DataSet) -> list[Feature]:
 def why_poseless(data_set: DataSet) -> str:
     """Return the reason why no mapping can find objects in a data set; "" without one."""
     features = mappable_features(data_set)
-    joints = [feature for feature in features if _holds_joints(feature)]
-    if data_set.names_bodies or len(joints) < len(features):
+    joint_features = [feature for feature in features if _holds_joints(feature)]
+    if data_set.names_bodies or len(joint_features) < len(features):
         return ""
-    names = [feature.name for feature in joints]
-    pictures = [feature.name for feature in data_set.features if "image" in feature.name]
+    names = [feature.name for feature in joint_features]
+    picture_features = [feature.name for feature in data_set.features if "image" in feature.name]
     content = "; ".join(
         [
             *([f"the joints of the robot ({listing(names)})"] if names else []),
-            *([f"pictures ({listing(pictures)})"] if pictures else []),
+            *([f"pictures ({listing(picture_features)})"] if picture_features else []),
         ]
     )
     return (
@@ -134,20 +134,20 @@ def suggest_feature_mapping(data_set: DataSet) -> str:
         raise UsageError(reason)
     features = mappable_features(data_set)
     columns, bodies = _numbers(data_set, features)
-    suggestions, twins = _without_bodies(suggest_objects(features, columns), columns, bodies)
+    suggestions, body_by_feature = _without_bodies(suggest_objects(features, columns), columns, bodies)
     if data_set.names_bodies and not suggestions and (data_set.fps or data_set.has_times):
         raise UsageError(f"{data_set.name} needs no mapping: it names its objects")
     name = printable(data_set.name)
     lines = [f"# how features of {name} become objects: a start, by their names", *_head_lines(data_set)]
     if suggestions or not data_set.names_bodies:
         lines += _feature_lines(suggestions)
-    used = {suggestion.feature for suggestion in suggestions}
-    used |= {place for suggestion in suggestions for place in suggestion.orientation}
+    used_names = {suggestion.feature for suggestion in suggestions}
+    used_names |= {place for suggestion in suggestions for place in suggestion.orientation}
     for feature in features:
-        about = f"# not used: {feature.name}: {places_text(feature)}"
-        if feature.name in twins:
-            about = f"# {feature.name}: the same as the body {twins[feature.name]}"
-        lines += [f"  {printable(about, 400)}"] if feature.name not in used else []
+        line = f"# not used: {feature.name}: {places_text(feature)}"
+        if feature.name in body_by_feature:
+            line = f"# {feature.name}: the same as the body {body_by_feature[feature.name]}"
+        lines += [f"  {printable(line, 400)}"] if feature.name not in used_names else []
     return "\n".join(lines) + "\n"
 
 
@@ -182,31 +182,33 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
     names = [feature.name for feature in features]
     # any rate will do, because only the numbers are read
     reading = AS_STORED._replace(fps=data_set.fps or 1.0)
-    rows: dict[str, list[Floats]] = {name: [] for name in names}
+    value_arrays: dict[str, list[Floats]] = {name: [] for name in names}
     bodies: list[Body] = []
-    for number, episode in enumerate(data_set.episodes[:_MOST_EPISODES]):
+    for episode_index, episode in enumerate(data_set.episodes[:_MOST_EPISODES]):
         try:
             columns = data_set.columns(episode.number, reading, names)
         except UsageError:
             # the data set cannot be read without keys of a mapping, such as `order`
             break
-        bodies += columns.bodies if number == 0 else ()
+        bodies += columns.bodies if episode_index == 0 else ()
         for name, values in columns.features.items():
-            rows[name].append(values.reshape(len(values), -1))
-    return {name: np.concatenate(parts) for name, parts in rows.items() if parts}, bodies
+            value_arrays[name].append(values.reshape(len(values), -1))
+    return {name: np.concatenate(arrays) for name, arrays in value_arrays.items() if arrays}, bodies
 
 
 def _without_bodies(
     suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
 ) -> tuple[list[Suggestion], dict[str, str]]:
     """Return the suggestions that are not bodies of the data set; by feature, the bodies of the others."""
-    twins: dict[str, str] = {}
+    body_by_feature: dict[str, str] = {}
     for suggestion in suggestions:
         for body in bodies:
             positions = columns[suggestion.feature][: len(body.positions), :3]
             if suggestion.position == ("[0:3]",) and np.allclose(positions, body.positions, atol=1e-5):
-                twins[suggestion.feature] = body.name
-    return [suggestion for suggestion in suggestions if suggestion.feature not in twins], twins
+                body_by_feature[suggestion.feature] = body.name
+    return [
+        suggestion for suggestion in suggestions if suggestion.feature not in body_by_feature
+    ], body_by_feature
 
 
 # ------------------------------------------------------------------------------------- objects by their names
@@ -214,28 +216,38 @@ def _without_bodies(
 
 def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
     """Yield objects whose coordinates have names, such as `puck_x`."""
-    points: dict[str, dict[str, str]] = {}
-    turns: dict[str, dict[str, str]] = {}
+    point_places: dict[str, dict[str, str]] = {}
+    quaternion_places: dict[str, dict[str, str]] = {}
     for place in feature.places:
-        if part := _PART.fullmatch(place):
-            turns.setdefault(part["stem"], {})[part["part"].lower()] = place
-        elif (axis := _AXIS.fullmatch(place)) and not _NO_POINT.search(axis["stem"]):
-            letter = axis["axis"].lower() if axis["axis"] else "xyz"[int(axis["number"])]
-            points.setdefault(axis["stem"], {})[letter] = place
-    points = {stem: axes for stem, axes in points.items() if {"x", "y"} <= axes.keys()}
-    used = {place for stem in points for place in (*points[stem].values(), *turns.get(stem, {}).values())}
-    signals = tuple(place for place in feature.places if place not in used)[:_MOST_SIGNALS]
-    for stem, axes in points.items():
-        position = tuple(axes[axis] for axis in "xyz" if axis in axes)
+        if part_match := _PART.fullmatch(place):
+            quaternion_places.setdefault(part_match["stem"], {})[part_match["part"].lower()] = place
+        elif (axis_match := _AXIS.fullmatch(place)) and not _NO_POINT.search(axis_match["stem"]):
+            axis_letter = (
+                axis_match["axis"].lower() if axis_match["axis"] else "xyz"[int(axis_match["number"])]
+            )
+            point_places.setdefault(axis_match["stem"], {})[axis_letter] = place
+    point_places = {
+        stem: place_by_axis
+        for stem, place_by_axis in point_places.items()
+        if {"x", "y"} <= place_by_axis.keys()
+    }
+    used_places = {
+        place
+        for stem in point_places
+        for place in (*point_places[stem].values(), *quaternion_places.get(stem, {}).values())
+    }
+    signals = tuple(place for place in feature.places if place not in used_places)[:_MOST_SIGNALS]
+    for stem, place_by_axis in point_places.items():
+        position = tuple(place_by_axis[axis] for axis in "xyz" if axis in place_by_axis)
         suggestion = Suggestion(feature.name, stem or _last_word(feature.name), position, signals=signals)
         # only the first object of a feature has its signals
         signals = ()
-        parts = turns.get(stem, {})
-        if set("wxyz") <= parts.keys():
-            places, order = tuple(parts[part] for part in "xyzw"), "xyzw"
-        elif set("0123") <= parts.keys():
+        place_by_part = quaternion_places.get(stem, {})
+        if set("wxyz") <= place_by_part.keys():
+            places, order = tuple(place_by_part[part] for part in "xyzw"), "xyzw"
+        elif set("0123") <= place_by_part.keys():
             # numbers do not show which part is w
-            places, order = tuple(parts[part] for part in "0123"), ""
+            places, order = tuple(place_by_part[part] for part in "0123"), ""
         else:
             yield suggestion
             continue
@@ -247,18 +259,22 @@ def _whole_feature(
     feature: Feature, features: Sequence[Feature], columns: Mapping[str, Floats]
 ) -> Iterator[Suggestion]:
     """Yield the object of a feature with the name of a position or a pose, such as `obj_pos`."""
-    parent, last = (["", *re.split(r"[./]", feature.name)])[-2:]
-    point, pose = _POINT.fullmatch(last), _POSE.fullmatch(last)
+    parent_word, last_word = (["", *re.split(r"[./]", feature.name)])[-2:]
+    point_match, pose_match = _POINT.fullmatch(last_word), _POSE.fullmatch(last_word)
     values = columns.get(feature.name)
-    if feature.width in (2, 3) and point is not None and not _NO_POINT.search(last):
-        name = last if point["what"].lower() == "goal" else point["stem"] or parent or last
+    if feature.width in (2, 3) and point_match is not None and not _NO_POINT.search(last_word):
+        name = (
+            last_word
+            if point_match["what"].lower() == "goal"
+            else point_match["stem"] or parent_word or last_word
+        )
         suggestion = Suggestion(feature.name, name, (f"[0:{feature.width}]",))
-        partner = f"{feature.name[: len(feature.name) - len(point['what'])]}quat"
-        if any((sibling.name, sibling.width) == (partner, 4) for sibling in features):
-            suggestion = _with_orientation(suggestion, (partner,), columns.get(partner))
+        quaternion_feature = f"{feature.name[: len(feature.name) - len(point_match['what'])]}quat"
+        if any((sibling.name, sibling.width) == (quaternion_feature, 4) for sibling in features):
+            suggestion = _with_orientation(suggestion, (quaternion_feature,), columns.get(quaternion_feature))
         yield suggestion
-    elif feature.width == 7 and pose is not None:
-        name = pose["stem"] if pose["stem"] not in ("", "root") else parent or last
+    elif feature.width == 7 and pose_match is not None:
+        name = pose_match["stem"] if pose_match["stem"] not in ("", "root") else parent_word or last_word
         suggestion = Suggestion(feature.name, name, ("[0:3]",))
         yield _with_orientation(suggestion, ("[3:7]",), None if values is None else values[:, 3:7])
 
@@ -271,16 +287,18 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
     if values is None or not len(values):
         return
     width = values.shape[1]
-    errors = [
+    length_errors = [
         float(np.abs(np.linalg.norm(values[:, start + 3 : start + 7], axis=1) - 1).max())
         for start in range(width - 6)
     ]
-    starts: list[int] = []
+    joint_starts: list[int] = []
     # the most exact quaternions first, because the seven numbers of two bodies do not overlap
-    for start in np.argsort(errors, kind="stable").tolist():
-        if errors[start] < _EXACT and all(abs(start - begin) >= 7 for begin in starts):
-            starts.append(start)
-    for number, start in enumerate(sorted(starts)):
+    for start in np.argsort(length_errors, kind="stable").tolist():
+        if length_errors[start] < _EXACT and all(
+            abs(start - joint_start) >= 7 for joint_start in joint_starts
+        ):
+            joint_starts.append(start)
+    for number, start in enumerate(sorted(joint_starts)):
         yield Suggestion(
             feature.name,
             f"body_{number}",
@@ -308,11 +326,13 @@ def _with_orientation(
         )
     if order:
         return suggestion._replace(orientation=places, order=order)
-    upright = None if HANDS.search(suggestion.name) else quaternion_order([quaternions])
-    if upright is None:
+    upright_order = None if HANDS.search(suggestion.name) else quaternion_order([quaternions])
+    if upright_order is None:
         return suggestion._replace(remark=undecided)
     return suggestion._replace(
-        orientation=places, order=upright, remark="in this order it stands upright in some frames; check it"
+        orientation=places,
+        order=upright_order,
+        remark="in this order it stands upright in some frames; check it",
     )
 
 

@@ -142,8 +142,8 @@ class Extractor:
         self._first_classes: dict[int, int] = {}
         self.namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
         self._needs_frame = needs_frame
-        self._path = FieldPath.of(layout.objects) if layout.objects else None
-        self._list: Get | None = None
+        self._list_path = FieldPath.of(layout.objects) if layout.objects else None
+        self._get_list: Get | None = None
         self._binding: Binding | None = None
         self._time: TimeGetter | None = None
         self._time_of_empty: TimeGetter | None = None
@@ -347,13 +347,13 @@ class Extractor:
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the indices of their messages, and their indices, or keys, in their lists."""
-        if self._path is None:
+        if self._list_path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
-        if self._list is None and messages:
+        if self._get_list is None and messages:
             # the first message is read step by step, because the errors of the fast getter name no fields
-            list(iter_elements(self._path, messages[0]))
-            self._list = list_getter(self._path, messages[0]) or self._elements
-        lists = list(map(self._list, messages)) if self._list is not None else []
+            list(iter_elements(self._list_path, messages[0]))
+            self._get_list = list_getter(self._list_path, messages[0]) or self._elements
+        lists = list(map(self._get_list, messages)) if self._get_list is not None else []
         keys = (
             map(str, keys_of(holder)) if isinstance(holder, Mapping) else range(len(holder))
             for holder in lists
@@ -364,7 +364,7 @@ class Extractor:
         return list(chain.from_iterable(lists)), message_indices, list_keys
 
     def _elements(self, message: object) -> list[object]:
-        return [message] if self._path is None else list(iter_elements(self._path, message))
+        return [message] if self._list_path is None else list(iter_elements(self._list_path, message))
 
     def _deleted_entities(
         self, messages: Sequence[object], entities: _Objects

@@ -726,8 +726,8 @@ class TransformReader:
     """Reader of the transforms in one topic's messages, of ROS 1, ROS 2 and Foxglove types."""
 
     def __init__(self) -> None:
-        self._list: Get | None = None
-        self._get: Get | None = None
+        self._get_list: Get | None = None
+        self._get_values: Get | None = None
 
     def add(
         self, tree: FrameTree, message: object, clock_ns: int | None, *, log_ns: int, is_static: bool
@@ -763,15 +763,15 @@ class TransformReader:
         return None
 
     def _each(self, message: object) -> Iterator[Any]:
-        if self._list is None:
+        if self._get_list is None:
             has_list = "transforms" in field_names(message)
             path = FieldPath.of("transforms")
-            self._list = getter(path, message) if has_list else lambda message: (message,)
-        return iter(self._list(message))
+            self._get_list = getter(path, message) if has_list else lambda message: (message,)
+        return iter(self._get_list(message))
 
     def _values(self, transform: Any) -> Sequence[Any]:
-        self._get = self._get or _getter(transform)
-        values: Sequence[Any] = self._get(transform)
+        self._get_values = self._get_values or _getter(transform)
+        values: Sequence[Any] = self._get_values(transform)
         return values
 
 

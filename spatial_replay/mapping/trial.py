@@ -55,11 +55,11 @@ def readable_messages(
     """
     reasons: list[str] = []
     reader = _reader(topic, entry, origin, reasons)
-    good = reader.read(np.arange(len(messages)), messages).good
+    is_good = reader.read(np.arange(len(messages)), messages).good
     reader.finish()
-    if not good.any():
+    if not is_good.any():
         raise UsageError(reasons[0])
-    return list(compress(messages, good)), reasons
+    return list(compress(messages, is_good)), reasons
 
 
 def lateness_s(
@@ -70,15 +70,15 @@ def lateness_s(
     Returns:
         None if stamps are not a clock: a stamp is missing or 0, or stamps do not advance with the recording.
     """
-    good = np.ones(len(messages), np.bool_)
+    is_good = np.ones(len(messages), np.bool_)
     try:
-        stamps_ns = _reader(topic, entry, f"{origin}clock: header\n", []).stamps(messages, times_ns, good)
+        stamps_ns = _reader(topic, entry, f"{origin}clock: header\n", []).stamps(messages, times_ns, is_good)
     except UsageError:
         return None
-    is_clock = good.all() and (stamps_ns > 0).all() and (np.diff(stamps_ns) > 0).all()
+    is_clock = is_good.all() and (stamps_ns > 0).all() and (np.diff(stamps_ns) > 0).all()
     # stamps in another unit advance by a factor of 1,000; a simulation may run some times faster than time
-    advance = np.ptp(stamps_ns) / max(1, np.ptp(times_ns))
-    if not is_clock or (len(messages) > 1 and not 1 / _FASTEST < advance < _FASTEST):
+    advance_ratio = np.ptp(stamps_ns) / max(1, np.ptp(times_ns))
+    if not is_clock or (len(messages) > 1 and not 1 / _FASTEST < advance_ratio < _FASTEST):
         return None
     return (np.asarray(times_ns) - stamps_ns) / 1e9
 
@@ -114,22 +114,22 @@ def choose_entry(
     """
     reasons: list[str] = []
     doubts = _doubts(topic, fields, messages, times_ns, origin)
-    untried = dict(_ALTERNATIVES)
-    while doubt := next((doubt for doubt in doubts if doubt.assumption in untried), None):
+    untried_alternatives = dict(_ALTERNATIVES)
+    while doubt := next((doubt for doubt in doubts if doubt.assumption in untried_alternatives), None):
         trials = [
-            (changed, rest)
-            for changed in untried.pop(doubt.assumption)(fields)
-            for rest in [_doubts(topic, changed, messages, times_ns, origin)]
-            if doubt.assumption not in {contradiction.assumption for contradiction in rest}
+            (changed_fields, remaining_doubts)
+            for changed_fields in untried_alternatives.pop(doubt.assumption)(fields)
+            for remaining_doubts in [_doubts(topic, changed_fields, messages, times_ns, origin)]
+            if doubt.assumption not in {contradiction.assumption for contradiction in remaining_doubts}
         ]
         if not trials:
             continue
         # a change may reveal another contradiction, such as a number that stands for a missing value
-        changed, rest = min(trials, key=lambda trial: len(trial[1]))
-        if len(rest) <= len(doubts):
-            keys = [f"{key}: {value}" for key, value in changed.items() if fields.get(key) != value]
+        changed_fields, remaining_doubts = min(trials, key=lambda trial: len(trial[1]))
+        if len(remaining_doubts) <= len(doubts):
+            keys = [f"{key}: {value}" for key, value in changed_fields.items() if fields.get(key) != value]
             reasons.append(f"{', '.join(keys)}, since otherwise {_clause(doubt)}")
-            fields, doubts = changed, rest
+            fields, doubts = changed_fields, remaining_doubts
     return fields, [*reasons, *(_clause(doubt, with_remedy=True) for doubt in doubts)]
 
 
@@ -143,8 +143,8 @@ def _doubts(
     try:
         assembler.add(
             [
-                Message(topic.name, time_ns, time_ns, number, str(number).encode())
-                for number, time_ns in enumerate(times_ns)
+                Message(topic.name, time_ns, time_ns, message_index, str(message_index).encode())
+                for message_index, time_ns in enumerate(times_ns)
             ]
         )
         assembler.finish()
@@ -170,11 +170,11 @@ def _yaws(fields: Fields) -> Iterator[Fields]:
     if yaw is None:
         return
     path = yaw.removeprefix("{field: ").split(",")[0]
-    kinds = ["unit: deg", f"unit: deg, {FROM_NORTH}", FROM_NORTH]
+    interpretations = ["unit: deg", f"unit: deg, {FROM_NORTH}", FROM_NORTH]
     if FROM_NORTH in yaw:
-        kinds = [f"unit: deg, {FROM_NORTH}"]
-    for kind in kinds:
-        yield {**fields, "yaw": f"{{field: {path}, {kind}}}"}
+        interpretations = [f"unit: deg, {FROM_NORTH}"]
+    for interpretation in interpretations:
+        yield {**fields, "yaw": f"{{field: {path}, {interpretation}}}"}
 
 
 def _orders(fields: Fields) -> Iterator[Fields]:
@@ -195,9 +195,9 @@ def _degrees(fields: Fields) -> Iterator[Fields]:
 
 
 def _latitudes(fields: Fields) -> Iterator[Fields]:
-    invalid = fields.get("invalid", "[]").strip("[]")
+    invalid_numbers = fields.get("invalid", "[]").strip("[]")
     # AIS sends 91 and 181 degrees for a missing position (ITU-R M.1371); GNSS receivers send degrees * 10^7
-    yield {**fields, "invalid": f"[{', '.join(filter(None, (invalid, '91, 181')))}]"}
+    yield {**fields, "invalid": f"[{', '.join(filter(None, (invalid_numbers, '91, 181')))}]"}
     yield {**fields, "scale": "1e-7"}
 
 

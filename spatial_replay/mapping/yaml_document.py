@@ -107,7 +107,7 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
     return "; put patterns in quotes: 'logs/run-[0-3]*.mcap'"
 
 
-def _find_unsupported_feature(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:
+def _find_unsupported_feature(events: Iterable[yaml.Event], noun: str) -> tuple[int, str] | None:
     """Return the line and text of the first tag, alias, lone surrogate or deep nesting; None without one.
 
     Aliases and deep nesting could expand a short text beyond memory.
@@ -125,7 +125,7 @@ def _find_unsupported_feature(events: Iterable[yaml.Event], what: str) -> tuple[
             return line, f"{event.value[:40]!r} holds half a character; write it whole"
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
-            return line, f"it is nested more than {_DEEPEST} deep; {what} is not"
+            return line, f"it is nested more than {_DEEPEST} deep; {noun} is not"
     return None
 
 
@@ -158,8 +158,10 @@ def _table(node: yaml.MappingNode, place: Place, document: Document) -> dict[str
             continue
         key = key_node.value
         if key in table:
-            what = f"the key {key[:60]!r} appears twice; the first is in line {document.lines[(*place, key)]}"
-            document.faults.append((line, what))
+            fault = (
+                f"the key {key[:60]!r} appears twice; the first is in line {document.lines[(*place, key)]}"
+            )
+            document.faults.append((line, fault))
             continue
         document.lines[(*place, key)] = line
         table[key] = _value(value_node, (*place, key), document)
@@ -258,10 +260,10 @@ def faults_by_place(
 
 def numbered_faults(document: Document, by_place: Mapping[Place, str]) -> list[tuple[int, str]]:
     """Return all faults of a document as (line, text), in order of lines."""
-    named = [
+    placed_faults = [
         (document.line_of(place), f"{_text_from_place(place)}{fault}") for place, fault in by_place.items()
     ]
-    return sorted(document.faults + named)
+    return sorted(document.faults + placed_faults)
 
 
 def _text_from_place(place: Place) -> str:
@@ -276,16 +278,16 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
     place: Place = tuple(error.absolute_path)
     keyword = error.validator
     if keyword == "anyOf" and isinstance(error.instance, dict | list):
-        branches: dict[int, list[Any]] = {}
+        violations_by_branch: dict[int, list[Any]] = {}
         for violation in error.context:
-            branches.setdefault(violation.schema_path[0], []).append(violation)
-        for branch in branches.values():
+            violations_by_branch.setdefault(violation.schema_path[0], []).append(violation)
+        for violations in violations_by_branch.values():
             # skip an alternative for another type: its violations would not help
             if not any(
                 violation.validator == "type" and len(violation.absolute_path) == len(place)
-                for violation in branch
+                for violation in violations
             ):
-                for violation in branch:
+                for violation in violations:
                     yield from _faults_in_words(violation)
                 return
     if keyword == "additionalProperties" and isinstance(error.instance, dict):
@@ -295,8 +297,8 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
                 hint = nearest_hint(key, keys) or f"known are {', '.join(keys)}"
                 yield (*place, key), f"unknown key; {hint}"
     elif keyword == "required":
-        missing = [key for key in error.validator_value if key not in error.instance]
-        yield place, f"the key {missing[0]!r} is missing"
+        missing_keys = [key for key in error.validator_value if key not in error.instance]
+        yield place, f"the key {missing_keys[0]!r} is missing"
     elif "propertyNames" in error.absolute_schema_path:
         yield place, "a name is empty; give it a name"
     else:
