@@ -1,7 +1,7 @@
 """Bind a layout to the first object of a topic: field paths in, compiled getters out.
 
-A layout lists alternative paths. The first object decides which alternative its topic has, and whether a time
-is two fields or a number. Names and classes of objects become codes.
+A layout lists alternative paths. The topic's first object decides between alternatives, and whether a time is
+two fields or a number. Names and classes of objects become codes.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _MOST_IN_NAME = 16
 
 
 class Codes(dict[Any, int]):
-    """Codes of values, numbered in the order of their first use; `by_code` lists the values."""
+    """Codes of values in the order of first use; `by_code` lists the values."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,10 +73,10 @@ class Codes(dict[Any, int]):
 
 
 class Namer:
-    """Namer of objects by a template, with codes that several namers share.
+    """Namer of objects by a template; several namers share one table of codes.
 
     Args:
-        only, without: patterns of names to keep and to leave out.
+        only, without: patterns of names to keep, and of names to leave out.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Namer:
 
     @property
     def needs_messages(self) -> bool:
-        """Whether names depend on fields of the messages, outside the objects."""
+        """Whether names depend on fields of the message outside its objects."""
         paths = (path for part in self._template.parts if not isinstance(part, str) for path in part)
         return any(path.from_message for path in paths)
 
@@ -116,7 +116,7 @@ class Namer:
 
         Args:
             indices: index or key of each object in its list.
-            messages: message of each object, if the namer `needs_messages`.
+            messages: message of each object; required if the namer `needs_messages`.
 
         Raises:
             FieldError: a field of the template is missing, or the name is empty or too long.
@@ -125,7 +125,7 @@ class Namer:
             name = "".join(str(part) for part in self._template.parts) if self._template.is_constant else ""
             return [self._codes[_check_name(name or self._topic)]] * len(objects)
         if objects and not self._is_prepared:
-            # the first object is read step by step, because the errors of the fast getter name no fields
+            # the first object is read step by step, because errors of the fast getter do not name the fields
             message = messages[0] if messages else None
             self._name(objects[0], indices[0], message)
             self._prepare(objects[0], indices[0], message)
@@ -155,7 +155,7 @@ class Namer:
         return [self._is_wanted[code] for code in codes]
 
     def _prepare(self, example: object, index: int | str, message: object) -> None:
-        """Compile a getter if the template has one field, so that names can be cached by its value."""
+        """Compile a getter if the template has a single field, so that its value can be a cache key."""
         self._is_prepared = True
         template_fields = [part for part in self._template.parts if not isinstance(part, str)]
         built_in_names = {INDEX, TOPIC}.difference(field_names(example))
@@ -230,7 +230,7 @@ def _first_value(getters: Sequence[Get], element: object) -> Any:
             continue
         if isinstance(value, Zero):
             return None
-        # as text, because lists and messages cannot be keys of a dictionary
+        # lists and messages become texts, because they cannot be keys of a dictionary
         return value if isinstance(value, str | int | float | bool) else str(value)
     return None
 
@@ -269,7 +269,7 @@ def _text(value: object, path: FieldPath) -> str:
 
 
 def _is_uuid(value: object) -> bool:
-    """Return whether a value is a sequence of 16 bytes; a text is not."""
+    """Return whether a value is a sequence of 16 bytes, but not a text."""
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != _UUID_BYTES:
         return False
     try:
@@ -305,27 +305,27 @@ _TIME_FIELDS = (
 class Binding:
     """Getters for the columns of objects.
 
-    A column is an index into the tuple that `numbers` returns. One call reads all numbers of an object,
-    because that is several times faster than one call per number.
+    A column is an index into the tuple that `numbers` returns. One call reads all numbers of an object, which
+    is several times faster than one call per number.
 
     Attributes:
         style: access to fields.
         width: number of columns.
         numbers: getter of all numbers of an object; None without numbers.
-        position: columns of x, y and maybe z; () for polygons and solids, which have their own coordinates.
-        orientation: columns of x, y, z, w; () without one.
-        yaw: column, or None.
-        sizes: columns of length, width and maybe height; () if the message has none.
+        position: columns of x, y and maybe z; () for polygons and solids, which contain coordinates.
+        orientation: columns of x, y, z, w; () without a quaternion.
+        yaw: column of the yaw; None without a yaw.
+        sizes: columns of length, width and maybe height; () for messages without sizes.
         shape_sizes, height: measures of the mapping, each a number (float) or a column (int).
-        uncertainty: number (float), column (int), or None.
+        uncertainty: radius (float) or its column (int); None without a radius.
         polygon: getter of corners or rings; None without an outline.
         has_rings: whether `polygon` returns the holder of rings instead of corners.
         class_names: names by number of a protobuf enum.
         unset: (column, path, default) of numbers that a protobuf sender may leave unset.
-        frame: getter of a frame's name, and whether it reads the message instead of the object; None for the
-            fixed frame.
+        frame: getter of a frame's name, and whether it reads the message instead of the object; None if
+            objects have no frame.
         outer_frame: getter of the message's frame, for objects with an empty frame.
-        own_stamp: getter of an object's stamp, if the message has another stamp.
+        own_stamp: getter of an object's stamp, for objects with a stamp next to the message's stamp.
     """
 
     style: Style
@@ -360,7 +360,7 @@ class TimeGetter:
     unit_ns: int
 
     def nanoseconds(self, values: Sequence[object]) -> list[int]:
-        """Return the times in the messages or objects at which `path` starts.
+        """Return the time, nanoseconds, of each value. Values are messages, or objects, according to `path`.
 
         Raises:
             FieldError: a time lies outside the times of a log.
@@ -386,7 +386,7 @@ class TimeGetter:
                 f"{self.path.text}: its nanoseconds, {nanoseconds.max()}, are not below one second, so the"
                 " stamp is invalid; `clock: log` takes the time of recording"
             )
-        # checked before the product below, which would overflow
+        # checked before the product below, because it could overflow
         if len(seconds) and max(np.abs(seconds).max(), np.abs(nanoseconds).max()) >= LATEST_NS // _SECOND_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return [int(time) for time in (seconds * _SECOND_NS + nanoseconds).tolist()]
@@ -410,7 +410,7 @@ def ns_from_text(text: str, unit_ns: int) -> int:
         ContentError: the text is none of these.
     """
     if seconds_match := _SECONDS.fullmatch(text):
-        # exact, while a float of seconds since 1970 resolves only 0.24 us
+        # exact, because a float of seconds since 1970 resolves only 0.24 us
         return int(Decimal(seconds_match[1]) * (_SECOND_NS if seconds_match[2] else unit_ns))
     date_match = _DATE.fullmatch(text)
     try:
@@ -426,7 +426,7 @@ def ns_from_text(text: str, unit_ns: int) -> int:
 
 
 def ns_from_json(value: Any) -> int:
-    """Return the nanoseconds of a time or duration in JSON; 0 without one.
+    """Return the nanoseconds of a time or duration in JSON; 0 for null.
 
     The value is an object with seconds and nanoseconds, a text such as `1.5s`, or a number of nanoseconds.
 
@@ -443,7 +443,7 @@ def ns_from_json(value: Any) -> int:
 
 
 def _is_numeral(value: object) -> bool:
-    """Return whether a value is a text of a number.
+    """Return whether a value is a number written as a text.
 
     ProtoJSON writes 64-bit integers and NaN as texts (https://protobuf.dev/programming-guides/json/).
     """
@@ -499,7 +499,7 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         example: first object of the topic, which is part of `message`.
 
     Raises:
-        FieldError: a path does not resolve; the text lists the existing fields.
+        FieldError: a path does not resolve; the message lists the existing fields.
     """
     style = style_of(example)
     if isinstance(example, Sparse):
@@ -520,7 +520,8 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     polygon, has_rings = _polygon(layout, columns)
     class_paths = [FieldPath.of(path) for path in layout.class_field]
     if len(class_paths) == 1:
-        # a single path comes from the mapping and must exist; all alternatives of a type may be missing
+        # a single path comes from the mapping and must exist; a built-in type's alternatives may all be
+        # missing
         walk(class_paths[0], example)
     frame = _frame(layout.frame, example, message, needs_frame)
     outer_frames = [path for path in layout.frame if FieldPath.of(path).from_message]
@@ -551,14 +552,15 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         unset=tuple(
             (column, path, _default(path, example))
             for column, path in enumerate(paths)
-            # an unset quaternion is zeros, which mean no rotation; few specifications need z, so it stays 0
+            # an unset quaternion of zeros means no rotation. An unset z stays 0, because few specifications
+            # need z.
             if column not in (*orientation, *position[2:]) and may_be_unset(path, example)
         ),
     )
 
 
 def _default(path: FieldPath, example: object) -> float:
-    """Return the number at a path of an empty protobuf message; 0 if the path crosses a list."""
+    """Return the default number at a path of a protobuf message; 0 if the path crosses a list."""
     try:
         return float(walk(path, type(example)()))  # type: ignore[arg-type]
     except FieldError:
@@ -566,7 +568,7 @@ def _default(path: FieldPath, example: object) -> float:
 
 
 def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
-    """Return the names by number of the first path that resolves to a protobuf enum; {} without one."""
+    """Return the names by number of the first protobuf enum at the paths; {} without an enum."""
     for path in paths:
         with suppress(FieldError):
             if names := enum_names(path, example):
@@ -575,7 +577,7 @@ def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
 
 
 def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout:
-    """Return a layout without alternatives that are missing in a sparse object, which would read as 0."""
+    """Return a layout without alternatives that a sparse object lacks, because they would read as 0."""
 
     def is_there(paths: Alternatives | str) -> bool:
         alternatives = (paths,) if isinstance(paths, str) else paths
@@ -611,7 +613,7 @@ def _position(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 class OrderError(FieldError):
-    """Missing order of a quaternion in a list, or superfluous order of a quaternion with named fields."""
+    """A quaternion in a list without an order, or a quaternion of named fields with an order."""
 
 
 def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
@@ -637,10 +639,10 @@ def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
 
 
 def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolved]) -> _Resolved | None:
-    """Resolve the first existing alternative; None if none of several exists.
+    """Return the first alternative that resolves; None if several alternatives all fail.
 
     Raises:
-        FieldError: the only alternative does not exist.
+        FieldError: the only alternative does not resolve.
     """
     for option in alternatives:
         try:
@@ -705,10 +707,10 @@ def _frame(
 def bind_time(
     stamps: Sequence[Stamp], example: object, message: object, faults: list[str] | None = None
 ) -> TimeGetter | None:
-    """Bind the first existing stamp that is a time; None if none of several is.
+    """Bind the first existing stamp that is a time; None if none of several stamps is a time.
 
     Args:
-        faults: list to which reasons are added why existing fields are not times.
+        faults: list that gets the reasons why existing fields are not times.
 
     Raises:
         FieldError: the only stamp does not exist, or is not a time.
@@ -729,11 +731,6 @@ def bind_time(
 
 
 def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
-    """Return the getter of a stamp.
-
-    Raises:
-        FieldError: the value at the path is not a time.
-    """
     value = walk(path, root)
     if stamp.nanoseconds:
         paths = [path, FieldPath.of(stamp.nanoseconds)]

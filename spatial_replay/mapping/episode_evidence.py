@@ -23,12 +23,12 @@ _GRAVITY: Final = 9.81
 
 
 def jump_remark(trace: Trace, episode: str) -> Sentence | None:
-    """Return a remark on the farthest jump of an object from one frame to the next; None without one.
+    """Return a remark on the longest jump of an object between two frames; None without a jump.
 
-    An object that is thrown or pushed moves for several frames. An object that jumps is at rest, or much
-    slower, before and after the jump. Causes are exchanged ranges of frames, and frames from before a reset.
+    A thrown or pushed object moves for several frames. A jumping object is at rest, or much slower, before
+    and after the jump. Causes are exchanged ranges of frames, and frames from before a reset.
     """
-    # a jump needs a step next to it, with which it is compared
+    # a jump is compared with the steps next to it, so it needs three frames
     if len(trace) < 3 or not len(trace.footprints.radius):
         return None
     shapes, rows = trace.footprints, trace.rows.T
@@ -70,7 +70,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
 
 
 def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[str]:
-    """Yield remarks on unnamed quaternions that stand upright only in the other order."""
+    """Yield remarks on objects with unnamed quaternions that stand upright only in the other order."""
     for bound_object in objects:
         places = bound_object.quaternion
         if (

@@ -1,7 +1,6 @@
 """Episodes of data sets as sources: columns of an episode and a mapping in; a block of samples out.
 
-All frames of an episode become samples together, by operations on arrays. Several short episodes are read
-together.
+All frames of an episode become samples by operations on arrays. Several short episodes are read together.
 """
 
 from __future__ import annotations
@@ -60,8 +59,8 @@ class EpisodeSource(Source):
 
     Attributes:
         number: number of the episode.
-        mapped_by: its mapping; None for a data set that names its bodies.
-        episode: content that was read in advance; None to read it from the data set.
+        mapped_by: mapping of the episode; None for a data set that names its bodies.
+        episode: content read in advance; None if iteration reads it from the data set.
     """
 
     data_set: DataSet
@@ -72,7 +71,7 @@ class EpisodeSource(Source):
 
     @property
     def name(self) -> str:
-        """Its address without the folder: `push_v3#17`."""
+        """Address of the episode without the folder, such as `push_v3#17`."""
         return encodable(f"{self.data_set.name}#{self.number}")
 
     @property
@@ -137,7 +136,7 @@ class EpisodeSource(Source):
         yield Block(trace, remarks=tuple(remarks))
 
     def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
-        """Yield a remark on bodies without a shape in the data set and in the mapping."""
+        """Yield a remark on bodies without a shape in both data set and mapping."""
         shapes = {} if self.mapped_by is None else self.mapped_by.shapes
         names = [body.name for body in columns.bodies if body.shapes is None and body.name not in shapes]
         if names:
@@ -179,7 +178,7 @@ class EpisodeSource(Source):
                 " model; leave it out"
             )
         class_by_name = {bound_object.name: bound_object.class_name for bound_object in features.objects}
-        # NaN and infinity in features are no reason for NumPy's warnings: they make objects unknown
+        # NumPy does not warn, because NaN and infinity in features make objects unknown
         with np.errstate(all="ignore"):
             detections = {
                 bound_object.name: bound_object.detections(
@@ -223,10 +222,10 @@ class EpisodeSource(Source):
         frame_count: int,
         report: Report,
     ) -> tuple[list[str], ObservationRows]:
-        """Return the names of objects, and their observations in all frames, object by object.
+        """Return the names of objects, and the objects' observations in all frames, object by object.
 
-        Objects are checked together, because a check of few rows costs as much as one of many. Frames
-        without a valid footprint are faults.
+        Objects are checked together, because a check of few rows costs as much as a check of many rows.
+        Frames without a valid footprint are faults.
         """
         names, row_parts = list(rows_by_name), list(rows_by_name.values())
         for has_height in (False, True):
@@ -307,9 +306,9 @@ _MOST_FRAMES: Final = 2**15
 
 
 def read_together(sources: Sequence[Source]) -> list[Source]:
-    """Return the sources, with episodes that share a data set and a mapping read together.
+    """Return the sources, after reading episodes with a common data set and mapping together.
 
-    An episode that cannot be read stays unread, so that iterating over its blocks raises the error.
+    An unreadable episode stays unread, so that iterating over its blocks raises the error.
     """
     read_sources: list[Source] = []
     for is_episode, group in groupby(sources, lambda source: isinstance(source, EpisodeSource)):
@@ -325,11 +324,11 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
 
 
 def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
-    """Yield episodes of one data set with one mapping, after reading those with features of equal shapes."""
+    """Yield episodes of one data set and mapping, after reading episodes with equal feature shapes."""
     columns_by_index: dict[int, EpisodeColumns] = {}
     frame_count = 0
     for index, source in enumerate(sources if sources[0].mapped_by is not None else ()):
-        # any error, because one episode must not end the reading of the others
+        # any error, because one episode must not end the reading of other episodes
         with suppress(Exception):
             columns = source.columns()
             frame_count += len(columns.times_ns)
@@ -352,14 +351,14 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
 
 
 def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
-    """Return the shape of a frame of each feature; None for columns that cannot be joined with others."""
+    """Return the shape of each feature in a frame; None for columns that cannot be joined."""
     if columns.bodies or any(len(values) != len(columns.times_ns) for values in columns.features.values()):
         return None
     return tuple(sorted((name, values.shape[1:]) for name, values in columns.features.items()))
 
 
 def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
-    """Read episodes whose features have equal shapes, together."""
+    """Read episodes together; their features must have equal shapes."""
     first_frames = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
     features = {
         name: np.concatenate([columns.features[name] for _, columns in parts])
@@ -400,7 +399,7 @@ def _bind(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
 
 
 def _rows_of_body(body: Body, axes: Axes) -> ObservationRows:
-    """Return the observations of a body that a data set names, with its own shapes or as a point."""
+    """Return the observations of a body that a data set names, with the body's shapes or as a point."""
     frame_count = len(body.positions)
     is_valid: Booleans = np.asarray(np.isfinite(body.positions).all(axis=1))
     yaw: Floats = np.full(frame_count, np.nan)

@@ -1,7 +1,7 @@
 """Measurements of a log while it is read: arrivals and objects of each topic in, statistics out.
 
-Every message and object is measured, in columns. Medians come from a subset of the values. `assumptions`
-compares the measurements with the assumptions of a mapping.
+Every message and object is measured, in columns. Medians come from a subset of the values. The module
+`assumptions` compares the measurements with a mapping's assumptions.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ _ROWS_AT_ONCE: Final = 4_096
 """Number of objects measured together, because a short column costs as much as a long one."""
 
 _LONGEST_GAP: Final = 9
-"""Longest counted gap between two reports of an object, messages; longer gaps are counted as this one."""
+"""Limit of counted gaps between two reports of an object, messages. Longer gaps count as this gap."""
 
 _MOST_LEAPS: Final = 4
 """Limit of reports after which an object may return to its place."""
 
 _MOST_ROWS: Final = 32_768
-"""Limit of last reports kept until the next report of an object; the oldest are dropped."""
+"""Limit of kept last reports of objects; the oldest reports are dropped."""
 
 FAR_LEAP: Final = 5.0
 """Least length of a suspicious step, in sizes of the object."""
 
 _FAST: Final = 100.0
-"""Speed from which a leap there and back cannot be one robot, footprint units per second."""
+"""Least speed of a leap there and back that cannot be one robot, footprint units per second."""
 
 
 class Spread:
-    """Statistics of values: least, median, greatest, and the time of the greatest.
+    """Statistics of values: least, median, greatest, and the time of the greatest value.
 
-    Values that are not finite are ignored. The median is taken from every n-th value.
+    NaN and infinity are ignored. The median is the median of every n-th value.
     """
 
     __slots__ = ("_kept_values", "_stride", "count", "greatest", "greatest_ns", "least")
@@ -76,7 +76,7 @@ class Spread:
                 0 if times_ns is None else int(times_ns[greatest_index]),
             )
         self.least = min(self.least, float(values.min()))
-        # the stride continues over calls, so that the sample does not depend on their sizes
+        # the stride continues over calls, so that the subset does not depend on the sizes of calls
         kept_values = np.concatenate([self._kept_values, values[-self.count % self._stride :: self._stride]])
         while len(kept_values) > _MOST_VALUES:
             kept_values, self._stride = kept_values[::2], 2 * self._stride
@@ -122,10 +122,10 @@ class Arrivals:
         publishers: numbers of the channels.
         returns: number of changes back to an earlier channel.
         longest_still_s: longest time without a new stamp.
-        still_ns: log time at which it began.
+        still_ns: log time at which that longest time began.
         stamps_vary: whether stamps are not all equal.
-        stamps_passed_s: time from the first to the last stamp.
-        log_passed_s: time between the recordings of the first and the last stamp.
+        stamps_passed_s: difference of the last and the first stamp.
+        log_passed_s: difference of the log times of the last and the first stamp.
     """
 
     def __init__(self) -> None:
@@ -196,13 +196,13 @@ class Arrivals:
 
     @property
     def mean_period_s(self) -> float:
-        """Mean interval between messages; NaN without two messages of different times."""
+        """Mean interval between messages, seconds; NaN without two messages of different times."""
         if self.first_ns is None or self.last_ns is None or self.messages < 2:
             return nan
         return (self.last_ns - self.first_ns) / (self.messages - 1) / 1e9 or nan
 
     def add_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
-        """Add the stamps of some messages, in order, and their log times."""
+        """Add stamps of messages in order, with the messages' log times."""
         self._waiting_stamps.append((stamps_ns, log_ns))
 
     def _measure_stamps(self, stamps_ns: Integers, log_ns: Integers) -> None:
@@ -240,7 +240,7 @@ HEADINGS: Final[dict[str, tuple[float, float]]] = {
     "unit: rad, zero: east, clockwise: true": (0.0, -1.0),
     "unit: deg, zero: east, clockwise: true": (0.0, -pi / 180),
 }
-"""Interpretations of a number as a yaw, by keys of a mapping: yaw at 0, and yaw per unit, in radians."""
+"""Interpretations of a number as a yaw, by keys of a mapping: yaw at 0 and yaw per unit, in radians."""
 
 
 class Motions:
@@ -250,22 +250,22 @@ class Motions:
         speed: speeds, footprint units per second.
         turn_rate: turn rates, radians per second.
         jump: longest step of an object.
-        jump_s: time of this step.
-        comeback: longest step over an absence, in which messages lacked the object for a second or more.
-        comeback_s: time of this step.
-        zeros: number of leaps to (0, 0) by more than five sizes of the object, without absences.
-        turn_step: greatest change of the number that is read as yaw.
+        jump_s: duration of the longest step.
+        comeback: longest step over an absence. In an absence, messages lack the object for a second or more.
+        comeback_s: duration of that step.
+        zeros: number of leaps to (0, 0) without an absence, by more than five sizes of the object.
+        turn_step: greatest change of the raw angle that is read as yaw.
         chances: number of reports of objects with at least two earlier reports.
-        returns: number of these reports in which an object is back at its place two to four reports earlier,
-            after steps that were all longer than its size.
-        slow_returns: number of returns after a step of a second or more, at a speed of a robot.
-        return_moment: first return; None without one.
-        gaps: (10,) number of steps by the count of messages from one report of the object to the next.
+        returns: number of reports with an object back at its place two to four reports earlier. All steps
+            since then are longer than its size.
+        slow_returns: number of returns at the speed of a robot, after a step of a second or more.
+        return_moment: first return; None without a return.
+        gaps: (10,) numbers of steps, by the count of messages between the step's two reports.
         changes: first changes of classes.
         change_count: number of all changes of classes.
         courses: mean of exp(i (course - angle)) over the steps of moving objects, for the angle as read and
             for each of `HEADINGS`.
-        course: mean of exp(i course) over these steps.
+        course: mean of exp(i course) over the same steps.
     """
 
     def __init__(self, names: Codes, classes: Codes) -> None:
@@ -291,15 +291,15 @@ class Motions:
 
         Args:
             begin_ns: time 0 of the seconds in reports.
-            turns_back: whether angles of messages run clockwise in our axes.
-            zero, scale: interpretation of the angle: zero + scale * number, in radians.
+            turns_back: whether angles of messages run clockwise in the axes of samples.
+            zero, scale: interpretation of the raw angle: yaw = zero + scale * raw angle, in radians.
         """
         self._begin_ns = begin_ns
         reports = np.concatenate([self._last_reports, reports])
         name_codes = reports[:, _NAME].astype(np.int64)
         reports = reports[np.argsort(name_codes, kind="stable")]
         is_same_object = reports[1:, _NAME] == reports[:-1, _NAME]
-        # `behind`: number of later reports of the same object
+        # `later_count`: number of later reports of the same object
         last_indices = np.append(np.flatnonzero(~is_same_object), len(reports) - 1)
         later_count = np.repeat(last_indices, np.diff(last_indices, prepend=-1)) - np.arange(len(reports))
         self._last_reports = reports[later_count < _MOST_LEAPS].copy()
@@ -342,7 +342,7 @@ class Motions:
         self.speed.add(np.where(seconds > 0, distance / seconds, nan), times_ns)
         turn_step = np.fmax.reduce(np.abs(later[:, _TURN] - earlier[:, _TURN]))
         self.turn_step = max(self.turn_step, float(np.nan_to_num(turn_step)))
-        # by the shorter way round
+        # the turn by the shorter way
         turn = np.abs((later[:, _YAW] - earlier[:, _YAW] + pi) % (2 * pi) - pi)
         self.turn_rate.add(np.where(seconds > 0, turn / seconds, nan), times_ns)
         longest_index = int(np.nan_to_num(distance, nan=0.0).argmax())
@@ -368,7 +368,7 @@ class Motions:
         course = np.arctan2(step_xy[moves, 1], step_xy[moves, 0])
         yaw, raw_angle = earlier[moves, _YAW], earlier[moves, _TURN]
         sign = -1.0 if turns_back else 1.0
-        # another interpretation differs from the yaw by the differences of zero and scale
+        # an interpretation differs from the yaw by the differences of its zero and scale
         readings = (
             base_angle - zero + (unit_angle - scale) * raw_angle
             for base_angle, unit_angle in HEADINGS.values()
@@ -393,7 +393,7 @@ class Motions:
 
         Args:
             reports: reports, grouped by object.
-            after: indices of new reports that are not the first of their object.
+            new_indices: indices of new reports, except the first report of each object.
         """
         position, name = reports[:, _X : _Y + 1], reports[:, _NAME]
         step_xy = np.diff(position, axis=0, prepend=position[:1])
@@ -411,7 +411,7 @@ class Motions:
             least_leap = np.minimum(least_leap, leap[earlier_indices + 1])
             offset = position[new_indices] - position[earlier_indices]
             is_same = (name[earlier_indices] == name[new_indices]) & (new_indices >= steps)
-            # within a quarter of the shortest leap on the way
+            # back means within a quarter of the shortest leap since then
             is_back |= is_same & (np.hypot(offset[:, 0], offset[:, 1]) < least_leap / 4)
         is_slow = is_back & (step_s[new_indices] >= 1.0) & (leap[new_indices] < _FAST * step_s[new_indices])
         self.returns += int(np.count_nonzero(is_back))
@@ -453,7 +453,7 @@ class _Objects(NamedTuple):
     """Objects that wait to be measured.
 
     Attributes:
-        first: number of their first message.
+        first: number of the topic's messages before the first of these messages.
     """
 
     first: int
@@ -475,21 +475,23 @@ class TopicEvidence:
         quaternion_length: lengths of quaternions other than zeros.
         quaternions: number of quaternions other than zeros.
         upright: number of upright objects in the order of the mapping.
-        upright_otherwise: number of upright objects with w at the other end.
-        turned_otherwise: number of the latter that are turned by more than 20 degrees.
-        turn: numbers that are read as yaw.
-        first_turn: greatest absolute value of these numbers in the first message.
-        low, high: (3,) least and greatest coordinates, in the numbers of the messages.
-        is_single: whether all coordinates that are degrees, or far from the origin, are float32 numbers.
-        has_fraction: whether some of these coordinates are not integers.
-        size, shorter: longer and shorter sides of outlines.
+        upright_otherwise: number of upright objects in the other order, with w at the other end.
+        turned_otherwise: number of objects that are upright in the other order, and turned by more than 20
+            degrees.
+        turn: raw angles that are read as yaw.
+        first_turn: greatest absolute raw angle in the first message with angles.
+        low, high: (3,) least and greatest coordinates, as the messages give them.
+        is_single: whether coordinates are float32 numbers; tested for degrees, and far from the origin.
+        has_fraction: whether some of the tested coordinates are not integers.
+        size: longer sides of outlines.
+        shorter: shorter sides of outlines.
         pointlike: number of objects whose sides are 0.
         bottom, top: heights of the objects.
         uncertainty: radii of uncertainty.
         covariances: number of covariances.
         zero_covariances: number of covariances of zeros.
-        signal_chances: number of messages with signals that follow two others.
-        signal_returns: (S,) number of these messages in which a signal returns to its last but one value.
+        signal_chances: number of messages with signals after at least two such messages.
+        signal_returns: (S,) number of messages in which each signal returns to its last but one value.
     """
 
     def __init__(self, reader: TopicReader, names: Codes, classes: Codes) -> None:
@@ -538,7 +540,7 @@ class TopicEvidence:
 
     @property
     def has_moving_stamps(self) -> bool:
-        """Whether its stamps vary and its messages repeat, unlike those of latched topics and markers."""
+        """Whether stamps vary; False for topics whose messages stay valid, such as latched topics."""
         planned, arrivals = self.planned, self.arrivals
         stays = (
             planned.is_latched or planned.is_lasting or (planned.layout is not None and planned.layout.stays)
@@ -553,7 +555,7 @@ class TopicEvidence:
 
     @property
     def turn_path(self) -> str:
-        """Path of the yaw; "" without one."""
+        """Path of the yaw; "" without a yaw."""
         layout = self.planned.layout
         return "" if layout is None else next(iter(layout.yaw), "")
 
@@ -564,7 +566,7 @@ class TopicEvidence:
 
     @property
     def has_given_heading(self) -> bool:
-        """Whether the mapping gives zero and direction of the yaw."""
+        """Whether the mapping gives the yaw's zero and direction."""
         mapping = self.planned.mapping
         return mapping is not None and mapping.yaw is not None and not mapping.yaw.is_plain
 
@@ -576,7 +578,7 @@ class TopicEvidence:
 
     @property
     def angle_path(self) -> str:
-        """Path of a coordinate with the name of an angle; "" without one."""
+        """Path of a coordinate with the name of an angle; "" without such a coordinate."""
         position = None if self.planned.mapping is None else self.planned.mapping.position
         paths = position if isinstance(position, tuple) else ()
         return next((path for path in paths if _ANGLE.search(path)), "")
@@ -679,16 +681,16 @@ class TopicEvidence:
         self._measure_motions(self._reports_rows // _ROWS_AT_ONCE * _ROWS_AT_ONCE)
 
     def _measure_motions(self, report_count: int) -> None:
-        """Measure the motions of `count` reports, in parts of fixed size.
+        """Measure the motions of the first `report_count` reports, in parts of fixed size.
 
-        The parts do not depend on the division of the log into calls, so that the results do not, either.
+        Parts, and so results, do not depend on the division of the log into calls.
         """
         if not report_count:
             return
         layout = self.planned.layout
         reports = np.concatenate(self._reports)
         for begin in range(0, report_count, _ROWS_AT_ONCE):
-            # no warnings about NaN, infinity, and quotients of equal numbers
+            # no warnings about NaN, infinity, or division by 0
             with np.errstate(all="ignore"):
                 self.motions.add(
                     reports[begin : min(begin + _ROWS_AT_ONCE, report_count)],
@@ -700,7 +702,7 @@ class TopicEvidence:
         self._reports, self._reports_rows = [reports[report_count:]], len(reports) - report_count
 
     def _measure_signals(self) -> None:
-        """Count the returns of signals to their last but one value."""
+        """Count returns of signals to their last but one value."""
         if not self._waiting_values:
             return
         values = np.concatenate([self._last_values, *self._waiting_signals])
@@ -717,7 +719,7 @@ class TopicEvidence:
         self.signal_returns[: values.shape[1]] += np.where(is_switch, 0, is_back.sum(axis=0))
 
     def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
-        """Measure the unchanged numbers of messages; return them, or None without a binding."""
+        """Measure the raw numbers of messages; return these numbers, or None without a binding."""
         binding = self._binding
         number_arrays = [detected.numbers for detected in detections if detected.numbers is not None]
         numbers = (
@@ -765,10 +767,10 @@ class TopicEvidence:
         self.quaternion_length.add(length)
         self.quaternions += len(length)
         x, y, z, w = (quaternions / length[:, None]).T
-        # the tilt of an object's z axis depends on x * x + y * y, because its cosine is 1 - 2 (x * x + y * y)
+        # the tilt of an object's z axis has the cosine 1 - 2 (x * x + y * y)
         self.upright += int(np.count_nonzero(x * x + y * y < _LEVEL))
         layout = self.planned.layout
-        # in the other order the numbers called w, x, y (or y, z, w) are x, y, z
+        # in the other order, the numbers named w, x, y (or y, z, w) are x, y, z
         is_w_first = layout is not None and layout.order == "wxyz"
         other_x, other_y, other_z = (w, x, y) if is_w_first else (y, z, w)
         is_upright = other_x * other_x + other_y * other_y < _LEVEL
@@ -791,7 +793,8 @@ def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:
     has_parts = vertices[1:] > vertices[:-1]
     low, high = np.full((footprint_count, 2), nan), np.full((footprint_count, 2), nan)
     if has_parts.any():
-        # rows without vertices are skipped, because reduceat would return a vertex of the next row
+        # footprints without vertices are skipped, because reduceat would return a vertex of the next
+        # footprint
         vertex_starts = vertices[:-1][has_parts]
         radius = np.maximum.reduceat(shapes.radius, parts[:-1][has_parts])[:, None]
         low[has_parts] = np.minimum.reduceat(shapes.vertices, vertex_starts, axis=0) - radius

@@ -1,6 +1,6 @@
 """Read features of a data set: entries of a mapping and columns of an episode in; detections and signals out.
 
-An entry is bound to the features of a data set once. All frames of an episode are read together.
+An entry is bound once to the features of a data set. All frames of an episode are read together.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class NumberPlace(NamedTuple):
 
     Attributes:
         number: column of the number.
-        name: its name, for errors.
+        name: name of the number, for errors.
     """
 
     feature: str
@@ -59,7 +59,7 @@ class BoundObject:
     Attributes:
         key: key of the entry, for errors.
         places: place of each column of `binding`.
-        quaternion: places of x, y, z and w of its orientation; () without one.
+        quaternion: places of the orientation's x, y, z and w; () without an orientation.
     """
 
     name: str
@@ -71,10 +71,10 @@ class BoundObject:
     quaternion: tuple[NumberPlace, ...] = ()
 
     def detections(self, columns: Columns, times: int, mapping_name: str, episode: str) -> Detections:
-        """Return the object in each of T frames; its name and class have the code 0.
+        """Return the object in each of T frames, with 0 as the code of its name and class.
 
         Raises:
-            UsageError: the four numbers of its orientation are not a quaternion.
+            UsageError: the four numbers of the orientation are not a quaternion.
             LogError: the files of the data set lack a feature.
         """
         numbers = np.empty((times, self.binding.width))
@@ -85,13 +85,13 @@ class BoundObject:
         if self.quaternion:
             quaternions = numbers[:, list(self.binding.orientation)]
             self._check_quaternions(quaternions, mapping_name, episode)
-            # otherwise a disc would keep its place, and only lose its orientation
+            # otherwise a disc would keep its position, and only lose its orientation
             numbers[~np.isfinite(quaternions).all(axis=1)] = nan
         return detections_of(self.layout, self.binding, numbers)
 
     def _check_quaternions(self, quaternions: Floats, mapping_name: str, episode: str) -> None:
         lengths = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
-        # zeros mean an orientation that was not set; NaN and infinity make the object unknown
+        # zeros are an unset orientation; NaN and infinity make the object unknown
         is_wrong = np.isfinite(lengths) & (lengths > 0) & (np.abs(lengths - 1) > _LENGTH_ERROR)
         if not is_wrong.any():
             return
@@ -130,7 +130,7 @@ class FeatureReading:
     """The entries of a mapping, bound to a data set.
 
     Attributes:
-        objects: in the order of the mapping.
+        objects: objects, in the order of the mapping.
         absent: optional features that the data set lacks.
     """
 
@@ -245,7 +245,7 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
 
 
 def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> Detections:
-    """Return the detections of one object in T frames, from its numbers (T, W)."""
+    """Return the detections of one object in T frames from the object's numbers (T, W)."""
     frame_count = len(numbers)
     poses, no_codes = poses_from_numbers(layout, binding, numbers), np.zeros(frame_count, np.int64)
     detections = Detections(
@@ -262,7 +262,7 @@ def detections_of(layout: MessageLayout, binding: Binding, numbers: Floats) -> D
 
 
 def join_objects(objects: Sequence[Detections]) -> Detections:
-    """Join detections of several objects, each in all frames; heights exist for all objects or for none."""
+    """Join detections of several objects, each in all frames; all objects have heights, or none has."""
     if len(objects) == 1:
         return objects[0]
     solids, frame_counts = (
@@ -303,10 +303,10 @@ def join_objects(objects: Sequence[Detections]) -> Detections:
 
 
 def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
-    """Return the detections of a body that a data set names, in T frames, with a shape of the mapping.
+    """Return the detections, in T frames, of a body from the data set with a shape from the mapping.
 
     Raises:
-        UsageError: a size of the shape is a field, which a body does not have.
+        UsageError: a size of the shape is a field, but a body has no fields.
     """
     measures = (*shape.sizes, *(shape.height or ()))
     if shape.outline or any(isinstance(measure, str) for measure in measures):
@@ -327,10 +327,10 @@ def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
 def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) -> Floats:
     """Return the numbers at a place in each of T frames (T,); NaN in the last frame for actions.
 
-    Data sets have one action less than states, because no action follows the last state.
+    Data sets have one fewer action than states, because no action follows the last state.
 
     Raises:
-        LogError: the files of the data set lack the feature, or have another number of rows or columns.
+        LogError: the data set's files lack the feature, or have another number of rows or columns.
     """
     values = columns.get(place.feature)
     if values is None:
@@ -348,7 +348,7 @@ def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) ->
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Resolver of the places in an entry, which may name places of other features."""
+    """Resolver of an entry's places, which may belong to other features."""
 
     data_set: DataSet
     feature: Feature
@@ -376,7 +376,7 @@ class _Places:
         """Return the single place in a text.
 
         Raises:
-            UsageError: the text names no place, or several.
+            UsageError: the text names no place, or several places.
         """
         (place,) = self.several(key, text, (1,))
         return place

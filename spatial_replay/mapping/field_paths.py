@@ -11,11 +11,11 @@ the element with the highest score. `[index]`, in names, selects the element at 
 object in its own list.
 
 `tracks[id=7]` is the last element of `tracks` whose field `id` is 7. `position[name=elbow]` is the element of
-`position` at the index of `elbow` in the neighbouring list `name`. Without such an element the value is
+`position` at the index of `elbow` in the neighbouring list `name`. Without a matching element the value is
 unknown.
 
 Messages are decoded ROS, protobuf or JSON messages. `walk` follows a path step by step and explains errors.
-`getter` compiles it to nested calls. A path comes from a file, so no part of it is evaluated as code: it
+`getter` compiles a path to nested calls. A path comes from a file, so no part of it is evaluated as code. It
 reaches only fields that the message declares.
 """
 
@@ -37,7 +37,7 @@ Style: TypeAlias = Literal["attributes", "keys"]
 
 
 def style_of(value: object) -> Style:
-    """Return the access to the fields of a message: by key for JSON objects, otherwise by attribute."""
+    """Return how fields of a message are read: by key for JSON objects, otherwise by attribute."""
     return "keys" if isinstance(value, dict) else "attributes"
 
 
@@ -76,7 +76,7 @@ def _is_free(value: object) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Return a `google.protobuf.Struct` and its parts as JSON values, and other values unchanged."""
+    """Return a `google.protobuf.Struct` and its parts as JSON values, but other values unchanged."""
     descriptor = getattr(value, "DESCRIPTOR", None)
     kind = "" if descriptor is None else descriptor.full_name
     if kind == _FREE:
@@ -90,7 +90,7 @@ def _plain(value: Any) -> Any:
 
 
 class Sparse(dict[str, Any]):
-    """A JSON object in which missing fields are 0, as proto3 writes it."""
+    """A JSON object in which missing fields are 0, because proto3 leaves zeros out."""
 
     def __missing__(self, key: str) -> Zero:
         return ZERO
@@ -130,11 +130,12 @@ def _sparse(value: object) -> object:
 def from_protobuf_json(value: object, objects: str) -> object:
     """Return a JSON message, possibly written by protobuf, with the fields of its definition.
 
-    ProtoJSON renames fields and leaves out defaults (https://protobuf.dev/programming-guides/json/). So
-    `frameId` is added as `frame_id`, missing coordinates as 0, and a missing list of objects as an empty one.
+    ProtoJSON renames fields and leaves out defaults (https://protobuf.dev/programming-guides/json/). So a
+    copy of `frameId` is added as `frame_id`, missing coordinates as 0, and a missing list of objects as an
+    empty list.
 
     Args:
-        objects: path of the list of objects, such as `entities[*]`; "" without one.
+        objects: path of the list of objects, such as `entities[*]`; "" for a message that is one object.
 
     Raises:
         ContentError: the message is nested too deeply.
@@ -153,7 +154,7 @@ _POINT = MappingProxyType({"x": 0.0, "y": 0.0, "z": 0.0})
 
 def _message_from_json(value: object) -> object:
     if isinstance(value, list):
-        # a list of numbers stays as it is, because it may be long
+        # a list of numbers is not copied, because it may be long
         return list(map(_message_from_json, value)) if value and isinstance(value[0], dict | list) else value
     if not isinstance(value, dict):
         return value
@@ -172,7 +173,7 @@ def _snake_case(key: str) -> str:
 
 
 def type_name(value: object) -> str:
-    """Describe the type of a message or a part of it."""
+    """Return a description of the type of a message, or of a part of a message."""
     if isinstance(value, dict):
         return "the JSON object"
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -230,7 +231,7 @@ class Keyed:
     key: str
 
     def read(self, value: Any) -> object:
-        """Return the element; None without one, which makes a number unknown.
+        """Return the element; None without a matching element, which makes a number unknown.
 
         Raises:
             FieldError: the elements lack the field.
@@ -245,7 +246,7 @@ class Keyed:
         return matching[-1] if matching else None
 
     def names(self, value: object) -> list[str] | None:
-        """Return the names in the neighbouring list; None without one."""
+        """Return the names in the neighbouring list; None without such a list."""
         beside = self.path.text
         names = get_field(value, beside) if beside in field_names(value) else None
         return list(map(_word, names)) if is_list(names) else None
@@ -272,7 +273,7 @@ _SCORES = ("score", "probability", "confidence")
 
 
 def _score(value: object) -> float:
-    """Return the score of a result or of its hypothesis; -inf without one."""
+    """Return the score of a result, or of its hypothesis; -inf without a score."""
     score_fields = field_names(value)
     if "hypothesis" in score_fields:
         return _score(get_field(value, "hypothesis"))
@@ -296,7 +297,7 @@ class FieldPath:
     Attributes:
         text: the path in the mapping.
         steps: names, indices and other steps.
-        from_message: whether it starts at the message instead of the object.
+        from_message: whether the path starts at the message instead of the object.
     """
 
     text: str
@@ -346,10 +347,10 @@ def walk(
         may_lack_keys: whether a missing key of a protobuf map or Struct is unknown instead of an error.
 
     Raises:
-        FieldError: the path does not resolve; the text names the failing step and the existing fields.
+        FieldError: the path does not resolve; the message names the failing step and the existing fields.
     """
     for step in path.steps:
-        # a Struct is handled as a dictionary
+        # a Struct is read like a dictionary
         has_free_keys = may_lack_keys and (isinstance(value, Mapping) or _is_free(value))
         if has_free_keys and str(step) not in field_names(value):
             return None
@@ -377,7 +378,7 @@ def _element_at_place(path: FieldPath, value: object, index: int | str | None) -
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
-    """Return whether a path without `[*]` resolves in a value; missing fields count as missing, not as 0."""
+    """Return whether a path without `[*]` resolves; fields missing from `Sparse` do not resolve."""
     try:
         walk(path, value, is_strict=True)
     except FieldError:
@@ -430,7 +431,7 @@ def _element_of_key(path: FieldPath, value: object, step: Keyed) -> object:
 
 
 def is_list(value: object) -> TypeGuard[Sequence[object]]:
-    """Return whether a value is a list of ROS (or a NumPy array), protobuf or JSON."""
+    """Return whether a value is a list in ROS (also as a NumPy array), protobuf or JSON."""
     return (
         hasattr(value, "__len__")
         and hasattr(value, "__getitem__")
@@ -451,7 +452,7 @@ def enum_names(path: FieldPath, message: object) -> dict[object, str]:
 
 
 def is_set(path: FieldPath, value: object) -> bool:
-    """Return whether a sender set the protobuf fields on a path; fields without presence count as set."""
+    """Return whether the sender set all protobuf fields on a path; fields without presence count as set."""
     for step in path.steps:
         if isinstance(step, str) and not isinstance(value, Mapping):
             field = _definition_of(value, step)
@@ -462,7 +463,7 @@ def is_set(path: FieldPath, value: object) -> bool:
 
 
 def may_be_unset(path: FieldPath, example: object) -> bool:
-    """Return whether `is_set` may be false for messages of the example's type."""
+    """Return whether `is_set` may be False for messages of the example's type."""
     for step in path.steps:
         field = _definition_of(example, step) if isinstance(step, str) else None
         if field is not None and field.has_presence:
@@ -514,7 +515,7 @@ def getter(path: FieldPath, example: object) -> Get:
 
 
 def _has_free_keys(path: FieldPath, value: object) -> bool:
-    """Return whether a path crosses a protobuf map or a Struct, whose keys are not attributes."""
+    """Return whether a path crosses a protobuf map or a Struct; their keys are not attributes."""
     if style_of(value) == "keys":
         return False
     for step in path.steps:
@@ -542,7 +543,7 @@ def tuple_getter(paths: Sequence[FieldPath], example: object) -> Callable[[Any],
 
 
 def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
-    """Iterate over the elements at a path with `[*]`, in order, or over the single value at another path.
+    """Iterate over the elements at a path with `[*]`, or over the one value at a path without it.
 
     Raises:
         FieldError: the path does not resolve.
@@ -565,12 +566,12 @@ def elements_of(value: Any) -> Sequence[object]:
 
 
 def keys_of(value: Mapping[Any, object]) -> list[Any]:
-    """Return the keys of a protobuf map, or the keys of a JSON object whose values are objects."""
+    """Return the keys of a protobuf map, or the keys with JSON objects as values of a JSON object."""
     return [key for key, part in value.items() if not isinstance(value, dict) or isinstance(part, dict)]
 
 
 def list_getter(path: FieldPath, example: object) -> Get | None:
-    """Compile a path of the form `a.b[*]` to a function that returns the list; None for other forms."""
+    """Compile a path of the form `a.b[*]` to a getter of the list; return None for other forms."""
     *list_steps, last_step = path.steps
     if isinstance(last_step, Each) and not any(isinstance(step, Each) for step in list_steps):
         return getter(FieldPath(path.text, tuple(list_steps)), example)
@@ -584,7 +585,7 @@ def below(path: FieldPath, step: str | int) -> FieldPath:
 
 
 def is_number(value: object) -> bool:
-    """Return whether a field holds a number, or null, which stands for a missing number in JSON."""
+    """Return whether a field holds a number or null; null is a missing number in JSON."""
     if isinstance(value, str | bytes) or value is None or field_names(value):
         return value is None
     try:
@@ -613,9 +614,9 @@ class NameTemplate:
     """A template for the names of objects: literal text and fields in turn.
 
     Attributes:
-        parts: texts, and tuples of alternative fields, of which the first existing one with a value is used.
-            If no field has that name, `index` is the object's index in its list, or its key in a JSON
-            object, and `topic` is its topic.
+        parts: texts, and tuples of alternative fields. The first existing field with a value is used. Unless
+            a field has this name, `index` is the object's index in its list or its key in a JSON object, and
+            `topic` is its topic.
     """
 
     text: str

@@ -1,6 +1,7 @@
 """External logs as sources: a log and a mapping in; blocks of samples with their raw messages out.
 
-Copies of the log contain the raw messages and their definitions, so that viewers show them next to results.
+Copies of the log contain the raw messages and their definitions, so that viewers show the messages next to
+results.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 _WAITING_BYTES = 2**26
-"""Size limit of raw messages that wait for their samples, bytes; above it, all are passed on."""
+"""Size limit of raw messages that wait for their samples, bytes. Above it, all messages are passed on."""
 
 _MOST_UNREAD = 20
 """Limit of undecodable topics listed one by one."""
@@ -52,8 +53,8 @@ class MappedSource(FileSource):
     """An external log, with a mapping from its messages to objects.
 
     Attributes:
-        keep: topics whose messages its blocks hold unchanged, for copies of the log: "mapped" for topics that
-            the mapping reads, "all", or patterns such as "/camera/*". Several add up.
+        keep: topics whose raw messages are in the blocks, for copies of the log: "mapped" for topics that the
+            mapping reads, "all", or patterns such as "/camera/*". Several values add up.
     """
 
     _: KW_ONLY
@@ -80,7 +81,7 @@ class MappedSource(FileSource):
 
     @property
     def begin_ns(self) -> int | None:
-        """Log time of the first message of a remote log; None for local logs, and if it is unknown."""
+        """Log time of the first message of a remote log; None for local logs, or if the time is unknown."""
         return open_messages(self.path).start_ns if isinstance(self.path, RemoteFile) else None
 
     @noting_pauses
@@ -89,7 +90,7 @@ class MappedSource(FileSource):
 
         Blocks hold raw messages of the topics in `keep`.
         """
-        # None for a window that covers everything, because only a full read checks the declared counts
+        # None for a window of the whole log, because only a full read checks the declared counts
         start_ns = start_ns or None
         end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
         reader = open_messages(self.path)
@@ -129,7 +130,8 @@ class MappedSource(FileSource):
             blocks.remarks.append(f"{self.name}: it is {description}")
         static_topics = list(dict.fromkeys(topic.topic for topic in plan.planned if topic.is_static))
         if static_topics:
-            # static transforms hold after their time, and the first one of a frame also before its time
+            # a static transform holds after its time, and a frame's first static transform also before its
+            # time
             assembler.know_static(open_messages(self.path).iter_messages(static_topics))
         if start_ns is not None and plan.by_log_time and plan.sampled_topic is not None:
             sampled_ns = first_ns([plan.sampled_topic])
@@ -143,7 +145,7 @@ class MappedSource(FileSource):
         if not as_recorded and plan.late_ns < LATEST_NS:
             columns = without_jumps(columns, self.name, mapped_topics, plan.late_ns)
         for piece in in_pieces(columns):
-            # messages that are only copied make no samples and do not advance their time
+            # messages that are only copied make no samples, and do not advance the time of samples
             mapped_piece = piece if read_topics == mapped_topics else piece.of_topics(mapped_topics)
             yield from blocks.of(assembler.add(mapped_piece), piece)
             if assembler.is_finished:
@@ -154,7 +156,7 @@ class MappedSource(FileSource):
             raise LogError(f"{self.name} holds no sample: {reason}")
 
     def _with_type(self, topic: Topic) -> Topic:
-        """Return a topic; a ROS topic without a type in the log gets the type from the mapping."""
+        """Return a topic. A ROS topic without a type in the log gets the mapping's type."""
         type_names = (entry.type for entry in self.mapping.topics if entry.topic == topic.name and entry.type)
         type_name = next(type_names, None)
         if topic.type or type_name is None or topic.encoding not in ("ros1", "cdr"):
@@ -193,7 +195,7 @@ class MappedSource(FileSource):
 
     @cached_property
     def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
-        """Attachments and metadata, read once, because a log without an index has to be scanned for them."""
+        """Attachments and metadata, read once, because a log without an index must be scanned for them."""
         reader = open_messages(self.path)
         return reader.attachments(), reader.metadata()
 
@@ -213,7 +215,7 @@ class _Blocks:
     first_fault: str | None = None
 
     def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
-        """Yield a block if it would not be empty."""
+        """Yield the next block, unless it would be empty."""
         messages = messages.within(self.start_ns, FOREVER if self.end_ns is None else self.end_ns)
         for fault in trace.faults:
             self.faults.add(fault)
@@ -233,13 +235,13 @@ class _Blocks:
 
 
 class _CopiedMessages:
-    """Buffer that holds raw messages until their samples are ready, and returns them in order of time."""
+    """Buffer of raw messages until their samples are ready, which returns messages in order of time."""
 
     def __init__(self, channels: Mapping[int, Channel], trees: _TreeLog) -> None:
         """Create an empty buffer.
 
         Args:
-            channels: channels of the log, by their numbers in its columns.
+            channels: channels of the log, by channel number.
             trees: source of additional messages, the ticks of behaviour trees.
         """
         self.topics = frozenset(channel.topic for channel in channels.values())
@@ -252,9 +254,9 @@ class _CopiedMessages:
         self._waiting_bytes = 0
 
     def passed_on(self, messages: MessageColumns, trace: Trace, *, last: bool = False) -> Messages:
-        """Add messages; return the held messages up to the last new sample, or with `last` all of them.
+        """Add messages; return the held messages up to the last new sample, or all messages if `last`.
 
-        Above a size limit all are returned, because log times and header stamps may be far apart.
+        Above a size limit, all messages are returned, because log times and header stamps may be far apart.
         """
         messages = messages.of_topics(self.topics | self.trees.topics)
         self._waiting.append(messages)
@@ -273,7 +275,7 @@ class _CopiedMessages:
         )
         self._waiting = [waiting_rest] if len(waiting_rest) else []
         self._waiting_bytes = sum(map(len, waiting_rest.payloads))
-        # by channel, because a topic may also have a channel of ours
+        # by channel, because a topic may also have a channel that a replay writes
         copied_messages = select(
             ready_messages, np.flatnonzero(np.isin(ready_messages.channel, self._channel_numbers))
         )
@@ -319,7 +321,7 @@ class _TreeLog:
         return Messages.from_rows({0: TREE_CHANNEL}, rows)
 
     def _tick(self) -> TreeTick:
-        """Return the newest nodes; each of several trees gets a root with the name of its topic."""
+        """Return the newest nodes. If there are several trees, each tree gets a root named like its topic."""
         if len(self.topics) == 1:
             return TreeTick(None, *self._nodes.values())
         nodes: list[TreeNode] = []
@@ -333,17 +335,17 @@ class _TreeLog:
 def _first_ns(
     open_reader: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
 ) -> int | None:
-    """Return the log time of the first message of some topics, at or after a time; None without one."""
+    """Return the log time of the first message of some topics at or after a time; None without a message."""
     topic_names = [topic for topic in topics if topic is not None]
     messages = open_reader().iter_messages(topic_names, log_ns) if topic_names else ()
     return next((message.log_time_ns for message in messages), None)
 
 
 def _foreign_channels(reader: MessageReader, topics: Collection[str]) -> Mapping[int, Channel]:
-    """Return the channels of some topics, without channels that a replay writes from the samples."""
+    """Return the channels of some topics, except channels that a replay writes from the samples."""
     channels = reader.channels(topics)
     own_channels = [number for number, channel in channels.items() if has_our_type(channel)]
-    # only logs that we wrote have channels of ours; elsewhere, channels with our types are foreign
+    # only logs that a replay wrote have such channels; elsewhere, channels with our types are foreign
     if own_channels and METADATA in dict(reader.metadata()):
         return {number: channel for number, channel in channels.items() if number not in own_channels}
     return channels
@@ -372,7 +374,7 @@ def _columns(
     *,
     as_recorded: bool,
 ) -> Columns:
-    """Iterate over the messages of some topics in a window, and over other messages that affect it."""
+    """Iterate over messages of some topics in a window, and over other messages that affect the window."""
     if not plan.by_log_time or (not start_ns and end_ns is None):
         return reader.iter_columns(topics, as_recorded=as_recorded)
     last_ns = None if end_ns is None else end_ns + plan.margin_ns

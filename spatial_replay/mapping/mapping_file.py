@@ -47,7 +47,7 @@ NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
 """Error of a mapping whose `fixed_frame` has no value."""
 
 Measure: TypeAlias = float | str
-"""A number, or the path of a field that holds it."""
+"""A number, or the path of a field with the number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,9 @@ class ShapeMapping:
 
     Attributes:
         kind: "box", "disc" or "polygon".
-        sizes: length along x, width along y and maybe height along z of a box; radius of a disc.
+        sizes: of a box: length along x, width along y, and maybe height along z; of a disc: radius.
         points: fixed corners of a polygon.
-        outline: path of the corners of a polygon; "" without one.
+        outline: path of the corners of a polygon; "" for fixed corners.
         offset: centre (x, y) in the object's own frame, in footprint units.
         height: bottom and top above the object's origin.
     """
@@ -76,8 +76,9 @@ class ClassMapping:
     """Mapping from a field to a class: `table[str(value)]`, or `other` for values outside the table.
 
     Attributes:
-        has_other: whether `other` is given; otherwise values outside the table are classes themselves.
-        changes: effect of a change of class: only a remark, a second object ("split"), or none ("first").
+        has_other: whether `other` is given. Otherwise a value outside the table is itself the class.
+        changes: effect of a change of class: only a remark ("remark"), a second object ("split"), or no
+            effect ("first").
     """
 
     field: str
@@ -105,7 +106,7 @@ class SignalMapping:
     """A signal: the path of its field, and its unit.
 
     Attributes:
-        unit: unit, or names of its numbers as a JSON object (see `names_from_unit`).
+        unit: unit of the numbers, or names of the numbers as a JSON object (see `names_from_unit`).
     """
 
     name: str
@@ -119,7 +120,7 @@ class Stamp:
 
     Attributes:
         unit_ns: unit of a number, nanoseconds.
-        nanoseconds: path of the nanoseconds if `field` holds only the seconds; "" otherwise.
+        nanoseconds: path of the nanoseconds, if `field` holds only seconds; otherwise "".
     """
 
     field: str
@@ -134,7 +135,7 @@ class Angle:
     Attributes:
         scale: radians per unit of the field; negative if angles count clockwise.
         zero: yaw at angle 0, in radians.
-        is_plain: whether the mapping gives neither zero nor direction.
+        is_plain: whether the mapping leaves out the zero and the direction.
     """
 
     field: str
@@ -148,23 +149,23 @@ class TopicMapping:
     """Entry of one topic; None selects the default of the message type.
 
     Attributes:
-        reads_objects: whether the topic has objects; false for topics with signals only.
+        reads_objects: whether the topic has objects; False for topics with signals only.
         objects: path of the list of objects; "" for a message that is one object.
-        complete: whether a message lists all existing objects, so that objects missing from it have left.
+        complete: whether a message lists all existing objects. Then objects missing from a message have left.
         position: path of a point, or paths of x, y and maybe z.
         orientation: path of a quaternion, or paths of its x, y, z and w.
         order: order of the four numbers of a quaternion in a list.
         yaw: field of an angle.
-        bounds: path of two opposite corners of a box along the axes, or paths of their four numbers.
+        bounds: path of two opposite corners of an axis-aligned box, or paths of its four numbers.
         bounds_have_size: whether the last two numbers are width and height instead of a corner.
-        only, without: patterns of names to keep, and to leave out.
+        only, without: patterns of names to keep, and of names to leave out.
         max_age_ns: validity of an observation, nanoseconds.
-        clock: clock of this topic; None for the clock of the mapping.
-        scale: units of the log per unit of this topic's positions, sizes, heights and uncertainties.
+        clock: clock of this topic; None for the mapping's clock.
+        scale: units of the log per unit of the topic's positions, sizes, heights and uncertainties.
         invalid: numbers that stand for a missing value.
-        has_zeros_left_out: whether fields that JSON messages lack are 0.
+        has_zeros_left_out: whether fields missing from JSON messages are 0.
         optional: whether a log may lack the topic.
-        publisher: number, from 1, of the only publisher whose messages are read; None for all.
+        publisher: number, from 1, of the only publisher whose messages are read; None for all publishers.
     """
 
     topic: str
@@ -204,7 +205,7 @@ class Sampling:
     """Sampling: a sample at each message of a topic, or at each multiple of a step.
 
     Attributes:
-        topic: sampled topic; None without a step for the most frequent topic with objects.
+        topic: sampled topic. None without `step_ns` selects the most frequent topic with objects.
         step_ns: step, nanoseconds; None for samples at messages.
     """
 
@@ -218,17 +219,17 @@ class LogMapping:
 
     Attributes:
         name: name of the file.
-        sha256: hash of its content, independent of layout and comments.
+        sha256: hash of the file's content, independent of layout and comments.
         fixed_frame: frame into which coordinates are transformed; None for coordinates as they are.
         topics: entries of topics, in the file's order.
-        max_gap_ns: longest pause, nanoseconds; in a longer pause of a topic its objects are unknown.
+        max_gap_ns: pause of a topic, nanoseconds, beyond which its objects are unknown.
         trims_ends: whether samples before a needed topic begins, and after it ends, are left out.
-        axes: axes of the fixed frame, or of the messages if there is no fixed frame.
-        origin: latitude and longitude in degrees of the point (0, 0) for satellite fixes.
+        axes: axes of the fixed frame; without a fixed frame, axes of the messages.
+        origin: latitude and longitude of the point (0, 0), degrees, for satellite fixes.
         accept: names of assumptions that the log may contradict.
-        features: entries of a data set's features, in the file's order; their `topic` is the feature.
+        features: entries of a data set's features, in the file's order, with the feature as `topic`.
         episodes: options for reading a data set.
-        shapes: shapes by name, for bodies that a data set names itself.
+        shapes: shapes by name, also for bodies that a data set names itself.
     """
 
     name: str
@@ -249,7 +250,7 @@ class LogMapping:
 
     @property
     def identity(self) -> str:
-        """Hash of its content, and of the models and meshes that it references."""
+        """Hash of the file's content, and of the models and meshes that it references."""
         model, assets = self.episodes.model, self.episodes.assets
         if model is None and assets is None:
             return self.sha256
@@ -281,14 +282,14 @@ def age_ns(text: str) -> int:
     """Parse a duration, or `forever`, to nanoseconds.
 
     Raises:
-        UsageError: the text is neither.
+        UsageError: the text is neither a duration nor `forever`.
     """
     return FOREVER_NS if text == "forever" else duration_ns(text)
 
 
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing", "publisher"})
-"""Keys that do not concern objects; an entry with `signals` and only such keys has no objects."""
+"""Keys that do not concern objects. An entry with `signals` and only such keys has no objects."""
 
 
 def load_mapping(path: str | PathLike[str]) -> LogMapping:
@@ -310,7 +311,7 @@ def parse_mapping(text: str, name: str = "mapping", folder: Path | None = None) 
 
     Args:
         name: name of the file, for errors.
-        folder: folder of the file, to which its paths are relative.
+        folder: folder of the file; paths in the file are relative to it.
 
     Raises:
         UsageError: the text is not a valid mapping; all errors are listed.
@@ -326,7 +327,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
     value: Any = document.value
     shapes = value.get("shapes") or {}
     sampling = value.get("sample", {})
-    # hashed in a canonical form, so that layout and comments do not change the hash
+    # the hash is of a canonical form, so that it does not depend on layout and comments
     canonical_text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
     topics = tuple(
@@ -372,7 +373,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
 
 
 def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any]]:
-    """Yield (topic or feature, place, entry) for each entry; a topic may have a list of entries."""
+    """Yield (topic or feature, place, entry) for each entry; one topic may have several entries."""
     for name, entry in value.get(key, {}).items():
         if isinstance(entry, list):
             yield from ((name, (key, name, index), part) for index, part in enumerate(entry))
@@ -381,7 +382,7 @@ def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any
 
 
 def _without_indices(entry: Any) -> Any:
-    """Return the entry of a feature, with indices such as 3 written as places such as `[3]`."""
+    """Return the entry of a feature, with each index such as 3 written as a place such as `[3]`."""
 
     def as_text(index: Any) -> Any:
         if isinstance(index, list):
@@ -403,7 +404,7 @@ _OF_EPISODES = ("features", "label", "fps", "model", "assets", "order")
 
 
 def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, str]]:
-    """Yield faults of a file that mixes keys of logs and data sets, or has neither."""
+    """Yield faults of a file that mixes keys of logs and data sets, or lacks both."""
     episode_keys = [key for key in _OF_EPISODES if key in value]
     if not episode_keys and "topics" not in value:
         yield (), "the key 'topics' is missing, or 'features' for a data set of episodes"
@@ -477,7 +478,7 @@ def _contradictions_of_turns(entry: Table[str, Any], is_feature: bool) -> Iterat
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:
-    """Return the mapping of a topic from an entry that conforms to the schema.
+    """Return the topic's mapping for an entry that conforms to the schema.
 
     Raises:
         UsageError: a path or a template is invalid, although it conforms to the schema.

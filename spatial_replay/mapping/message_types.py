@@ -1,6 +1,6 @@
 """Layouts of messages: the type of a topic and its entry in the mapping in, a `MessageLayout` out.
 
-Built-in types have their own layouts. Other types share one, which lists common names of fields.
+Built-in types have their own layouts. All other types share one layout, which lists common field names.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from spatial_replay.mapping.mapping_file import (
 )
 
 Alternatives: TypeAlias = tuple[str, ...]
-"""Field paths, of which the first that resolves is used."""
+"""Alternative field paths; the first path that resolves is used."""
 
 _NO_CLASSES: Table[str, str | None] = MappingProxyType({})
 
@@ -40,21 +40,22 @@ class MessageLayout:
         position: alternatives, each the path of a point or the paths of its coordinates.
         orientation: alternatives, each the path of a quaternion or the paths of its x, y, z and w.
         order: order of the four numbers of a quaternion in a list; "" if unknown.
-        yaw: alternatives of an angle.
-        angle_scale: radians per unit of `yaw`; negative if it counts clockwise.
+        yaw: alternative paths of an angle.
+        angle_scale: radians per unit of `yaw`; negative if the angle counts clockwise.
         angle_zero: yaw in radians at angle 0.
-        polygon: path of the corners, or paths of the four numbers of bounds.
-        is_bounds: whether `polygon` is two opposite corners of a box along the axes.
+        polygon: path of the corners, or paths of the bounds' four numbers.
+        is_bounds: whether `polygon` is two opposite corners of an axis-aligned box.
         bounds_have_size: whether the last two numbers are width and height instead of a corner.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
-        frame, stamp: alternatives in the object or, with `$.`, in the message. An empty frame of an object
-            means the frame of its message.
-        own_stamp: path of an object's stamp, for its transforms, if the message has another stamp; "" if not.
-        solids: kind of message that lists the solids of an object; "" for objects with a single shape.
+        frame, stamp: alternative paths in the object or, with `$.`, in the message. An object with an empty
+            frame has the message's frame.
+        own_stamp: path of an object's stamp for transforms, next to the message's stamp; "" without such a
+            stamp.
+        solids: kind of message that lists an object's solids; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
-        origin: latitude and longitude of (0, 0) if positions are latitudes and longitudes; otherwise None.
-        is_geojson: whether features are in a text, with longitudes and latitudes as corners.
-        corner_origin: latitude and longitude of (0, 0) if corners are longitudes and latitudes.
+        origin: latitude and longitude of (0, 0) for positions in degrees; None for other positions.
+        is_geojson: whether features are in a JSON text, with longitudes and latitudes as corners.
+        corner_origin: latitude and longitude of (0, 0) for corners in degrees; None for other corners.
         scale: units of the log per unit of positions, sizes, heights and uncertainties.
         invalid: numbers that stand for a missing value.
     """
@@ -261,7 +262,7 @@ _LATITUDE, _LONGITUDE = re.compile(r"lat(itude)?", re.I), re.compile(r"lon|lng|l
 
 
 def geodetic_order(paths: Alternatives) -> Alternatives | None:
-    """Return the paths of latitude and longitude among the paths of a position; None without these names."""
+    """Return the paths named latitude and longitude among a position's paths; None without these names."""
     last_names = [path.rpartition(".")[2] for path in paths]
     latitude_paths = [path for path, name in zip(paths, last_names, strict=True) if _LATITUDE.fullmatch(name)]
     longitude_paths = [
@@ -320,7 +321,7 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
     layout = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
     is_list = mapping.objects is not None
     if is_list and mapping.objects != layout.objects:
-        # a list that is not the type's list of objects has elements with other fields
+        # another list than the type's list of objects has elements with other fields
         layout = GENERIC
     changes: dict[str, object] = {}
     if is_list:

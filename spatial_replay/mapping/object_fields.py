@@ -43,24 +43,24 @@ _FOUR_BOUNDS = (
     ("x1", "y1", "x2", "y2"),
     ("x_offset", "y_offset", "width", "height"),
 )
-"""Names of the four numbers of a box; the last four are corner and size (sensor_msgs/RegionOfInterest)."""
+"""Names of a box's four numbers. The last row is a corner and a size (sensor_msgs/RegionOfInterest)."""
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
-"""Names of lists that name the elements of another list."""
+"""Names of lists with the names of another list's elements."""
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
-"""Words in the names of ids that several objects share, such as `class_id` and `frame_id`."""
+"""Words in names of ids that several objects share, such as `class_id` and `frame_id`."""
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
 _GEOMETRIES = ("Polygon", "MultiPolygon", "Feature")
-"""GeoJSON types with an outline; a `type` with such a value is not a class."""
+"""GeoJSON types with an outline. A field `type` with such a value is not a class."""
 _PLANES = ("level_name", "level", "floor", "floor_name", "storey", "map_name", "map_id", "map")
-"""Names of fields that name the floor or the map of an object."""
+"""Names of fields with an object's floor or map."""
 _PARTS = frozenset(
     {
         *(*_POSITIONS, *_TURNS, *_YAWS, *_SIZES, *_OUTLINES, *_NAMES, *_CLASSES),
         *("pose", "min", "max", "start", "end", "from", "to", "goal", "offset", "base"),
     }
 )
-"""Keys that are parts of one object; other keys of a JSON object may be names of objects."""
+"""Keys of parts of one object. Other keys of a JSON object may be names of objects."""
 _LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
 _PLANS = frozenset(
     {
@@ -76,7 +76,7 @@ _NOT_PLACES = frozenset(
         *("mount", "mounting", "sensor", "camera", "extrinsic", "extrinsics", "calibration"),
     }
 )
-"""Words in the names of fields whose points are not positions of objects, such as mounts of sensors."""
+"""Words in names of fields whose points are not positions of objects, such as mounts of sensors."""
 _ELSEWHERE = frozenset(
     {"goal", "target", "desired", "reference", "home", "last", "next", "previous", "initial"}
 )
@@ -98,22 +98,22 @@ class Guess:
         objects: path of the list of objects; None for a single object.
         position: path of a point, or paths of x and y.
         orientation: path of a quaternion.
-        has_order: whether the orientation is a list, so that it needs an order.
+        has_order: whether the orientation is a list, which needs an `order`.
         yaw: path of an angle.
         polygon: path of an outline.
-        is_own: whether the outline is in the object's own frame, at its pose.
-        bounds: path of a list of two opposite corners of a box, or paths of four numbers.
-        bounds_have_size: whether the last two of these numbers are width and height.
-        size: paths of length, width and maybe height, or of a radius.
+        is_own: whether the outline is in the object's frame, at its pose.
+        bounds: path of a list with a box's two opposite corners, or paths of its four numbers.
+        bounds_have_size: whether the last two numbers of the bounds are width and height.
+        size: paths of length, width and maybe height, or path of a radius.
         names: paths of possible names or ids, the likeliest first; `index` for keys of a JSON object.
         class_name: path of a class.
         is_in_pixels: whether coordinates look like pixels.
         is_sizeless: whether all objects have size 0.
-        other_outline: path of an outline of objects with size 0, if other objects have a size.
-        plane: path of the name of an object's floor or map, if objects have different ones.
-        has_zeros_left_out: whether some objects lack coordinates that others have.
-        others: guesses for further lists.
-        is_plan: whether the positions are planned ones.
+        other_outline: path of the outline of objects with size 0, if other objects have a size.
+        plane: path of the name of an object's floor or map, if objects have different names.
+        has_zeros_left_out: whether some objects lack coordinates that other objects have.
+        others: guesses for further lists of objects.
+        is_plan: whether the positions are planned positions.
     """
 
     objects: str | None = None
@@ -138,7 +138,7 @@ class Guess:
 
     @property
     def is_body(self) -> bool:
-        """Whether it has a name and also an orientation, a size or an outline, as further lists must have."""
+        """Whether it has a name, and an orientation, a size or an outline; required of further lists."""
         has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
         return bool(self.names) and has_extent and not self.is_plan
 
@@ -150,7 +150,7 @@ class Guess:
 
     @property
     def score(self) -> int:
-        """Number of fields of an object; a place (position, outline or bounds) counts ten."""
+        """Number of fields of an object; a position, an outline or bounds counts ten."""
         parts = (
             self.polygon or self.bounds,
             self.size,
@@ -163,7 +163,7 @@ class Guess:
 
 
 def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
-    """Find an object, or a list of objects, in the messages of a topic; None without one.
+    """Find an object, or a list of objects, in a topic's messages; None without an object.
 
     Args:
         kind: type of the messages.
@@ -172,7 +172,7 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
         return None
     best = _best(messages)
     if best is not None and best.objects is not None and not best.names:
-        # a list of positions without ids is a plan if its topic or type is named so, such as nav_msgs/Path
+        # a list of positions without ids is a plan if the topic or type has such a name, as nav_msgs/Path has
         words = (_words(re.split(r"[/.]", name)[-1]) for name in (topic, kind))
         best = replace(best, is_plan=best.is_plan or any(map(_PLANS.intersection, words)))
     if any(isinstance(message, dict) for message in messages):
@@ -188,7 +188,7 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
 
 
 def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether all objects have a position, but some positions lack x or y."""
+    """Return whether all objects have a position, and some positions lack x or y."""
     coordinate_counts = set()
     for message in messages:
         try:
@@ -209,7 +209,7 @@ def _best(messages: Sequence[object]) -> Guess | None:
     guesses = [guess for message in messages if (guess := _guess(message)) is not None]
     if not guesses:
         return None
-    # near the origin an outline may be in either frame; another message decides by `is_own`
+    # near the origin an outline may be in either frame; a message with `is_own` decides
     best = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
     if best.objects is None:
         return best
@@ -221,11 +221,11 @@ def _best(messages: Sequence[object]) -> Guess | None:
 
 
 def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
-    """Return a guess that is corrected by the values of its fields in all messages."""
+    """Return a guess after corrections by the values of its fields in all messages."""
     if guess.names == (INDEX,):
         return guess
     if isinstance(guess.position, tuple) and geodetic_order(guess.position):
-        # the frame of a fix names its receiver
+        # the frame of a fix is the name of its receiver
         guess = replace(guess, names=(*guess.names, "frame_id"))
     names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
     with suppress(FieldError):
@@ -243,7 +243,7 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
 
 
 def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
-    """Yield the paths of neighbouring lists with a name for each object."""
+    """Yield the paths of neighbouring lists that hold a name for each object."""
     if guess.objects is None or guess.objects.count("[*]") > 1:
         return
     prefix = guess.objects.rpartition(".")[0]
@@ -286,7 +286,7 @@ def signals_in(message: object) -> tuple[str, ...]:
 
 
 def frame_of(message: object) -> str | None:
-    """Return the frame of a message's coordinates; None without one."""
+    """Return the frame of a message's coordinates; None without a frame."""
     for path, value in _iter_fields(message, is_skipped=lambda name: False):
         if path.split(".")[-1] == "frame_id" and isinstance(value, str) and value:
             return value.removeprefix("/")
@@ -313,7 +313,7 @@ def _guess(message: object) -> Guess | None:
 
 
 def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
-    """Return whether a field distinguishes the objects of a message or, for single objects, the senders."""
+    """Return whether a field distinguishes the objects of each message, or the senders of single objects."""
     try:
         texts_by_message = [
             [str(walk(FieldPath.of(name), element)) for element in _objects_in(guess, message)]
@@ -336,7 +336,7 @@ def _outline_of_sizeless(guess: Guess, messages: Sequence[object]) -> str | None
 
 
 def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -> Iterator[object]:
-    """Iterate over the values at some paths in all objects; paths that do not resolve are skipped."""
+    """Iterate over the values at some paths in all objects; skip paths that do not resolve."""
     for message in messages:
         for path in paths:
             with suppress(FieldError):
@@ -344,7 +344,7 @@ def _values_at(paths: Sequence[str], guess: Guess, messages: Sequence[object]) -
 
 
 def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> bool:
-    """Return whether most objects of the second list are at the places of objects of the first.
+    """Return whether most objects of the second list have the position of an object of the first list.
 
     Such lists, for example detections and tracks, have the same objects.
     """
@@ -362,7 +362,7 @@ def share_places(first: Guess, second: Guess, messages: Sequence[object]) -> boo
 
 
 _SAME_PLACE = 0.2
-"""Distance within which objects of two lists are the same object, units of the log."""
+"""Distance below which objects of two lists are one object, units of the log."""
 
 
 def _place_of(guess: Guess, element: object) -> tuple[float, ...]:
@@ -386,7 +386,7 @@ def _objects_in(guess: Guess, message: object) -> Iterator[object]:
 
 
 def takes_turns(texts: Sequence[str]) -> bool:
-    """Return whether a text returns after another one, as names of several senders do, unlike a counter."""
+    """Return whether a text returns after another text. Names of several senders return; counters do not."""
     run_starts = [
         text for text, previous_text in zip(texts, (None, *texts), strict=False) if text != previous_text
     ]
@@ -401,13 +401,13 @@ def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
         elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
             last_name = path.split(".")[-1]
-            # corners of an outline are points instead of objects
+            # corners of an outline are points, but not objects
             if guess is not None and not (last_name in _OUTLINES and guess.score <= 10):
                 yield f"{path}[*]", replace(guess, is_plan=not _PLANS.isdisjoint(_words(last_name)))
 
 
 def _table_of_objects(value: object) -> list[object]:
-    """Return the objects in a protobuf map or a JSON object whose keys are names; [] for other values.
+    """Return the objects of a protobuf map, or of a JSON object whose keys are names; [] for other values.
 
     A JSON object counts as a map if it has at least two objects, all with the same fields.
     """
@@ -423,7 +423,7 @@ def _table_of_objects(value: object) -> list[object]:
 
 
 def _object_in(value: object) -> Guess | None:
-    """Find the fields of one object in a message or an element of a list."""
+    """Find the fields of one object in a message, or in an element of a list; None without a position."""
     fields = dict(_iter_fields(value))
     position, orientation = _pose_in(fields)
     polygon, corners = _outline_in(fields)
@@ -433,7 +433,7 @@ def _object_in(value: object) -> Guess | None:
         origin = _point(fields[position]) or (0.0, 0.0)
         is_in_object_frame = not _is_around(corners, origin) and _is_around(corners, (0.0, 0.0))
         if not is_in_object_frame and not _is_around(corners, origin):
-            # the outline is elsewhere, such as pixels next to a pose in metres
+            # the outline does not belong to the pose, such as pixels next to a pose in metres
             polygon, corners = None, []
     if polygon is not None or position is not None:
         bounds = None
@@ -491,20 +491,20 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     for path in _paths_by_name(fields, _BOUNDS):
         if _numbers(fields[path], 4):
             return path
-    # reversed, so that the first of several fields with one name is used
+    # reversed, so that the first field is used if several fields have one name
     path_by_name = {
         "_".join(_words(path.split(".")[-1])): path for path in reversed(fields) if _is_number(fields[path])
     }
     for names in _FOUR_BOUNDS:
         if all(name in path_by_name for name in names):
             left, low, right, top = (float(fields[path_by_name[name]]) for name in names)  # type: ignore[arg-type]
-            # in another order they are the ends of a line, not corners of a box
+            # numbers in another order are the ends of a line, not corners of a box
             return tuple(path_by_name[name] for name in names) if left <= right and low <= top else None
     return None
 
 
 def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]:
-    """Return the four numbers of the bounds of an object; () if the value is no list of four numbers.
+    """Return the four numbers of an object's bounds; () if the value is not a list of four numbers.
 
     Raises:
         FieldError: a path does not resolve.
@@ -518,7 +518,7 @@ def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]
 def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether bounds have width and height instead of a second corner.
 
-    Names decide; without such names, a second corner left of or below the first in some box does.
+    Names decide. Without such names, a box whose second corner would be left of or below its first decides.
     """
     bounds = guess.bounds
     if bounds is None or isinstance(bounds, tuple):
@@ -533,7 +533,7 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
-    """Return the paths of a position and an orientation, preferably those of one pose."""
+    """Return the paths of a position and an orientation, preferably in the same pose."""
     orientations = [
         path
         for path in _paths_by_name(fields, _TURNS)
@@ -543,7 +543,7 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
         path
         # first names such as `position`, then names such as `agvPosition`
         for path in (*_paths_by_name(fields, _POSITIONS), *_paths_by_last_word(fields, _POSITIONS))
-        # positions next to a list of names are those of joints, as in sensor_msgs/JointState
+        # positions next to a list of names are positions of joints, as in sensor_msgs/JointState
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
     ]
@@ -553,7 +553,7 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
                 return position_path, orientation
     position: str | tuple[str, ...] | None = positions[0] if positions else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
-        # x and y next to w are parts of a quaternion
+        # x and y next to w belong to a quaternion
         position = None if _is_number(fields.get("w")) else ("x", "y")
     if position is None:
         position = geodetic_order(tuple(path for path, value in fields.items() if _is_number(value)))
@@ -577,7 +577,7 @@ def _numbers(value: object, count: int) -> list[float]:
 
 
 def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
-    """Return whether a place is inside the box around an outline, enlarged by the outline's size."""
+    """Return whether a point is in the box around an outline, enlarged by the outline's size."""
     low, high = (
         tuple(extremum(corner[axis] for corner in corners) for axis in (0, 1)) for extremum in (min, max)
     )
@@ -586,12 +586,12 @@ def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -
 
 
 _PIXELS = 50
-"""Coordinate that pixels usually exceed."""
+"""Lower limit of the greatest coordinate of points in pixels."""
 _IMAGES = re.compile("pixel|image|bbox|keypoint", re.IGNORECASE)
 
 
 def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
-    """Return whether points, or boxes of four numbers, look like pixels: large, not negative, without z."""
+    """Return whether points, or boxes of four numbers, look like pixels: large, not negative, no z."""
     flat = [number for point in points for number in (point if len(point) > 3 else point[:2])]
     is_flat = not any(point[2] for point in points if len(point) == 3)
     return bool(flat) and is_flat and min(flat) >= 0 and max(flat) >= _PIXELS
@@ -613,7 +613,7 @@ def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
 
 
 def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
-    """Return the paths of fields that may distinguish objects: `name`, `id`, then others as `fiducial_id`."""
+    """Return the paths of fields that may distinguish objects: `name`, `id`, then e.g. `fiducial_id`."""
     other_paths = [
         path
         for path in fields
@@ -627,7 +627,7 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
             names.append(path)
         elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
-            # a list of one id, or of the bytes of a UUID
+            # a list with one id, or with the bytes of a UUID
             names.append(path)
         elif inner_name := next((name for name in ("value", "uuid") if name in field_names(value)), None):
             names.append(f"{path}.{inner_name}")
@@ -647,7 +647,7 @@ def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[st
 
 
 def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """Return the paths whose last name ends in a word of `names` after other words, by depth.
+    """Return the paths whose last name has several words, the last of them in `names`, by depth.
 
     Names of planned or earlier positions are excluded.
     """
@@ -675,7 +675,7 @@ def _is_time(name: str) -> bool:
 def _iter_fields(
     value: object, path: str = "", depth: int = 0, *, is_skipped: Callable[[str], bool] = _is_no_place
 ) -> Iterator[tuple[str, object]]:
-    """Iterate over the fields of a message and its parts, with their paths; lists are not entered."""
+    """Iterate over the (path, value) of fields in a message and its parts, without elements of lists."""
     for name in field_names(value) if depth < _DEEPEST else ():
         if not is_skipped(name) and _FIELD.fullmatch(name):
             inner_value = get_field(value, name)
@@ -685,7 +685,7 @@ def _iter_fields(
 
 
 def _list_rank(path: str) -> int:
-    """Return a rank of a list by its name; lists of moving objects have the highest."""
+    """Return a rank of a list by its name; lists of moving objects have the highest rank."""
     last_name = path.removesuffix("[*]").split(".")[-1].lower()
     return 2 * ("moving" in last_name or "dynamic" in last_name) + bool(_LISTS.search(last_name))
 

@@ -40,10 +40,10 @@ def outlines_from_lists(
 ) -> tuple[Integers, Floats, int]:
     """Return the corner counts (R,) and corners (V, 3) of outlines, and the number of faulty outlines.
 
-    An outline with too few corners gets one corner at NaN, so that its object is unknown.
+    An outline with too few corners gets one corner at NaN, which makes its object unknown.
 
     Args:
-        is_bounds: whether each list has two opposite corners of a box, which become four corners.
+        is_bounds: whether each list is two opposite corners of a box. They become four corners.
         have_size: whether bounds have width and height instead of the second corner.
     """
     corner_counts, points = points_from_lists(lists)
@@ -56,7 +56,7 @@ def outlines_from_lists(
             else np.empty((2, 0, 3))
         )
         if have_size:
-            # NaN instead of a negative size, so that the object is unknown
+            # NaN instead of a negative size makes the object unknown
             box_corners[1] = box_corners[0] + np.where(box_corners[1] < 0, np.nan, box_corners[1])
         (left, low, _), (right, high, _) = box_corners.min(axis=0).T, box_corners.max(axis=0).T
         box_xs, box_ys = (
@@ -101,14 +101,14 @@ def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
 
 
 def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) -> Floats:
-    """Return the numbers (N, width) of elements; NaN for null in JSON and for missing elements of lists.
+    """Return the numbers (N, width) of elements; NaN for null in JSON, and for missing elements of lists.
 
     Args:
         get: function from an element to its numbers.
     """
     element_count = len(elements)
     if style == "attributes":
-        # faster than an array from a list of tuples, but np.fromiter refuses None
+        # faster than np.array of a list of tuples, but np.fromiter refuses None
         with suppress(TypeError):
             numbers = chain.from_iterable(map(get, elements))
             return np.fromiter(numbers, np.float64, element_count * width).reshape(element_count, width)
@@ -138,7 +138,7 @@ def features_in(message: object) -> dict[str, object]:
 
 
 def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
-    """Return the path of the object that holds the rings at a path; None if the path resolves to corners.
+    """Return the path of the object with the rings at a path; None if the path leads to corners.
 
     A neighbouring field identifies rings: `type` next to `coordinates`, or `inner` next to `outer`.
     """
@@ -149,16 +149,16 @@ def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
             return owner_path
     value = walk(path, example) if leads_somewhere(path, example) else None
     names = field_names(value)
-    # corners are lists in a list, rings are one level deeper
+    # corners are lists in a list; rings are one level deeper
     has_rings = _INNER in names or "coordinates" in names or _depth(value) > 2
     return path if has_rings else None
 
 
 def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Floats, int]:
-    """Return outline counts (R,), corner counts, corners (V, 3), and the number of objects without a polygon.
+    """Return outline counts (R,), corner counts, corners (V, 3), and the number of objects without polygon.
 
     A polygon without a hole is one outline. A polygon with holes is split into convex outlines. An object
-    without a polygon gets one corner at NaN, so that it is unknown.
+    without a polygon gets one corner at NaN, which makes it unknown.
 
     Raises:
         ContentError: a ring crosses or touches itself or another ring.
@@ -176,7 +176,7 @@ def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Flo
 
 
 def _polygons_in(holder: Any) -> list[Any]:
-    """Return the polygons of an object, each a list of rings."""
+    """Return the polygons of an object, each as a list of rings."""
     names = field_names(holder)
     if _OUTER in names:
         rings = [get_field(holder, _OUTER), *get_field(holder, _INNER)]  # type: ignore[misc]
@@ -186,7 +186,7 @@ def _polygons_in(holder: Any) -> list[Any]:
         # points and lines cover no area
         polygons_by_type: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
         return list(polygons_by_type.get(get_field(holder, "type"), ()))
-    # a polygon has three levels (rings, corners, numbers), a MultiPolygon four
+    # a polygon has three levels of lists (rings, corners, numbers), a MultiPolygon has four
     return list(holder) if _depth(holder) > 3 else [holder]
 
 
@@ -196,7 +196,7 @@ def _depth(value: Any) -> int:
 
 
 def _pieces(rings: Sequence[Any]) -> list[Floats]:
-    """Return the outlines (n, 3) of a polygon; no outline if its outer ring has too few corners."""
+    """Return the outlines (n, 3) of a polygon; [] if its outer ring has too few corners."""
     outer, *holes = (_ring(ring) for ring in rings) if len(rings) else (np.empty((0, 3)),)
     if len(outer) < _LEAST_CORNERS:
         return []
@@ -211,8 +211,8 @@ def _pieces(rings: Sequence[Any]) -> list[Floats]:
 
 
 def _ring(corners: Any) -> Floats:
-    """Return the corners (n, 3) of a ring, without a last corner that repeats the first."""
+    """Return the corners (n, 3) of a ring, without a last corner that repeats the first corner."""
     _, points = points_from_lists([corners])
-    # rings of GeoJSON are closed (RFC 7946, section 3.1.6), those of polygon_msgs are open
+    # rings of GeoJSON are closed (RFC 7946, section 3.1.6), rings of polygon_msgs are open
     is_closed = len(points) > 1 and (points[0] == points[-1]).all()
     return points[:-1] if is_closed else points

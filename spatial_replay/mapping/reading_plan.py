@@ -1,6 +1,6 @@
 """Plan the reading of a log: compare a mapping with the topics of the log.
 
-`ReadingPlan.of` finds faults of a mapping that depend on the log. It decides which topics are read, for which
+`ReadingPlan.of` finds a mapping's faults that depend on the log. It decides which topics are read, for which
 purpose, and how far outside a window.
 """
 
@@ -34,9 +34,9 @@ from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint, plural
 from spatial_replay.trace.trace import LONG_PAUSE
 
-# bounded, so that a window needs to read only 11 s beyond its end and 13 s before its start
+# a bound, so that a window needs messages only up to 11 s after its end and 13 s before its start
 _LONGEST_SILENCE_NS: Final = 10 * 10**9
-"""Silence of the sampled topic that is always a pause, even if its messages are rare, nanoseconds."""
+"""Silence of the sampled topic, nanoseconds, that is always a pause, even if messages are rare."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,20 +44,20 @@ class PlannedTopic:
     """Plan for one topic, or for one list of objects in its messages.
 
     Attributes:
-        name: topic, with the index of its entry if the mapping has several: `/scene`, `/scene[1]`.
+        name: topic, with the entry's index after the first entry: `/scene`, `/scene[1]`.
         topic: topic of the log.
-        mapping: entry of the mapping; None for topics that are read for transforms or times only.
+        mapping: entry of the mapping; None for topics read only for transforms or times.
         layout: places of object fields; None for a topic without objects.
         max_age_ns: validity of an observation or a signal, nanoseconds.
-        between_ns: longest time between two transforms that are interpolated, nanoseconds; objects are
-            unknown within a longer one.
-        silence_ns: silence after which the topic has ended, even if its last message stays valid,
-            nanoseconds.
-        is_transforms: whether its messages are transforms between frames.
-        is_static: whether these transforms hold at all times.
+        between_ns: longest time between two transforms that are interpolated, nanoseconds. Within a longer
+            time, objects are unknown.
+        silence_ns: silence after which the topic has ended, nanoseconds. This holds even if its last message
+            stays valid.
+        is_transforms: whether the messages are transforms between frames.
+        is_static: whether the transforms hold at all times.
         is_lasting: whether a message stays valid forever.
-        is_latched: whether a message may have been sent long before it was recorded.
-        is_protobuf_json: whether its messages are JSON of a Foxglove type, which protobuf may have written.
+        is_latched: whether messages may have been sent long before recording.
+        is_protobuf_json: whether messages are JSON of a Foxglove type, which protobuf may have written.
     """
 
     name: str
@@ -82,17 +82,17 @@ class PlannedTopic:
 
 @dataclass(frozen=True, slots=True)
 class ReadingPlan:
-    """Selection of messages for a mapping that fits the log.
+    """Messages to read for a mapping that fits the log.
 
     Attributes:
         topics: topics to read: mapped topics, and topics of transforms if frames are needed.
-        by_log_time: whether times of samples are log times. Otherwise the messages of a window are known only
-            after all messages have been decoded.
-        late_ns: largest disorder of messages, nanoseconds; samples wait as long for late messages.
-        wait_ns: time that samples wait for messages that affect them, nanoseconds.
-        margin_ns: time after the end of a window in which messages still affect it, nanoseconds.
+        by_log_time: whether times of samples are log times. Otherwise a window's messages are known only
+            after decoding all messages.
+        late_ns: largest disorder of messages, nanoseconds. Samples wait for late messages for this time.
+        wait_ns: waiting time of samples for messages that affect them, nanoseconds.
+        margin_ns: time after a window's end in which messages still affect the window, nanoseconds.
         planned: plan for each topic, in the order of `topics`.
-        lost: topics of transforms that cannot be decoded, with the reason.
+        lost: (topic, reason) of transform topics that cannot be decoded.
         absent: optional topics that the log lacks.
         sampled_topic: topic with a sample at each message; None for samples at multiples of a step.
         fallback_topics: topics that are sampled while the sampled topic is silent.
@@ -184,9 +184,9 @@ class ReadingPlan:
         )
 
     def lookback_ns(self, topic: str) -> int | None:
-        """Return the time before a window in which messages of a topic affect it, nanoseconds.
+        """Return the time before a window in which a topic's messages affect the window, nanoseconds.
 
-        None means all messages, as for static transforms.
+        None means that all earlier messages affect it, for example static transforms.
         """
         lookbacks_ns = [self._lookback_ns(planned) for planned in self.planned if planned.topic == topic]
         return None if None in lookbacks_ns else max(filter(None, lookbacks_ns), default=0)
@@ -203,7 +203,7 @@ class ReadingPlan:
             pauses_ns = self.longest_silence_ns + self.longest_silence_ns // LONG_PAUSE
             lookback_ns = max(lookback_ns, pauses_ns)
         if planned.is_transforms and not planned.is_static:
-            # an observation that old may be valid in the window, and needs a transform of its own time
+            # an observation of this age may be valid in the window, and needs a transform at its time
             lookback_ns = max(lookback_ns, HISTORY_NS + max(ages_ns, default=0))
             if any(topic.is_lasting and topic.layout is not None for topic in self.planned):
                 return None
@@ -272,9 +272,10 @@ def _topics_in_words(by_name: Mapping[str, Topic]) -> str:
 
 
 def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
-    """Return the topic that is sampled by default: the topic with objects that has most messages.
+    """Return the topic to sample by default: the topic with objects and most messages.
 
-    Without objects, all topics are candidates. If the log does not give counts, the first candidate is taken.
+    Without objects, all topics are candidates. If the log does not give message counts, the first candidate
+    is sampled.
     """
     existing_entries = [entry for entry in mapping.topics if entry.topic in by_name]
     names = [entry.topic for entry in existing_entries if entry.reads_objects] or [
@@ -285,9 +286,10 @@ def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
 
 
 def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
-    """Return the topics that are sampled while the sampled topic is silent.
+    """Return the topics to sample while the sampled topic is silent.
 
-    Topics of static transforms, of markers and latched topics are excluded, because they are sent rarely.
+    Topics of static transforms, topics of markers and latched topics are excluded, because they are sent
+    rarely.
     """
     frequent_topics = [
         topic
@@ -306,7 +308,7 @@ _MANY_TIMES = 10
 def _slow_sampling(
     sampled: str | None, mapped: Sequence[Topic], by_name: Mapping[str, Topic]
 ) -> tuple[str, ...]:
-    """Return a remark if a mapped topic has many times the messages of the sampled topic."""
+    """Return a remark if a mapped topic has many times more messages than the sampled topic."""
     busiest_topic = max(mapped, key=lambda topic: topic.count or 0)
     sampled_count = None if sampled is None else by_name[sampled].count
     if (
@@ -382,4 +384,4 @@ def _plan_of_topic(
 
 
 _GEOMETRIES = frozenset({"geometry", "coordinates"})
-"""Fields of GeoJSON, whose corners are longitude and latitude, in this order (RFC 7946)."""
+"""Fields of GeoJSON. Their corners are longitude and latitude, in this order (RFC 7946)."""

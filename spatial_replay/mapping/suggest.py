@@ -65,7 +65,7 @@ from spatial_replay.text import plural
 from spatial_replay.trace.trace import FOREVER
 
 EXAMPLES = 20
-"""First messages of each topic to decode; later ones are decoded more and more rarely."""
+"""Number of first messages of each topic to decode; later messages are decoded more and more rarely."""
 
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
@@ -76,24 +76,24 @@ _MOST_SIGNALS = 12
 _MOST_LISTS = 6
 _TEXTS = frozenset({"name", "label"})
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
-"""Last parts of names of topics about programs instead of objects."""
+"""Last words of topic names that concern programs instead of objects."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of sensor frames, which are mounted on objects."""
 # PX4 publishes in this frame, see https://docs.px4.io/main/en/ros2/user_guide.html
 _NORTH_EAST_DOWN = re.compile(
     r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position|vehicle_odometry)(?![a-z0-9])", re.IGNORECASE
 )
-"""Topics, types and frames whose x points north, y east and z down."""
+"""Names of topics, types and frames with x north, y east and z down."""
 _MAVROS = re.compile(r"(?<![a-z0-9])mavros(?![a-z0-9])", re.IGNORECASE)
 
 _LARGEST_SUGGESTION = LARGEST_TEXT // 2
-"""Size limit of a suggestion, bytes; half of the limit of mappings, so that a user can add to it."""
+"""Size limit of a suggestion, bytes: half the limit of mappings, so that a user can add entries."""
 _LONGEST_KEY = 500
-"""Length limit of a topic's name, which is a key; YAML allows 1,024 characters in a key."""
+"""Length limit of a topic name as a key; YAML allows 1,024 characters in a key."""
 
 _Axes: TypeAlias = Literal["plane", "north", "image"]
 _AXES: Mapping[_Axes, str] = MappingProxyType({"plane": "", "north": "x north, y east", "image": "in pixels"})
-"""Kinds of axes, in words. A scene has one kind, and the first of these in a log is suggested."""
+"""Kinds of axes, in words. A scene has one kind; the suggestion uses the first kind that the log has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,18 +101,19 @@ class TopicSuggestion:
     """A suggestion for one topic.
 
     Attributes:
-        fields: entry of a mapping, values in YAML's flow style by key; None if no field looks like an object.
-        name: template of its objects' names, by default or as in the entry.
+        fields: entry of a mapping, as values in YAML's flow style by key; None if no field looks like an
+            object.
+        name: template of object names: of the entry, or the default.
         remarks: notes for the user, which become comments.
-        is_transforms: whether its messages are transforms, which are objects only in a log without others.
-        frames: frames of its coordinates, according to the entry.
-        axes: kind of axes of its coordinates.
+        is_transforms: whether messages are transforms, which are objects only in a log without other objects.
+        frames: frames of coordinates, according to the entry.
+        axes: kind of axes of coordinates.
         numbers: paths of possible signals.
         aside: reason why the entry is not used; "" if it is used.
         layout: layout of the entry; None without one.
-        lateness_s: (N,) time from stamps of messages to their recording; None if stamps are not a clock.
+        lateness_s: (N,) time from each message's stamp to its recording; None if stamps are not a clock.
         path: path of the list of objects.
-        further: suggestions for further lists of objects in its messages.
+        further: suggestions for further lists of objects in the messages.
     """
 
     topic: Topic
@@ -143,7 +144,7 @@ class TopicSuggestion:
 
     @property
     def signals(self) -> str:
-        """Entry that reads the numbers as signals; "" without numbers."""
+        """Entry with all `numbers` as signals; "" without numbers."""
         prefix = _topic_words(self.topic.name)
         path_by_name = {f"{prefix}_{_signal_name(path)}": path for path in self.numbers[:_MOST_SIGNALS]}
         signals = flow_text({yaml_text(name): yaml_text(path) for name, path in path_by_name.items()})
@@ -159,7 +160,7 @@ def suggest_topics(
 
     Args:
         examples: some decoded messages of each topic, by name.
-        times_ns: log times of these messages, by topic; by default, one second apart.
+        times_ns: log times of the example messages, by topic; by default, one second apart.
     """
     suggestions = []
     for topic in topics:
@@ -180,12 +181,12 @@ def suggest_mapping(
 ) -> str:
     """Return the text of a mapping file, with comments.
 
-    It is a valid mapping if a topic has objects or signals.
+    The text is a valid mapping if a topic has objects or signals.
 
     Args:
         log: name of the log.
         examples: some decoded messages of each topic, by name.
-        times_ns: log times of these messages, by topic.
+        times_ns: log times of the example messages, by topic.
     """
     suggestions = suggest_topics(topics, examples, times_ns)
     first_ns = {name: times[0] for name, times in times_ns.items() if times}
@@ -274,7 +275,7 @@ def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
 
 
 def _first_that_fit(texts: Sequence[tuple[str, str]], byte_limit: int) -> list[tuple[str, str]]:
-    """Return the first (name, text) pairs whose texts fit into `most` bytes."""
+    """Return the first (name, text) pairs whose texts fit into `byte_limit` bytes."""
     texts_that_fit: list[tuple[str, str]] = []
     for name, text in texts:
         byte_limit -= len(text.encode()) + 1
@@ -285,7 +286,7 @@ def _first_that_fit(texts: Sequence[tuple[str, str]], byte_limit: int) -> list[t
 
 
 def _with_distinct_names(suggestions: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
-    """Return suggestions in which names shared by several topics are prefixed by the topic."""
+    """Return suggestions with the topic as a prefix of names that several topics share."""
     parts_by_topic = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in suggestions}
     name_counts = Counter(part.name for parts in parts_by_topic.values() for part in parts)
     return [
@@ -301,7 +302,7 @@ def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
 
 
 def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
-    """Return a suggestion with a prefix of the names of its objects."""
+    """Return a suggestion with a prefix for its object names."""
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
     fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
     # `objects` first, then `name`, as in handwritten mappings
@@ -313,7 +314,7 @@ def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
 def _with_trial(
     suggestion: TopicSuggestion, examples: Sequence[object], times_ns: Sequence[int]
 ) -> TopicSuggestion:
-    """Return a suggestion after a trial on messages; it is put aside if the messages cannot be read."""
+    """Return a suggestion after a trial on messages, with the reason in `aside` if no message can be read."""
     topic, layout = suggestion.topic, suggestion.layout
     entry = suggestion.entry or suggestion.signals
     if not entry or not examples or suggestion.is_transforms:
@@ -349,7 +350,7 @@ def _with_trial(
 def _origin_lines(
     active: Sequence[TopicSuggestion], examples: Mapping[str, Sequence[object]]
 ) -> Iterator[str]:
-    """Yield the lines of the `origin`, which is the first fix."""
+    """Yield the lines of the key `origin`, with the first fix."""
     for suggestion in active:
         layout = suggestion.layout
         first_fix = None if layout is None else _first_fix(layout, examples.get(suggestion.topic.name, ()))
@@ -360,7 +361,7 @@ def _origin_lines(
 
 
 def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float, float] | None:
-    """Return latitude and longitude of the first fix, in degrees; None without one."""
+    """Return latitude and longitude of the first fix, in degrees; None without a fix."""
     paths = geodetic_paths(layout)
     if layout.is_geojson:
         return next(filter(None, map(_first_corner, examples)), None)
@@ -371,7 +372,7 @@ def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float
 
 
 def _first_corner(message: object) -> tuple[float, float] | None:
-    """Return latitude and longitude of the first position in a message of GeoJSON; None without one."""
+    """Return latitude and longitude of the first position in a GeoJSON message; None without a position."""
     try:
         text = str(walk(FieldPath.of("geojson"), message))
     except FieldError:
@@ -406,7 +407,7 @@ def _axes_lines(axes: _Axes) -> Iterator[str]:
 
 
 def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggestion]:
-    """Return one suggestion per list of objects in a topic's messages; at least one suggestion."""
+    """Return one suggestion per list of objects in a topic's messages, and at least one suggestion."""
     is_ours = has_our_type(Channel(topic.name, topic.encoding, topic.schema))
     if is_ours or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return [TopicSuggestion(topic)]
@@ -431,7 +432,7 @@ def _of_known_type(topic: Topic, reading: MessageLayout, examples: Sequence[obje
     name = reading.name.replace("{topic}", name_from_topic(topic.name))
     fields: Mapping[str, str] = {} if has_outline else _POINT
     if reading.name == "{topic}" and takes_turns(_children(examples)):
-        # several children on one topic, such as the odometry of several robots
+        # several child frames on one topic, such as the odometry of several robots
         name = "{child_frame_id}"
         fields = {"name": yaml_text(name), **fields}
     remarks = () if has_outline else _SIZELESS
@@ -451,7 +452,7 @@ def _of_guess(topic: Topic, guess: Guess, examples: Sequence[object]) -> TopicSu
 
 
 def _join_lists(suggestions: Sequence[TopicSuggestion]) -> TopicSuggestion:
-    """Join the suggestions for lists of objects of a topic into one."""
+    """Join the suggestions for a topic's lists of objects into one suggestion."""
     first_suggestion, *other_suggestions = suggestions
     further_suggestions = [
         suggestion
@@ -486,7 +487,7 @@ def _with_frames(
     name: str,
     remarks: tuple[str, ...],
 ) -> TopicSuggestion:
-    """Return a suggestion with the frames and axes of its coordinates, and `max_age` if it is needed."""
+    """Return a suggestion with frames, axes, and `max_age` where needed."""
     frames = frozenset(_iter_frames(layout, examples))
     fields = {**fields, "max_age": "forever"} if layout.stays or topic.latched else fields
     axes: _Axes = "plane"
@@ -500,7 +501,7 @@ def _with_frames(
 
 
 def _children(messages: Sequence[object]) -> list[str]:
-    """Return the `child_frame_id` of each message that has one."""
+    """Return the `child_frame_id` of each message that has this field."""
     return [
         str(get_field(message, "child_frame_id"))
         for message in messages
@@ -509,7 +510,7 @@ def _children(messages: Sequence[object]) -> list[str]:
 
 
 def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]) -> bool:
-    """Return whether names of some objects fall back on their indices in a list."""
+    """Return whether some objects are named by their index in a list."""
     if f"{INDEX}}}" not in layout.name:
         return False
     namer = Namer(NameTemplate.of(layout.name), topic.name, Codes(), (), ())
@@ -521,7 +522,7 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
-    """Yield the frame of each object that has one according to the layout."""
+    """Yield the frame of each object with a frame according to the layout."""
     alternatives = [FieldPath.of(path) for path in layout.frame]
     for message, element in _iter_objects(layout, examples):
         roots = [(path, message if path.from_message else element) for path in alternatives]
@@ -543,7 +544,7 @@ def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator
 
 
 def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
-    """Suggest the child frames of transforms as objects, without frames of sensors."""
+    """Suggest child frames of transforms as objects, except frames of sensors."""
     if topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static":
         remark = "static transforms place frames, such as those of sensors; they are no objects"
         return TopicSuggestion(topic, remarks=(remark,), is_transforms=True)
@@ -631,7 +632,7 @@ def _name(topic: Topic, guess: Guess) -> str:
         return name_from_topic(topic.name)
     path = guess.names[0] if guess.names else INDEX
     if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] in _TEXTS):
-        # the value is a name; a number would need a word in front
+        # the value is a name; only a number needs a word in front
         return f"{{{path}}}"
     word = name_from_topic(topic.name) if guess.objects is None else guess.objects.removesuffix("[*]")
     return f"{re.sub('(?<=x)es$|s$', '', word.split('.')[-1]) or 'object'}{{{path}}}"
@@ -672,13 +673,13 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
 def _choose_frame(
     suggestions: Sequence[TopicSuggestion], transforms: Sequence[object]
 ) -> tuple[list[str], dict[str, str]]:
-    """Choose the fixed frame as the frame in which most topics can be placed.
+    """Choose the frame in which most topics can be placed as the fixed frame.
 
     Args:
         transforms: messages with transforms.
 
     Returns:
-        Lines of the mapping, and the reason why a topic cannot be placed, by topic.
+        Lines of the mapping, and by topic the reason why it cannot be placed.
     """
     frames = sorted(frozenset().union(*(suggestion.frames for suggestion in suggestions)))
     edges = sorted({edge for message in transforms for edge in _edges(message)})
@@ -715,7 +716,7 @@ def _choose_frame(
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
-    """Return a frame and all frames below it in the tree of transforms."""
+    """Return a frame and all its descendants in the tree of transforms."""
     frames_below = {root}
     while new_frames := {child for parent, child in edges if parent in frames_below} - frames_below:
         frames_below |= new_frames
@@ -749,7 +750,7 @@ def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) 
 
 
 def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
-    """Return the clock and the reason: stamps are used if delays of recording differ too much."""
+    """Return the clock and the reason for it: `header` if delays of recording differ too much."""
     lateness_by_topic = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
     stampless_topics = [topic for topic, lateness in lateness_by_topic if lateness is None]
     median_by_topic = {
@@ -788,9 +789,9 @@ def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
 
 
 def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
-    """Choose the topic to sample: of the frequent topics that start together, the last to start.
+    """Choose the topic to sample: the last topic to start among frequent topics that start together.
 
-    So all of these topics have a message at the first sample.
+    So all these topics have a message at the first sample.
     """
     topics = [suggestion.topic for suggestion in active]
     begin_times_ns = [first_ns.get(topic.name, FOREVER) for topic in topics]

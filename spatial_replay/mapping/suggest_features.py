@@ -21,15 +21,15 @@ _NO_OBJECTS: Final = re.compile(
     r"(.*[./])?(actions?\b.*|rewards?|timestamps?|time|truncat\w*|terminat\w*|is_success|success|done)"
     r"|next\..*|(frame_|episode_|task_|subtask_)?index|observation\.images?\b.*"
 )
-"""Features without objects: actions, rewards, labels, times, row numbers, images."""
+"""Names of features without objects: actions, rewards, labels, times, row numbers, images."""
 _STATES_OF_BODIES: Final = ("states/", "env_states/")
-"""Prefixes of features whose bodies the data set names itself."""
+"""Prefixes of features with bodies that the data set names itself."""
 _JOINTS: Final = re.compile(
     r"joint|shoulder|elbow|wrist|waist|forearm|upperarm|hip|knee|ankle|finger|thumb|gripper|torso|neck"
     r"|\bhead_(pan|tilt)|qvel|velocity|effort|torque|current",
     re.IGNORECASE,
 )
-"""Names of numbers that belong to a robot's joints instead of a position."""
+"""Names of numbers that concern a robot's joints instead of a position."""
 _NO_POINT: Final = re.compile(
     r"vel|acc|force|torque|twist|delta|linear|angular|rot|rpy|euler|axis|joint|image|_to_", re.IGNORECASE
 )
@@ -60,10 +60,10 @@ class Suggestion(NamedTuple):
     """An object in a feature.
 
     Attributes:
-        position, orientation: one place per number, or one text for all numbers; () without one.
+        position, orientation: one place per number, or one text for all numbers; () if missing.
         order: order of a quaternion's numbers, "xyzw" or "wxyz"; "" if undecided.
         signals: places of other numbers of the feature.
-        remark: note on a point that the user has to check or decide.
+        remark: note on a decision that the user has to make or check.
     """
 
     feature: str
@@ -97,7 +97,7 @@ def mappable_features(data_set: DataSet) -> list[Feature]:
 
 
 def why_poseless(data_set: DataSet) -> str:
-    """Return the reason why no mapping can find objects in a data set; "" without one."""
+    """Return the reason why no mapping can find objects in a data set; "" if a mapping can."""
     features = mappable_features(data_set)
     joint_features = [feature for feature in features if _holds_joints(feature)]
     if data_set.names_bodies or len(joint_features) < len(features):
@@ -172,15 +172,15 @@ def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) 
         else:
             objects = _whole_feature(feature, features, columns)
         for suggestion in objects:
-            # an observation and a state may hold the same object
+            # two features, such as an observation and a state, may hold the same object
             suggestions.setdefault(suggestion.name, suggestion)
     return list(suggestions.values())
 
 
 def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, Floats], list[Body]]:
-    """Return the numbers of some episodes by feature, and the bodies of the first one."""
+    """Return the numbers of some episodes by feature, and the bodies of the first episode."""
     names = [feature.name for feature in features]
-    # any rate will do, because only the numbers are read
+    # any frame rate will do, because only the numbers are read
     reading = AS_STORED._replace(fps=data_set.fps or 1.0)
     value_arrays: dict[str, list[Floats]] = {name: [] for name in names}
     bodies: list[Body] = []
@@ -199,7 +199,7 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
 def _without_bodies(
     suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
 ) -> tuple[list[Suggestion], dict[str, str]]:
-    """Return the suggestions that are not bodies of the data set; by feature, the bodies of the others."""
+    """Return the suggestions that are not bodies of the data set, and the names of the bodies by feature."""
     body_by_feature: dict[str, str] = {}
     for suggestion in suggestions:
         for body in bodies:
@@ -258,7 +258,7 @@ def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Sugg
 def _whole_feature(
     feature: Feature, features: Sequence[Feature], columns: Mapping[str, Floats]
 ) -> Iterator[Suggestion]:
-    """Yield the object of a feature with the name of a position or a pose, such as `obj_pos`."""
+    """Yield the object of a feature that is named like a position or a pose, such as `obj_pos`."""
     parent_word, last_word = (["", *re.split(r"[./]", feature.name)])[-2:]
     point_match, pose_match = _POINT.fullmatch(last_word), _POSE.fullmatch(last_word)
     values = columns.get(feature.name)
@@ -292,7 +292,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
         for start in range(width - 6)
     ]
     joint_starts: list[int] = []
-    # the most exact quaternions first, because the seven numbers of two bodies do not overlap
+    # the most exact quaternions first, because numbers of two bodies do not overlap
     for start in np.argsort(length_errors, kind="stable").tolist():
         if length_errors[start] < _EXACT and all(
             abs(start - joint_start) >= 7 for joint_start in joint_starts
@@ -312,7 +312,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
 def _with_orientation(
     suggestion: Suggestion, places: tuple[str, ...], quaternions: Floats | None, order: str = ""
 ) -> Suggestion:
-    """Return a suggestion with an orientation, or with a remark why it has none."""
+    """Return a suggestion with an orientation, or with a remark why the orientation is missing."""
     text = places[0] if len(places) == 1 else f"[{', '.join(places)}]"
     undecided = f"orientation: {text} needs `order: wxyz` or `order: xyzw`; the numbers do not show which"
     if quaternions is None:

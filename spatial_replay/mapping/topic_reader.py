@@ -1,8 +1,8 @@
 """Read one topic: raw messages in, columns of detections and signals out.
 
-A message passes three steps: it is decoded, its signals are read, its objects are read (by `Extractor`). Each
-step may fail for single messages. One boolean mask per batch marks the good messages. A step skips the
-others, reports its failures, and clears their flags.
+A message passes three steps: decoding, reading of signals, and reading of objects (by `Extractor`). Each step
+may fail for single messages. One boolean mask per batch marks the good messages. A step skips bad messages,
+reports its failures, and clears the flags of failing messages.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Extractor:
 
     Args:
         names, classes: codes that all topics share.
-        needs_frame: whether the mapping has a fixed frame, so that frames of objects are read.
+        needs_frame: whether frames of objects are read, because the mapping has a fixed frame.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Extractor:
     ) -> None:
         self.noted_frames: set[str] = set()
         self.unseen: tuple[str, ...] = ()
-        """With `missing: 0`, the paths of the position until an object has one of them."""
+        """Paths of the position with `missing: 0`; () once an object has one of these fields."""
         if mapping.has_zeros_left_out and mapping.position is not None:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
@@ -126,17 +126,17 @@ class Extractor:
         self.stamp_faults: list[str] = []
         """Reasons why fields with names of stamps are not times."""
         self.unset: Counter[str] = Counter()
-        """Number of objects in which a protobuf field is not set, by its path."""
+        """Number of objects in which a protobuf field is not set, by field path."""
         self._scene_stamps_ns: dict[int, int] = {}
-        """Timestamps of existing scene entities, by the codes of their names."""
+        """Timestamps of existing scene entities, by name code."""
         self.boxes, self.leftward, self.downward = 0, 0, 0
-        """Number of bounds, and of those whose second corner has a lesser x, or y, than the first."""
+        """Numbers of bounds: all, with the second corner left of the first, and below the first."""
         self.corner_low, self.corner_high = np.full((2, 2), np.inf), np.full((2, 2), -np.inf)
-        """Least and greatest coordinates of first and second corners."""
+        """Least and greatest coordinates: a row for the first corners, a row for the second corners."""
         self.differences = 0
         """Number of messages marked as a list of changes by their field `is_diff`."""
         self.turned, self.unturned = 0, 0
-        """Number of poses with a quaternion, and of those whose quaternion is zeros."""
+        """Numbers of poses with a quaternion, and of poses with a quaternion of zeros."""
         self.layout = layout
         self._names, self._classes = names, classes
         self._first_classes: dict[int, int] = {}
@@ -156,7 +156,7 @@ class Extractor:
 
     @property
     def is_bound(self) -> bool:
-        """Whether an object was read, so that all paths are known to resolve."""
+        """Whether an object was read, which shows that all paths resolve."""
         return self._binding is not None
 
     @property
@@ -166,13 +166,13 @@ class Extractor:
 
     @property
     def lacks_stamp(self) -> bool:
-        """Whether a message with an object was read, and had no stamp."""
+        """Whether the first message with an object lacks a stamp."""
         return self._is_time_bound and self._time is None
 
     def stamp(self, message: object) -> int | None:
-        """Return the stamp of a message, or the stamp of its first object; None without one.
+        """Return the stamp of a message, or the stamp of its first object; None without a stamp.
 
-        The stamp of a message without objects is the time from which there are no objects.
+        A message without objects has a stamp, too: the time from which there are no objects.
 
         Raises:
             FieldError: the path of the stamp does not resolve.
@@ -202,11 +202,11 @@ class Extractor:
             is_early: whether the messages will be read again, in the order of their times.
 
         Raises:
-            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
-                from the others. Only a FieldError describes the difference.
+            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message has
+                another form. Only a FieldError describes the difference.
         """
         values, message_indices, list_keys = self._flatten(messages)
-        # such as moveit_msgs/PlanningScene
+        # a list of changes, such as in moveit_msgs/PlanningScene
         if messages and "is_diff" in field_names(messages[0]):
             get = lenient_getter(style_of(messages[0]))
             self.differences += sum(bool(get(message, "is_diff")) for message in messages)
@@ -235,7 +235,7 @@ class Extractor:
             if any(leads_somewhere(path, element) for path in paths for element in objects.values):
                 self.unseen = ()
         if not is_early:
-            # set last, because a failing message is read again, alone
+            # set last, because the messages are read again one by one after a failure
             self._scene_stamps_ns = scene_stamps_ns
         return chunk
 
@@ -250,7 +250,7 @@ class Extractor:
         )
 
     def _with_one_class(self, detections: Detections) -> Detections:
-        """Return detections in which objects keep their first class, or have their class in their name."""
+        """Return detections whose objects keep their first class, or have the class in their name."""
         names, classes = detections.name.tolist(), detections.class_code.tolist()
         if self.layout.class_changes == "first":
             first_classes = self._first_classes
@@ -258,7 +258,7 @@ class Extractor:
                 first_classes.setdefault(name, code) for name, code in zip(names, classes, strict=True)
             ]
             return replace(detections, class_code=np.array(classes, np.int64))
-        # the name depends only on the class, so that it is the same in a window and in the whole log
+        # the new name depends only on the class, so it is equal in a window and in the whole log
         names = [self._name_of_class(name, code) for name, code in zip(names, classes, strict=True)]
         return replace(detections, name=np.array(names, np.int64))
 
@@ -319,9 +319,9 @@ class Extractor:
         self.cornerless += cornerless
 
     def _forget_unset(self, binding: Binding, numbers: Floats, objects: Sequence[object]) -> None:
-        """Replace the defaults of protobuf fields that were not set by NaN."""
+        """Replace the default of each unset protobuf field by NaN."""
         for column, path, default in binding.unset:
-            # a number other than the default was set; at the default, presence decides
+            # a number other than the default was set; for the default, the field's presence decides
             for row in np.flatnonzero(numbers[:, column] == default).tolist():
                 if not is_set(path, objects[row]):
                     numbers[row, column] = nan
@@ -350,7 +350,7 @@ class Extractor:
         if self._list_path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
         if self._get_list is None and messages:
-            # the first message is read step by step, because the errors of the fast getter name no fields
+            # the first message is read step by step, because errors of the fast getter do not name the fields
             list(iter_elements(self._list_path, messages[0]))
             self._get_list = list_getter(self._list_path, messages[0]) or self._elements
         lists = list(map(self._get_list, messages)) if self._get_list is not None else []
@@ -371,8 +371,8 @@ class Extractor:
     ) -> tuple[list[tuple[int, int]], dict[int, int]]:
         """Return (message, name) of each deletion in a foxglove.SceneUpdate, and the remaining stamps.
 
-        A deletion concerns only earlier entities, see
-        https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion. The entities of a message are added
+        A deletion concerns only earlier entities
+        (https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion). A message's entities are added
         after its deletions.
         """
         deleted: list[tuple[int, int]] = []
@@ -382,7 +382,7 @@ class Extractor:
         for message_index, message in enumerate(messages):
             get = lenient_getter(style_of(message))
             for deletion in get(message, "deletions") or ():
-                # a deletion without a timestamp concerns all entities so far
+                # a deletion without a timestamp concerns all earlier entities
                 stamp_ns = _stamp_of_scene(deletion) or LATEST_NS
                 if get(deletion, "type") in DELETE_ALL_ENTITIES:
                     names = list(stamps_ns)
@@ -402,7 +402,7 @@ class Extractor:
             self._is_time_bound = True
 
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
-        """Return the frame of each object; None without a fixed frame, or if all are in the fixed frame."""
+        """Return the frame of each object; None if frames are not needed, or messages name no frame."""
         if self.layout.frame_name is not None:
             self.noted_frames.add(self.layout.frame_name)
             return [self.layout.frame_name] * len(objects.values) if self._needs_frame else None
@@ -423,7 +423,7 @@ class Extractor:
     def _fill_stamps(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
-        """Read the stamps of objects for a fixed frame; otherwise only the first stamp, to compare clocks."""
+        """Read the stamps of objects if frames are needed; otherwise only the first stamp, for clocks."""
         if self._time is None:
             return
         from_message = self._time.path.from_message
@@ -436,7 +436,7 @@ class Extractor:
             chunk.stamps = [stamps[index] for index in objects.message]
             if binding.own_stamp is not None:
                 own_stamps = binding.own_stamp.nanoseconds(objects.values)
-                # a stamp of 0 means a stamp that was not set
+                # a stamp of 0 was not set
                 chunk.stamps = [
                     stamp or message_stamp
                     for stamp, message_stamp in zip(own_stamps, chunk.stamps, strict=True)
@@ -449,7 +449,7 @@ class Extractor:
 
 
 def _stamp_of_scene(entity: Any) -> int:
-    """Return the timestamp of an entity or a deletion; 0 without one."""
+    """Return the timestamp of an entity or a deletion, nanoseconds; 0 without a timestamp."""
     if isinstance(entity, dict):
         return ns_from_json(entity.get("timestamp"))
     stamp = entity.timestamp
@@ -479,7 +479,7 @@ def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int,
 
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
-"""Errors of fields in a message that does not fit the mapping."""
+"""Errors of reading a message that does not fit the mapping."""
 
 ReportFault: TypeAlias = Callable[[str, int, str], None]
 """Receiver of lost messages: topic, log time, and reason."""
@@ -489,25 +489,25 @@ _NO_STAMP = (
 )
 
 _PATIENCE = 100
-"""Misfitting messages before the first that fits that show a wrong mapping."""
+"""Number of misfitting messages, before any fitting message, that shows a wrong mapping."""
 
 _MOST_UNNAMED, _LONGEST_UNNAMED = 8, 40
-"""Limits of remarks on texts without a number: texts, and characters of a text."""
+"""Limits of remarks on texts without a number: number of texts, and characters of a text."""
 
 _CHUNK = 256
-"""Limit of messages decoded together, low, so that their contents are freed soon."""
+"""Limit of messages decoded together. It is low, so that decoded contents are freed soon."""
 _CHUNK_BYTES = 2**14
 """Usual size of messages that are decoded together, bytes."""
 
 
 class TopicColumns(NamedTuple):
-    """Columns read from N messages of a topic, of which M are good.
+    """Columns of N messages of a topic, M of them good.
 
     Attributes:
-        good: (N,) whether a message could be read.
+        good: (N,) whether each message could be read.
         detections: objects of the M good messages; None for a topic without objects.
         signals: (M, S) value of each signal in each good message.
-        stamps: (K, 2) indices of some of the N messages, and their stamps.
+        stamps: (K, 2) message index and stamp of some of the N messages, nanoseconds.
     """
 
     good: Booleans
@@ -517,7 +517,7 @@ class TopicColumns(NamedTuple):
 
 
 class TopicReader:
-    """Reader of one topic, which decodes messages and reads stamps, objects and signals.
+    """Reader of one topic: decoder of messages, and reader of stamps, objects and signals.
 
     Args:
         names, classes: codes that all topics share.
@@ -550,7 +550,7 @@ class TopicReader:
         self.transforms = TransformReader() if planned.is_transforms else None
         self.extractor: Extractor | None = None
         self.unstamped = 0
-        """Number of messages without a stamp, or with stamp 0, which have no time on the clock `header`."""
+        """Number of messages that have no time on the clock `header`: without a stamp, or with stamp 0."""
         self._is_stamped = False
         if planned.layout is not None and planned.mapping is not None:
             self.extractor = Extractor(
@@ -584,17 +584,17 @@ class TopicReader:
 
     @property
     def repeats_times(self) -> bool:
-        """Whether several messages of the same time are all valid, because each has other objects."""
+        """Whether messages with equal times are all valid, because they have different objects."""
         if self.extractor is None or self.planned.layout is None:
             return self.transforms is not None
         return not (self.planned.layout.complete or self.extractor.namer.is_constant)
 
     @property
     def advances_time(self) -> bool:
-        """Whether its times advance the time of the log.
+        """Whether the topic's times advance the time of the log.
 
-        Log times do. Stamps of transforms and of latched messages do not, because they may lie in the future
-        or the past.
+        Log times advance it. Stamps of transforms and of latched messages do not, because they may be in the
+        future or the past.
         """
         if self.planned.clock == "log":
             return True
@@ -605,7 +605,7 @@ class TopicReader:
         return self._read_each(self._decode, payloads, log_times_ns, good)
 
     def stamps(self, messages: Sequence[Any], log_times_ns: Sequence[int], good: Booleans) -> Integers:
-        """Return the stamp (N,) of each message; messages without one are not good.
+        """Return the stamp (N,) of each message, nanoseconds; clear the flags of messages without a stamp.
 
         Raises:
             UsageError: the path of the stamp does not resolve.
@@ -619,7 +619,7 @@ class TopicReader:
             return stamp_ns or (0 if self.planned.is_static else None)
 
         stamps_ns = self._read_each(read, messages, log_times_ns, good)
-        # None occurs for an empty list in a message without a header
+        # a message with an empty list and without a header has no stamp
         has_stamp = np.array([time_ns is not None for time_ns in stamps_ns], np.bool_)
         self.unstamped += int(np.count_nonzero(good & ~has_stamp))
         good &= has_stamp
@@ -640,7 +640,7 @@ class TopicReader:
             contents: payloads, or decoded messages if the reader `decodes_on_arrival`.
 
         Raises:
-            UsageError: the mapping fits none of many messages.
+            UsageError: many messages came, and the mapping fits none of them.
         """
         good = np.ones(len(contents), np.bool_)
         chunks: list[DetectionChunk] = []
@@ -652,7 +652,7 @@ class TopicReader:
                 contents[begin : begin + chunk_size],
                 all_times_ns[begin : begin + chunk_size],
             )
-            # a view, so that flags cleared in it are cleared in `good`
+            # a view, so that clearing its flags also clears flags in `good`
             is_chunk_good = good[begin : begin + chunk_size]
             if not self.decodes_on_arrival:
                 messages = self.decode(messages, chunk_times_ns, is_chunk_good)
@@ -674,10 +674,10 @@ class TopicReader:
         )
 
     def finish(self) -> None:
-        """Check after the last message that the mapping fitted at least one.
+        """Check after the last message that the mapping fitted at least one message.
 
         Raises:
-            UsageError: there were messages, but the mapping fitted none.
+            UsageError: there were messages, but the mapping fitted none of them.
         """
         if self.unstamped and not self._is_stamped and self.is_mapped:
             raise self._misfit_error(_NO_STAMP)
@@ -717,7 +717,7 @@ class TopicReader:
         log_times_ns: Sequence[int],
         is_good: Booleans,
     ) -> list[DetectionChunk]:
-        """Read the objects of the good messages, together if all of them have the same form.
+        """Read the objects of the good messages; together, if all good messages have the same form.
 
         Args:
             first: index of the first message in its batch.
@@ -732,7 +732,7 @@ class TopicReader:
         except MISFITS:
             pass
 
-        # one message has another form; reading each message alone shows which one
+        # one message has another form, which reading each message alone finds
         def read(indexed_message: tuple[int, object]) -> DetectionChunk:
             index, message = indexed_message
             was_bound = extractor.is_bound
@@ -769,7 +769,7 @@ class TopicReader:
             get_number = get_value
 
             def get_value(message: object) -> object:
-                # the name of an enum, as in ProtoJSON; a number without a name stays a number
+                # the enum's name, as in ProtoJSON; a number without a name stays a number
                 code = get_number(message)
                 return enum_name_by_number.get(
                     code, str(code) if number_by_name and code is not None else code
@@ -811,7 +811,7 @@ class TopicReader:
                 self._time = bind_time(stamps, message, message)
                 self._is_time_bound = True
         except FieldError as error:
-            # without any stamp so far, the mapping is wrong; otherwise only this message
+            # without an earlier stamp the mapping is wrong; otherwise only this message is wrong
             if self._is_time_bound or (self.extractor is not None and self.extractor.is_timed):
                 raise
             raise self._misfit_error(f"the clock is header, but {error}") from None
@@ -820,7 +820,7 @@ class TopicReader:
         return self._time.nanoseconds([message])[0]
 
     def _count_misfit(self, kind: str, error: Exception) -> None:
-        """Count a misfitting message before the first that fits.
+        """Count a misfitting message; called only before the first fitting message.
 
         Raises:
             UsageError: there were many misfitting messages.
@@ -836,13 +836,13 @@ class TopicReader:
 
 
 def with_single_precision(numbers: Sequence[float]) -> list[float]:
-    """Return numbers, and the same numbers rounded to float32, which fields may have."""
+    """Return numbers, and the same numbers rounded to float32, because a field may have this type."""
     # 0.1 in a field of type float32 is read as 0.10000000149011612
     return [*numbers, *np.array(numbers, np.float32).astype(np.float64).tolist()]
 
 
 def _getter_of_set_values(path: FieldPath, example: object) -> Get:
-    """Return the getter of a path; it returns None if a protobuf sender did not set the field."""
+    """Return the getter of a path, which returns None for an unset protobuf field."""
     get = getter(path, example)
     if not may_be_unset(path, example):
         return get
@@ -854,7 +854,7 @@ def _getter_of_set_values(path: FieldPath, example: object) -> Get:
 
 
 def unit_of_stamp(stamp: int, log_time_ns: int) -> str:
-    """Return the unit in which a stamp is within an hour of the recording of its message, otherwise ns."""
+    """Return the unit in which a stamp is within an hour of the log time; "ns" if there is none."""
     near_units = (
         unit for unit, unit_ns in UNITS_NS.items() if abs(stamp * unit_ns - log_time_ns) < 3600 * 10**9
     )
@@ -865,7 +865,7 @@ class ClockStep(NamedTuple):
     """A step back of a topic's times in the order of recording.
 
     Attributes:
-        is_sorted: whether its messages are sorted by time, because sequence numbers do not order them.
+        is_sorted: whether messages are sorted by time, because sequence numbers do not give their order.
     """
 
     from_ns: int
@@ -877,7 +877,7 @@ class PendingMessages:
     """Messages of one topic that wait until no earlier message can arrive.
 
     Attributes:
-        first_step: first step back of the times; None without one.
+        first_step: first step back of the times; None without a step back.
         taken_ns: latest time of the messages that were taken.
     """
 
@@ -893,7 +893,7 @@ class PendingMessages:
 
     @property
     def first_ns(self) -> int | None:
-        """Time of the earliest waiting message; None without one."""
+        """Time of the earliest waiting message; None without a waiting message."""
         return min((int(times_ns.min()) for times_ns, *_ in self._columns if len(times_ns)), default=None)
 
     @property
@@ -905,7 +905,8 @@ class PendingMessages:
         """Add messages in the order of arrival.
 
         Args:
-            columns: times, sequence numbers, log times, and numbers that increase in the order of recording.
+            columns: times, sequence numbers, log times, and record numbers, which increase in the order of
+                recording.
             contents: payloads, or decoded messages.
         """
         self._columns.append(columns)
@@ -914,8 +915,8 @@ class PendingMessages:
     def take(self, upto_ns: int) -> tuple[Integers, Integers, list[Any]]:
         """Remove the messages up to a time; return their times, log times and contents.
 
-        The order is by time, then sequence number, then arrival. A message recorded after a step back of the
-        clock gets a time right after the messages before the step.
+        The order is by time, then sequence number, then arrival. If the clock stepped back, later messages
+        get times right after the messages before the step.
         """
         no_integers = np.empty(0, np.int64)
         columns = zip((no_integers, no_integers, no_integers, no_integers), *self._columns, strict=True)
@@ -924,7 +925,7 @@ class PendingMessages:
         if not (record_numbers[1:] > record_numbers[:-1]).all() or not (times_ns[1:] >= times_ns[:-1]).all():
             times_ns = self._without_steps(times_ns, sequence_numbers, record_numbers, upto_ns)
         if len(times_ns) and not (times_ns[1:] > times_ns[:-1]).all():
-            # a stable sort, so that the order of arrival decides last
+            # lexsort is stable, so that the order of arrival decides last
             time_order = np.lexsort((sequence_numbers, times_ns))
             times_ns, sequence_numbers, log_times_ns = (
                 times_ns[time_order],
@@ -948,14 +949,14 @@ class PendingMessages:
     def _without_steps(
         self, times_ns: Integers, sequence_numbers: Integers, record_numbers: Integers, upto_ns: int
     ) -> Integers:
-        """Return times without steps back, if sequence numbers of the log increase across the steps."""
+        """Return times without steps back. Times stay unchanged if sequence numbers decrease at a step."""
         record_order = np.argsort(record_numbers, kind="stable")
         recorded_times_ns = times_ns[record_order]
         step_indices = np.flatnonzero(recorded_times_ns[1:] < recorded_times_ns[:-1] - LEAST_STEP_NS)
-        # sequence numbers of the log do not order messages on the clock of the sender
+        # the log's sequence numbers do not order messages on the sender's clock
         is_sorted = self._has_own_clock or not (np.diff(sequence_numbers[record_order]) > 0).all()
         if is_sorted and len(step_indices):
-            # steps of later messages wait, because messages recorded before them may still arrive
+            # steps of later messages wait, because earlier recorded messages may still arrive
             step_indices = step_indices[recorded_times_ns[step_indices + 1] <= upto_ns]
             step_indices = step_indices[np.argsort(recorded_times_ns[step_indices + 1], kind="stable")]
         if not len(step_indices):
@@ -984,7 +985,7 @@ def _number(value: object) -> float:
 
 
 def _skip(payload: bytes) -> None:
-    """Decode nothing, for a topic of which only the times are used."""
+    """Decode nothing, for a topic that is read only for its times."""
 
 
 def _chunk_size(contents: Sequence[Any]) -> int:

@@ -1,8 +1,8 @@
-"""Frames: messages with transforms in, the transform between any two frames at any time out.
+"""Trees of frames: messages with transforms in, the transform between any two frames at any time out.
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
 linearly and rotation along the shorter arc, as in tf2. There is no extrapolation. A static transform holds
-until another one replaces it.
+until another static transform replaces it.
 
 A step back of the stamps begins a new run, such as a restarted simulation. Only static transforms hold across
 runs. Rotations are arrays: quaternions (x, y, z, w) and matrices.
@@ -47,8 +47,8 @@ def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
         quaternions: (N, 4) x, y, z, w.
 
     Returns:
-        (N, 3, 3) a_from_b matrices, whose columns are the axes of b, and (N,) angles of the projected x axes.
-        The angle is NaN for quaternions of zeros.
+        (N, 3, 3) a_from_b matrices, whose columns are the axes of b, and (N,) angles of the projected x axes
+        in radians. The angle is NaN for quaternions of zeros.
     """
     norm = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
     is_zero = norm < _LEAST_NORM
@@ -64,7 +64,7 @@ def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
     matrices[:, 2, 0] = 2 * (x * z - y * w)
     matrices[:, 2, 1] = 2 * (y * z + x * w)
     matrices[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    # exactly the identity, also for norms that are above 0 and below the limit
+    # exactly the identity, also for norms between 0 and the limit
     matrices[is_zero] = np.eye(3)
     return matrices, np.where(is_zero, np.nan, yaw_of(matrices))
 
@@ -106,11 +106,11 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
     dot_product = np.einsum("ij,ij->i", first, second)
-    # q and -q are the same rotation; the shorter arc ends at the nearer one
+    # q and -q are the same rotation; the shorter arc ends at the nearer quaternion
     second = np.where(dot_product[:, None] < 0, -second, second)
     angle = np.arccos(np.clip(np.abs(dot_product), 0.0, 1.0))
     sine = np.sin(angle)
-    # linear interpolation for nearly equal quaternions, for which the quotient below tends to 0 / 0
+    # linear interpolation for nearly equal quaternions, because the quotient below tends to 0 / 0
     is_close = sine < _LEAST_NORM
     divisor = np.where(is_close, 1.0, sine)
     weight = np.where(is_close, 1.0 - share, np.sin((1.0 - share) * angle) / divisor)
@@ -125,15 +125,15 @@ HISTORY_NS = 10 * 10**9
 _LONGEST_CHAIN = 100
 """Limit of frames between a frame and its root."""
 _OFF_LENGTH = 0.01
-"""Largest error of the squared length of a rotation's quaternion, as in tf2."""
+"""Largest error of a quaternion's squared length, as in tf2."""
 _LEAST_JUMP = 0.1
 """Least jump of a frame: distance in metres plus turn in radians."""
 _MANY_JUMPS = 3
-"""Least number of a frame's jumps for a remark."""
+"""Least number of jumps of a frame for a remark."""
 _MOST_PUBLISHERS = 4
 """Limit of publishers that may send a frame in turn."""
 LEAST_STEP_NS = 10_000_000
-"""Least step back of a clock, nanoseconds; recorders with several threads mix messages by less."""
+"""Least step back of a clock, nanoseconds. Recorders with several threads mix messages by less."""
 _MOST_RESTARTS = 1_000
 """Limit of kept restarts."""
 
@@ -144,7 +144,8 @@ class Transforms(NamedTuple):
     Attributes:
         rotation: (N, 3, 3).
         translation: (N, 3).
-        known: (N,) whether a transform is known; other numbers of unknown transforms have no meaning.
+        known: (N,) whether a transform is known. Rotation and translation of unknown transforms have no
+            meaning.
     """
 
     rotation: Floats
@@ -161,7 +162,7 @@ class Transforms(NamedTuple):
         return cls(np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count, np.bool_))
 
     def put(self, places: Integers, others: Transforms) -> None:
-        """Set the transforms at some indices in place, to collect a result."""
+        """Overwrite the transforms at some indices, in place."""
         for column, other_column in zip(self, others, strict=True):
             column[places] = other_column
 
@@ -169,7 +170,7 @@ class Transforms(NamedTuple):
         return Transforms(self.rotation[places], self.translation[places], self.known[places])
 
     def after(self, first: Transforms) -> Transforms:
-        """Return a_from_c for a_from_b (this) and b_from_c (`first`)."""
+        """Return a_from_c for a_from_b (self) and b_from_c (`first`)."""
         return Transforms(
             self.rotation @ first.rotation,
             np.einsum("nij,nj->ni", self.rotation, first.translation) + self.translation,
@@ -193,7 +194,7 @@ class _Entry(NamedTuple):
 
 
 class _Restart(NamedTuple):
-    """A step back of the stamps: the last transform before it, and the first one after."""
+    """A step back of the stamps: the last transform before the step, and the first transform after it."""
 
     old: _Entry
     new: _Entry
@@ -204,7 +205,7 @@ class _Child:
     """The transforms of one child frame.
 
     Attributes:
-        restart: step back of the stamps at the last transform; None without one.
+        restart: step back of the stamps at the last transform; None without a step back.
     """
 
     moving: list[_Entry] = field(default_factory=list)
@@ -220,7 +221,7 @@ class _Series(NamedTuple):
     """The transforms of one child frame, ordered by stamp or by clock.
 
     Attributes:
-        still: number of static transforms, which come first and are not interpolated.
+        still: number of static transforms, which come first. They are not interpolated.
         parents: names of parents.
         parent: index of each transform's parent in `parents`.
     """
@@ -233,12 +234,12 @@ class _Series(NamedTuple):
     poses: Floats
 
     def at(self, times_ns: Integers) -> Integers:
-        """Return the index of the last transform up to each time; 0 before the first."""
+        """Return the index of the last transform up to each time; 0 before the first transform."""
         return np.maximum(np.searchsorted(self.times_ns, times_ns, "right") - 1, 0)
 
 
 class FrameTree:
-    """The transforms of a log, added in order of arrival; `remarks` lists contradictions between them."""
+    """The transforms of a log, added in order of arrival; `remarks` lists their contradictions."""
 
     def __init__(self) -> None:
         self._children: dict[str, _Child] = {}
@@ -264,11 +265,11 @@ class FrameTree:
         log_ns: int,
         is_static: bool,
     ) -> None:
-        """Add one transform; a transform that tf2 would ignore is only counted.
+        """Add one transform, or count it if tf2 would ignore it.
 
-        A static transform holds from its stamp on. The first static transform of a frame also holds
-        before its stamp. A static transform without a stamp, or with an older stamp than its predecessor,
-        holds from its clock time on.
+        A static transform holds from its stamp on. A frame's first static transform also holds before its
+        stamp. A static transform holds from its clock time on if it has no stamp, or a stamp older than its
+        predecessor's.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.
@@ -303,7 +304,7 @@ class FrameTree:
     def _note_restart(self, name: str, child: _Child, new: _Entry) -> None:
         """Note a restart if the stamps of a frame step back.
 
-        If the next transform steps forward again, there was no restart: two programs with different clocks
+        If the next transform steps forward again, there was no restart. Two programs with different clocks
         send the frame in turn.
         """
         old, earlier_restart, child.restart = child.moving[-1], child.restart, None
@@ -318,23 +319,23 @@ class FrameTree:
             return
         restart = child.restart = _Restart(old, new)
         if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
-            # one restart makes all frames step back, one after the other
+            # after one restart, all frames step back one after the other
             restart = min(restart, self._restarts.pop(), key=lambda restart: restart.new.log_ns)
         self._restarts = [*self._restarts[1 - _MOST_RESTARTS :], restart]
         self._series.clear()
 
     def forget_before(self, clock_ns: int) -> None:
-        """Drop the moving transforms of messages before a time, except the last one of each child."""
+        """Drop moving transforms of messages before a time, except each child's last transform."""
         for name, child in self._children.items():
             newer_entries = [entry for entry in child.moving if entry.clock_ns >= clock_ns]
             if len(newer_entries) < len(child.moving):
                 self._look_for_jumps(name, [entry for entry in child.moving if entry.clock_ns < clock_ns])
-                # the last one is kept for its parent, and as the start of the next interpolation
+                # the last transform gives the parent, and the start of the next interpolation
                 child.moving = newer_entries or child.moving[-1:]
         self._series.clear()
 
     def forget_moving(self) -> None:
-        """Drop all transforms except static ones, so that nothing is interpolated across a loss."""
+        """Drop all moving transforms, so that nothing is interpolated across a loss."""
         self._children = {
             name: _Child(static=child.static) for name, child in self._children.items() if child.static
         }
@@ -342,7 +343,7 @@ class FrameTree:
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of all frames that are a child or a parent of a transform."""
+        """Names of all frames that are the child or parent of a transform."""
         parents = {entry.parent for child in self._children.values() for entry in child.entries}
         # frames of ignored transforms are frames of the log, too
         ignored = {name for _, entry, child in self._ignored.values() for name in (child, entry.parent)}
@@ -363,9 +364,9 @@ class FrameTree:
 
         Args:
             times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
-            log_ns: (N,) times of recording, which identify the run; without them, all runs are used.
+            log_ns: (N,) times of recording, which identify the run; None for transforms of all runs.
             longest_ns: longest time between two transforms that are interpolated.
-            holds: whether a transform holds for `longest_ns` if none follows in that time.
+            holds: whether a transform holds for `longest_ns` if no transform follows in that time.
         """
         count = len(times_ns)
         if target == source or not count:
@@ -378,7 +379,7 @@ class FrameTree:
         return transforms
 
     def _by_run(self, question: _Question) -> list[_Question]:
-        """Divide a question by run, and into stamps near to and far from the times of recording."""
+        """Divide a question by run, and by whether stamps are near the times of recording."""
         times_ns, log_ns = question.times_ns, question.log_ns
         if log_ns is None:
             return [question]
@@ -388,7 +389,7 @@ class FrameTree:
                 # an observation may come before the first transform of its run
                 is_early = np.abs(times_ns - new.stamp_ns) < np.abs(times_ns - old.stamp_ns)
                 runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = number
-        # even for stamps near to the times of recording, odd for stamps far from them
+        # even numbers: stamps near the times of recording; odd numbers: stamps far from these times
         run_kinds = 2 * runs + (question.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
         return [
             question.part(run_kinds == run_kind)._replace(run=run_kind // 2, is_apart=run_kind % 2 > 0)
@@ -419,7 +420,7 @@ class FrameTree:
         return common_from_target.inverse().after(common_from_source)
 
     def _ancestors(self, frame: str, question: _Question) -> list[str]:
-        """Return the chain of a frame, its parent and so on up to the root, at the first time."""
+        """Return a frame and all its ancestors up to the root, at the first time of the question."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
             series, times_ns = self._series_of(chain[-1], question)
@@ -435,14 +436,14 @@ class FrameTree:
         return chain
 
     def _climb(self, frames: list[str], question: _Question) -> Transforms:
-        """Return the transform from the first frame of a chain to the parent of the last frame."""
+        """Return the transforms from the first frame of a chain to the last frame's parent."""
         transforms = Transforms.identity(len(question.times_ns))
         for frame in frames:
             transforms = self._step(frame, question).after(transforms)
         return transforms
 
     def _step(self, frame: str, question: _Question) -> Transforms:
-        """Return parent_from_child at each time."""
+        """Return parent_from_child at each time of a question, for one child frame."""
         series, times_ns = self._series_of(frame, question)
         last_index, newest_indices = len(series.times_ns) - 1, series.at(times_ns)
         is_still = newest_indices < series.still
@@ -472,7 +473,7 @@ class FrameTree:
         is_held = question.holds & ~is_between & (times_ns - start_ns <= question.longest_ns)
         is_known &= is_between | is_held
         span_ns = np.where(end_ns > start_ns, end_ns - start_ns, 1)
-        # no interpolation between poses in different parents: the earlier pose holds
+        # no interpolation between poses in different parents; the earlier pose holds
         is_moving = (
             is_between
             & (end_ns > start_ns)
@@ -487,11 +488,10 @@ class FrameTree:
         )
 
     def _series_of(self, frame: str, question: _Question) -> tuple[_Series, Integers]:
-        """Return the ordered transforms of a frame for a question, and the times to look up in them.
+        """Return a frame's ordered transforms for a question, and the times to look up.
 
-        Static transforms of all runs are used, but only those before the first moving transform of the frame.
-        If stamps are far from times of recording, a frame without moving transforms is looked up by the time
-        of recording.
+        Static transforms of all runs are used up to the frame's first moving transform. If stamps are far
+        from times of recording, a frame without moving transforms is looked up by the time of recording.
         """
         child = self._children.get(frame, _Child())
         clock, run, times_ns = (
@@ -515,7 +515,7 @@ class FrameTree:
         return bisect_right(self._restarts, entry.log_ns, key=lambda restart: restart.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
-        """Note the first contradiction of a kind: static and moving, two parents, or a changed static one."""
+        """Note a frame's first contradiction of each kind: static and moving, two parents, changed static."""
         key = child, is_mixed, old.parent == new.parent
         if key in self._contradictions:
             return
@@ -532,7 +532,7 @@ class FrameTree:
         )
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
-        """Count the jumps of a child: transforms far from both neighbours, which agree with each other."""
+        """Count a child's jumps: transforms far from both neighbours, while the neighbours agree."""
         kinds = [(entry.parent, self._run_of(entry)) for entry in entries]
         for kind in dict.fromkeys(kinds):
             self._look_for_jumps_in(
@@ -545,12 +545,12 @@ class FrameTree:
         poses = np.array([entry.pose for entry in entries])
 
         def apart(first: Floats, second: Floats) -> Floats:
-            # the absolute value, because q and -q are the same rotation
+            # absolute value, because q and -q are the same rotation
             cosine = np.abs(np.einsum("ij,ij->i", first[:, 3:], second[:, 3:]))
             turns = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turns)
 
-        # two poses of one publisher may have poses of other publishers between them
+        # poses of other publishers may come between two poses of one publisher
         lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
         distances_by_lag = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
         usual_distance = min(float(np.quantile(distances, 0.3)) for distances in distances_by_lag.values())
@@ -569,7 +569,7 @@ class FrameTree:
                 )
             return np.flatnonzero(is_jump)
 
-        # noise causes few jumps, and hardly any of ten times the usual motion
+        # noise causes few jumps, and almost no jumps of ten times the usual motion
         jumps = jumps_of(5)
         jumps = jumps if len(jumps) > 0.05 * len(poses) else jumps_of(10)
         if len(jumps):
@@ -582,7 +582,7 @@ class FrameTree:
             self._jumps[name] = jump_count + len(jumps), greatest_jump, example[0], example[1]
 
     def remarks(self) -> list[str]:
-        """Return remarks on transforms that were ignored, contradict each other, jump or pause."""
+        """Return remarks on transforms that are ignored, contradict each other, jump or pause."""
         for name, child in self._children.items():
             self._look_for_jumps(name, child.moving)
         texts: list[str] = []
@@ -639,7 +639,7 @@ class _Question(NamedTuple):
     """A request for transforms at some times; see `FrameTree.between`.
 
     Attributes:
-        places: indices of the times in the original question.
+        places: index of each time in the original question.
         run: number of the run; None for all runs.
         is_apart: whether stamps are far from the times of recording.
     """
@@ -659,10 +659,10 @@ class _Question(NamedTuple):
 
 
 def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
-    """Return transforms in order of a clock; of transforms with equal times, only the last.
+    """Return transforms in the order of a clock, and only the last of transforms with equal times.
 
     Args:
-        clock: attribute of entries with the time.
+        clock: name of the entries' attribute with the time.
         first_ns: time before which transforms are static.
     """
     times_ns = np.array([getattr(entry, clock) for entry in entries], np.int64)
@@ -685,7 +685,7 @@ def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
 
 
 def _reason_to_ignore(child: str, entry: _Entry) -> str | None:
-    """Return the reason for which tf2 would ignore a transform; None without one."""
+    """Return the reason why tf2 would ignore a transform; None if tf2 would use it."""
     if not child or not entry.parent:
         return "it has no name for the frame or its parent (child_frame_id, frame_id)"
     if child == entry.parent:
@@ -723,7 +723,7 @@ _REST = ("nanosec", "nsec", "nsecs", "nanos")
 
 
 class TransformReader:
-    """Reader of the transforms in one topic's messages, of ROS 1, ROS 2 and Foxglove types."""
+    """Reader of the transforms in one topic's messages of ROS 1, ROS 2 or Foxglove types."""
 
     def __init__(self) -> None:
         self._get_list: Get | None = None
@@ -744,7 +744,7 @@ class TransformReader:
         for transform in self._each(message):
             child, parent, seconds, nanoseconds, *pose = self._values(transform)
             stamp_ns = _nanoseconds(seconds, nanoseconds)
-            # tf wrote names with a slash in front, which tf2 does not have
+            # tf wrote names with a leading slash; tf2 does not
             tree.add(
                 str(child).removeprefix("/"),
                 str(parent).removeprefix("/"),
@@ -756,7 +756,7 @@ class TransformReader:
             )
 
     def stamp(self, message: object) -> int | None:
-        """Return the stamp of the first transform of a message; None without one."""
+        """Return the stamp of a message's first transform, nanoseconds; None without a transform."""
         for transform in self._each(message):
             _, _, seconds, nanoseconds, *_ = self._values(transform)
             return _nanoseconds(seconds, nanoseconds)

@@ -1,6 +1,6 @@
 """Trials of mapping entries: an entry and some messages of its topic in, contradictions out.
 
-`choose_entry` adds keys to an entry that resolve contradictions, as long as their number does not grow.
+`choose_entry` adds keys to an entry that resolve contradictions, unless the number of contradictions grows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Fields: TypeAlias = Mapping[str, str]
 """Entry of a topic: values in YAML's flow style, by key."""
 
 FROM_NORTH = "zero: north, clockwise: true"
-"""Keys for the angle of a compass."""
+"""Keys of a mapping for a compass angle."""
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 
 
@@ -48,7 +48,7 @@ def flow_text(fields: Fields) -> str:
 def readable_messages(
     topic: Topic, entry: str, messages: Sequence[object], origin: str = ""
 ) -> tuple[list[object], list[str]]:
-    """Return the messages that an entry can read, and the reasons why it cannot read the others.
+    """Return the messages that an entry can read, and the reasons why it cannot read other messages.
 
     Raises:
         UsageError: the entry can read no message.
@@ -76,7 +76,8 @@ def lateness_s(
     except UsageError:
         return None
     is_clock = is_good.all() and (stamps_ns > 0).all() and (np.diff(stamps_ns) > 0).all()
-    # stamps in another unit advance by a factor of 1,000; a simulation may run some times faster than time
+    # stamps in another unit advance by a factor of 1,000; a simulation may run some times faster than real
+    # time
     advance_ratio = np.ptp(stamps_ns) / max(1, np.ptp(times_ns))
     if not is_clock or (len(messages) > 1 and not 1 / _FASTEST < advance_ratio < _FASTEST):
         return None
@@ -84,11 +85,11 @@ def lateness_s(
 
 
 _FASTEST = 20
-"""Greatest ratio of the time in stamps to the time of recording, and its reciprocal the least."""
+"""Greatest ratio of stamp time to recording time. The reciprocal is the least ratio."""
 
 
 def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicReader:
-    """Return a reader of decoded messages, which adds a reason to `reasons` for each unreadable message."""
+    """Return a reader of decoded messages that adds a reason to `reasons` for each unreadable message."""
     mapping = parse_mapping(f"{head}topics:\n  {yaml_text(topic.name)}: {entry}")
     (planned,) = ReadingPlan.of(mapping, [topic]).planned
     return TopicReader(
@@ -105,12 +106,12 @@ def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicRea
 def choose_entry(
     topic: Topic, fields: Fields, messages: Sequence[object], times_ns: Sequence[int], origin: str = ""
 ) -> tuple[Fields, list[str]]:
-    """Return an entry with fewer contradictions, and texts on each change and each remaining contradiction.
+    """Return an entry with fewer contradictions, and a text on each change and each remaining contradiction.
 
     Args:
         fields: entry that can read the messages.
         times_ns: time of recording of each message.
-        origin: line of a mapping with the key `origin`; "" without one.
+        origin: line of the mapping with the key `origin`; "" without an origin.
     """
     reasons: list[str] = []
     doubts = _doubts(topic, fields, messages, times_ns, origin)
@@ -149,7 +150,7 @@ def _doubts(
         )
         assembler.finish()
     except (UsageError, LogError):
-        # an error, such as a jump of the times of recording, is no evidence against the entry
+        # an error, such as a jump of log times, is no evidence against the entry
         return ()
     return tuple(doubt for doubt in assembler.take_doubts() if doubt.assumption not in _OF_ALL_TOPICS)
 
@@ -202,7 +203,7 @@ def _latitudes(fields: Fields) -> Iterator[Fields]:
 
 
 _NOT_AVAILABLE = (511, 4095, 65535)
-"""Numbers that stand for a missing angle: 511 in AIS (ITU-R M.1371), the greatest of 12 and of 16 bits."""
+"""Numbers for a missing angle: 511 in AIS (ITU-R M.1371), and the greatest numbers of 12 and 16 bits."""
 
 _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxyType(
     {
@@ -215,4 +216,4 @@ _ALTERNATIVES: Mapping[str, Callable[[Fields], Iterator[Fields]]] = MappingProxy
         "complete_list": lambda fields: iter([{**fields, "complete": "false"}]),
     }
 )
-"""Functions from an entry to changed entries that may resolve a contradiction, by assumption."""
+"""Functions from an entry to changed entries that may resolve a contradiction, by name of the assumption."""

@@ -1,9 +1,9 @@
-"""Read YAML files that people write: text in; plain values with line numbers, or all errors together, out.
+"""Read YAML files that people write: text in; plain values with line numbers, or all errors, out.
 
 Size and depth are limited. Tags, aliases and repeated keys are errors. Plain scalars follow YAML 1.2
 (https://yaml.org/spec/1.2.2/#103-core-schema), so that `no` and `12:30` are texts. In YAML 1.1, a topic or a
-name could become a truth value or a number of minutes. Infinity and NaN are errors, because a comparison with
-them always gives the same result.
+name could become a truth value or a number of minutes. Infinity and NaN are errors, because comparisons with
+them always give the same result.
 
 A document is checked against a JSON Schema, whose descriptions appear in error messages. The caller adds
 checks that a schema cannot express.
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 Value: TypeAlias = "dict[str, Value] | list[Value] | str | int | float | bool | None"
 Place: TypeAlias = tuple[str | int, ...]
-"""Keys and indices from the top of a document to a value."""
+"""Place of a value in a document: keys and indices from the top."""
 
 LARGEST_TEXT = 256 * 1024
-"""Size limit, bytes; a larger file is no mapping, because mappings are written by hand."""
+"""Size limit of a mapping, bytes; mappings are written by hand."""
 
 _DEEPEST = 20
 """Nesting limit of lists and mappings."""
-# of at most 300 digits, so that its conversion to float does not overflow
+# at most 300 digits, so that conversion to float does not overflow
 _INTEGER = re.compile(r"[-+]?[0-9]{1,300}", re.ASCII)
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", re.ASCII)
 _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None}
@@ -51,7 +51,7 @@ class Document:
 
     Attributes:
         value: mappings, lists, texts, numbers, truth values, None.
-        lines: line of each value, from 1; a value with a key has the line of its key.
+        lines: line of each value, from 1; for a value with a key, the line of the key.
         faults: (line, text) of each error.
     """
 
@@ -99,7 +99,7 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
 
 
 def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
-    """Return the remedy for an unquoted file pattern, in which `*` and `[` are YAML syntax, or ""."""
+    """Return the remedy for an unquoted file pattern with `*` or `[`, which are YAML syntax; otherwise ""."""
     mark = error.problem_mark
     is_list = mark is not None and re.fullmatch(r"\S\[", text[max(0, mark.index - 1) : mark.index + 1])
     if not is_list and error.context != "while scanning an alias":
@@ -108,7 +108,7 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
 
 
 def _find_unsupported_feature(events: Iterable[yaml.Event], noun: str) -> tuple[int, str] | None:
-    """Return the line and text of the first tag, alias, lone surrogate or deep nesting; None without one.
+    """Return line and text of the first tag, alias, lone surrogate or deep nesting; None if there is none.
 
     Aliases and deep nesting could expand a short text beyond memory.
     """
@@ -137,7 +137,7 @@ def _value(node: yaml.Node, place: Place, document: Document) -> Value:
         return [_value(element, (*place, index), document) for index, element in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         return _table(node, place, document)
-    # a scalar with a style is quoted or a block, and so a text
+    # a scalar with a style is quoted or a block, so it is a text
     if not isinstance(node, yaml.ScalarNode) or node.style is not None:
         return cast("Value", node.value)
     value = _scalar(node.value)
@@ -187,7 +187,7 @@ MOST_FAULTS = 100
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
-    """Read a text file from a path or an address; only the beginning if the file is too large.
+    """Read a text file from a path or an address; of a too large file, only the beginning.
 
     Args:
         largest: size limit, bytes; at most one byte more is read.
@@ -211,7 +211,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
 
 @cache
 def schema_of(room: str, kind: str) -> Mapping[str, Any]:
-    """Return the JSON Schema of a kind of file from a subpackage."""
+    """Return the JSON Schema of a kind of file from the subpackage `room`."""
     text = files(f"spatial_replay.{room}").joinpath(f"{kind}.schema.json").read_text(encoding="utf-8")
     return cast("Mapping[str, Any]", json.loads(text))
 
@@ -228,7 +228,8 @@ def checked_document(
     Args:
         name: name of the file, for errors.
         schema: JSON Schema, draft 2020-12.
-        contradictions: returns faults that a schema cannot express; its document may violate the schema.
+        contradictions: function that returns faults that a schema cannot express, also for a document that
+            violates the schema.
         what: noun for the file, such as "a mapping".
 
     Raises:
@@ -247,12 +248,12 @@ def faults_by_place(
     schema: Mapping[str, Any],
     contradictions: Callable[[Document], list[tuple[Place, str]]],
 ) -> dict[Place, str]:
-    """Return the faults of the values of a document by place; for the arguments see `checked_document`."""
+    """Return a document's faults by place; see `checked_document` for the arguments."""
     if document.faults and document.value is None:
         return {}
     from jsonschema import Draft202012Validator
 
-    # one fault per place; a contradiction replaces a violation, because its text is more specific
+    # one fault per place: a contradiction replaces a violation, because its text is more specific
     errors = Draft202012Validator(schema).iter_errors(document.value)
     violations = [fault for error in errors for fault in _faults_in_words(error)]
     return dict(violations + contradictions(document))
@@ -282,7 +283,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
         for violation in error.context:
             violations_by_branch.setdefault(violation.schema_path[0], []).append(violation)
         for violations in violations_by_branch.values():
-            # skip an alternative for another type: its violations would not help
+            # violations of an alternative for another type would not help
             if not any(
                 violation.validator == "type" and len(violation.absolute_path) == len(place)
                 for violation in violations
@@ -312,7 +313,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
 
 
 def _around(error: Any) -> str:
-    """Return the description of the nearest enclosing rule, for a violated rule without a description."""
+    """Return the description of the nearest enclosing rule of a violated rule without a description."""
     parent = error.parent
     while parent is not None and "description" not in parent.schema:
         parent = parent.parent
