@@ -90,27 +90,27 @@ class Automaton(Displayed):
             NoAutomatonError: more than 100 000 transitions, or cubes in their guards. `iter_transitions`,
                 `successors` and `transition` compute them one by one.
         """
-        transitions, cubes = [], 0
+        transitions, cube_count = [], 0
         for transition in self.iter_transitions():
             transitions.append(transition)
-            cubes += len(transition.guard)
-            if transition.is_cut or max(len(transitions), cubes) > MAX_LISTED:
-                what = (
+            cube_count += len(transition.guard)
+            if transition.is_cut or max(len(transitions), cube_count) > MAX_LISTED:
+                noun = (
                     "transitions"
                     if len(transitions) > MAX_LISTED
                     else "cubes in the guards of its transitions"
                 )
-                raise NoAutomatonError(f"{self.name} has more than {MAX_LISTED} {what}")
+                raise NoAutomatonError(f"{self.name} has more than {MAX_LISTED} {noun}")
         return tuple(transitions)
 
     @cached_property
     def is_listable(self) -> bool:
         """Whether `transitions` raises no error."""
         # the count of transitions needs no guards, which take longer to compute
-        count = 0
+        transition_count = 0
         for state in self.states:
-            count += len(self.successors[state])
-            if count > MAX_LISTED:
+            transition_count += len(self.successors[state])
+            if transition_count > MAX_LISTED:
                 return False
         try:
             return bool(self.transitions)
@@ -132,8 +132,10 @@ class Automaton(Displayed):
     @cached_property
     def has_returns(self) -> bool:
         """Whether samples lead back to the initial state, so that runs can end in it."""
-        before = ~self.initial
-        return before in self.entries or any(before in (low, high) for _, low, high in self.decisions)
+        initial_place = ~self.initial
+        return initial_place in self.entries or any(
+            initial_place in (low, high) for _, low, high in self.decisions
+        )
 
     @cached_property
     def can_accept(self) -> frozenset[int]:
@@ -175,24 +177,24 @@ class Automaton(Displayed):
         Raises:
             UsageError: no such state, or a symbol of another length.
         """
-        places = []
+        pending_places = []
         for state in states:
             self._check(state, symbol)
-            places.append(self.entries[state])
-        visited = set(places)
-        reached = set()
-        while places:
-            place = places.pop()
+            pending_places.append(self.entries[state])
+        visited_places = set(pending_places)
+        next_states = set()
+        while pending_places:
+            place = pending_places.pop()
             if place < 0:
-                reached.add(~place)
+                next_states.add(~place)
                 continue
             proposition, low, high = self.decisions[place]
             value = symbol[proposition]
-            for after in (low, high) if value is None else (high,) if value else (low,):
-                if after not in visited:
-                    visited.add(after)
-                    places.append(after)
-        return frozenset(reached)
+            for next_place in (low, high) if value is None else (high,) if value else (low,):
+                if next_place not in visited_places:
+                    visited_places.add(next_place)
+                    pending_places.append(next_place)
+        return frozenset(next_states)
 
     def accepts(self, symbols: Sequence[Sequence[bool]]) -> bool:
         """Return whether a run of at least one sample satisfies the formula.
@@ -226,24 +228,27 @@ class Automaton(Displayed):
             UsageError: no such state.
         """
         self._check_state(state)
-        left_out = set(without)
-        distances = self._distances(self.accepting, left_out)
+        avoided_moves = set(without)
+        distances = self._distances(self.accepting, avoided_moves)
         if state not in distances:
             return
         paths: list[tuple[Transition, ...]] = [()]
         while paths:
             path = paths.pop()
-            end = path[-1].target if path else state
-            if distances[end] == 0:
+            end_state = path[-1].target if path else state
+            if distances[end_state] == 0:
                 yield path
                 continue
-            nearer = [
+            nearer_targets = [
                 target
-                for target in self.successors[end]
-                if (end, target) not in left_out and distances.get(target) == distances[end] - 1
+                for target in self.successors[end_state]
+                if (end_state, target) not in avoided_moves
+                and distances.get(target) == distances[end_state] - 1
             ]
             # the list is a stack, so the path over the state with the lowest number is popped first
-            paths.extend((*path, self._moves.transition(end, target)) for target in reversed(nearer))
+            paths.extend(
+                (*path, self._moves.transition(end_state, target)) for target in reversed(nearer_targets)
+            )
 
     def guard_words(self, transition: Transition, longest: int | None = None) -> str:
         """Return a transition's guard as a sentence of the specification language.
@@ -270,9 +275,9 @@ class Automaton(Displayed):
         Accepting states have a double outline. States that accept permanently are blue, traps are vermillion.
         If there are too many transitions to list, the text has only the states nearest to the start.
         """
-        short = abbreviate(self)
-        cut = () if self.is_listable else (_left_out(self),)
-        return digraph_text(short, [*meanings(short), *cut])
+        automaton = abbreviate(self)
+        cut_remarks = () if self.is_listable else (_left_out(self),)
+        return digraph_text(automaton, [*meanings(automaton), *cut_remarks])
 
     def to_hoa(self) -> str:
         """Return the automaton in the Hanoi omega-automata format, version 1.
@@ -289,14 +294,14 @@ class Automaton(Displayed):
                 f"the Hanoi format needs every transition of {self.name}, and there are too many "
                 f"({size_words(self)}); text and .dot files show the states nearest to the start"
             )
-        numbers = range(len(self.propositions))
-        names = [_quote(proposition.label) for proposition in self.propositions]
+        proposition_numbers = range(len(self.propositions))
+        quoted_labels = [_quote(proposition.label) for proposition in self.propositions]
         lines = [
             "HOA: v1",
             f"name: {_quote(self.name)}",
             f"States: {len(self.states)}",
             f"Start: {self.initial}",
-            " ".join(["AP:", str(len(numbers)), *names]),
+            " ".join(["AP:", str(len(proposition_numbers)), *quoted_labels]),
             "acc-name: Buchi",
             "Acceptance: 1 Inf(0)",
             "properties: trans-labels explicit-labels state-acc complete deterministic",
@@ -317,30 +322,32 @@ class Automaton(Displayed):
     def _above(self) -> dict[int, list[int]]:
         return above_of(self.entries, self.decisions)
 
-    def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
+    def _distances(
+        self, goal_states: Collection[int], without: Collection[tuple[int, int]] = ()
+    ) -> dict[int, int]:
         """Return the least number of samples to a goal state, for each state that can reach one."""
         # transitions to avoid are few, so the other transitions of their sources are followed one by one
-        left_out: dict[int, set[int]] = {}
+        avoided_targets: dict[int, set[int]] = {}
         for source, target in without:
             if source in self.states:
-                left_out.setdefault(source, set()).add(target)
-        before: dict[int, list[int]] = {}
-        for source, targets in left_out.items():
+                avoided_targets.setdefault(source, set()).add(target)
+        remaining_sources: dict[int, list[int]] = {}
+        for source, targets in avoided_targets.items():
             for target in self.successors[source]:
                 if target not in targets:
-                    before.setdefault(target, []).append(source)
-        distances = dict.fromkeys(sorted(goal), 0)
-        waiting = list(distances)
-        visited: set[int] = set()
-        for state in waiting:
-            direct = sources_of(self._above, (state,), visited)
+                    remaining_sources.setdefault(target, []).append(source)
+        distances = dict.fromkeys(sorted(goal_states), 0)
+        waiting_states = list(distances)
+        visited_rows: set[int] = set()
+        for state in waiting_states:
+            predecessors = sources_of(self._above, (state,), visited_rows)
             for source in (
-                *(predecessor for predecessor in direct if predecessor not in left_out),
-                *before.get(state, ()),
+                *(predecessor for predecessor in predecessors if predecessor not in avoided_targets),
+                *remaining_sources.get(state, ()),
             ):
                 if source not in distances:
                     distances[source] = distances[state] + 1
-                    waiting.append(source)
+                    waiting_states.append(source)
         return distances
 
     def _ends(self, states: frozenset[int]) -> frozenset[int]:
@@ -350,8 +357,8 @@ class Automaton(Displayed):
     def _check(self, state: int, symbol: Sequence[object]) -> None:
         self._check_state(state)
         if len(symbol) != len(self.propositions):
-            count = len(self.propositions)
-            raise UsageError(f"a symbol of {len(symbol)} values; there are {count} propositions")
+            proposition_count = len(self.propositions)
+            raise UsageError(f"a symbol of {len(symbol)} values; there are {proposition_count} propositions")
 
     def _check_state(self, state: int) -> None:
         if state not in self.states:
@@ -415,50 +422,56 @@ class TransitionTable:
 
 @elementwise
 @kernel
-def _walk(entries: Integers, decisions: Integers, state: int, values: Flags, result: Integers) -> None:
-    for t in range(values.shape[1]):
+def _walk(
+    entries: Integers, decisions: Integers, state: int, proposition_values: Flags, result: Integers
+) -> None:
+    for sample in range(proposition_values.shape[1]):
         place = entries[state]
         while place >= 0:
             # column 1 is for a false proposition, column 2 for a true one
-            place = decisions[place, 1 + values[decisions[place, 0], t]]
+            place = decisions[place, 1 + proposition_values[decisions[place, 0], sample]]
         state = ~place
-        result[t] = state
+        result[sample] = state
 
 
 @kernel
 def _spread(
-    entries: Integers, decisions: Integers, states: StateSet, values: Flags, result: NDArray[np.bool_]
+    entries: Integers,
+    decisions: Integers,
+    states: StateSet,
+    proposition_values: Flags,
+    result: NDArray[np.bool_],
 ) -> None:
     # sample of the last visit of each decision: states share decisions, which are followed once per sample
-    visited = np.full(decisions.shape[0], -1, np.int64)
+    last_visits = np.full(decisions.shape[0], -1, np.int64)
     # each visited decision adds at most one entry to the stack
     stack = np.empty(decisions.shape[0] + 2, np.int64)
-    before = states
-    for t in range(values.shape[1]):
-        after = result[t]
-        for state in range(before.shape[0]):
-            if not before[state]:
+    states_before = states
+    for sample in range(proposition_values.shape[1]):
+        states_after = result[sample]
+        for state in range(states_before.shape[0]):
+            if not states_before[state]:
                 continue
             stack[0] = entries[state]
-            height = 1
-            while height > 0:
-                height -= 1
-                place = stack[height]
+            stack_height = 1
+            while stack_height > 0:
+                stack_height -= 1
+                place = stack[stack_height]
                 if place < 0:
-                    after[~place] = True
+                    states_after[~place] = True
                     continue
-                if visited[place] == t:
+                if last_visits[place] == sample:
                     continue
-                visited[place] = t
+                last_visits[place] = sample
                 # an unknown value, -1, follows both branches
-                value = values[decisions[place, 0], t]
+                value = proposition_values[decisions[place, 0], sample]
                 if value != 1:
-                    stack[height] = decisions[place, 1]
-                    height += 1
+                    stack[stack_height] = decisions[place, 1]
+                    stack_height += 1
                 if value != 0:
-                    stack[height] = decisions[place, 2]
-                    height += 1
-        before = after
+                    stack[stack_height] = decisions[place, 2]
+                    stack_height += 1
+        states_before = states_after
 
 
 def words_text(automaton: Automaton) -> str:
@@ -475,8 +488,8 @@ def words_text(automaton: Automaton) -> str:
     for state, transitions in _by_source(automaton).items():
         lines.append(f"  state {state}: {state_words(automaton, state)}")
         for transition in transitions:
-            move = "stays" if transition.target == state else f"to {transition.target}"
-            lines.append(f"    {move} if {_guard_text(automaton, transition)}")
+            direction = "stays" if transition.target == state else f"to {transition.target}"
+            lines.append(f"    {direction} if {_guard_text(automaton, transition)}")
     if not automaton.is_listable:
         lines.append(f"  … {_left_out(automaton)}")
     return "\n".join(lines)
@@ -489,15 +502,15 @@ def size_words(automaton: Automaton) -> str:
 
 def state_words(automaton: Automaton, state: int) -> str:
     """Return the verdict of a run that ends in a state, and whether it can change."""
-    begins = "start, " if state == automaton.initial else ""
+    prefix = "start, " if state == automaton.initial else ""
     if state == automaton.initial and not automaton.has_returns:
-        return f"{begins}before the first sample"
-    now = "accepting" if state in automaton.accepting else "not accepting"
+        return f"{prefix}before the first sample"
+    verdict = "accepting" if state in automaton.accepting else "not accepting"
     if state not in automaton.can_reject:
-        now = "accepting permanently"
+        verdict = "accepting permanently"
     elif state not in automaton.can_accept:
-        now = "a trap: acceptance is lost"
-    return begins + now
+        verdict = "a trap: acceptance is lost"
+    return prefix + verdict
 
 
 def state_colour(automaton: Automaton, state: int) -> str:
@@ -511,12 +524,14 @@ def abbreviate(automaton: Automaton) -> Automaton:
     """Return the automaton with short names for propositions that are too long for arrows."""
     labels = {proposition.label for proposition in automaton.propositions}
     # twice as many names suffice, because labels take at most half of them
-    names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
-    short = (
-        proposition if len(proposition.label) <= _LONGEST_LABEL else replace(proposition, name=next(names))
+    free_names = (name for number in range(2 * len(labels) + 1) if (name := f"p{number}") not in labels)
+    short_propositions = (
+        proposition
+        if len(proposition.label) <= _LONGEST_LABEL
+        else replace(proposition, name=next(free_names))
         for proposition in automaton.propositions
     )
-    return automaton.with_propositions(tuple(short))
+    return automaton.with_propositions(tuple(short_propositions))
 
 
 def meanings(automaton: Automaton) -> list[str]:
@@ -538,14 +553,16 @@ def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
         f"  start -> {automaton.initial};",
     ]
     if legend:
-        text = "".join(f"{_escape(line)}\\l" for meaning in legend for line in _legend_lines(meaning))
-        lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
-    moves = _by_source(automaton)
-    for state in moves:
+        legend_text = "".join(f"{_escape(line)}\\l" for meaning in legend for line in _legend_lines(meaning))
+        lines.append(
+            f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{legend_text}"];'
+        )
+    moves_by_state = _by_source(automaton)
+    for state in moves_by_state:
         shape = "doublecircle" if state in automaton.accepting else "circle"
-        colour, about = state_colour(automaton, state), _quote(state_words(automaton, state))
-        lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
-    for transition in (move for state in moves.values() for move in state):
+        colour, tooltip = state_colour(automaton, state), _quote(state_words(automaton, state))
+        lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={tooltip}];')
+    for transition in (move for moves in moves_by_state.values() for move in moves):
         label = "\\n".join(map(_escape, _broken(_guard_text(automaton, transition))))
         lines.append(f'  {transition.source} -> {transition.target} [label="{label}"];')
     return "\n".join([*lines, "}", ""])
@@ -554,24 +571,28 @@ def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
 def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
     """Return the transitions from each drawn state to other drawn states."""
     shown_states = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
-    ends = [
+    state_pairs = [
         (state, target)
         for state in shown_states
         for target in automaton.successors[state]
         if target in shown_states
     ]
-    moves: dict[int, list[Transition]] = {state: [] for state in shown_states}
-    for source, target in ends if automaton.is_listable else ends[:MOST_MOVES]:
+    moves_by_state: dict[int, list[Transition]] = {state: [] for state in shown_states}
+    for source, target in state_pairs if automaton.is_listable else state_pairs[:MOST_MOVES]:
         move = automaton.transition(source, target)
         if move is not None:
-            moves[source].append(move)
-    return moves
+            moves_by_state[source].append(move)
+    return moves_by_state
 
 
 def _left_out(automaton: Automaton) -> str:
-    most = len(automaton.states[:MOST_STATES])
-    rest = f"{plural(len(automaton.states) - most, 'more state')}, " if len(automaton.states) > most else ""
-    return f"{rest}more transitions and the rest of long guards are left out: there are too many"
+    drawn_count = len(automaton.states[:MOST_STATES])
+    states_text = (
+        f"{plural(len(automaton.states) - drawn_count, 'more state')}, "
+        if len(automaton.states) > drawn_count
+        else ""
+    )
+    return f"{states_text}more transitions and the rest of long guards are left out: there are too many"
 
 
 def _guard_text(automaton: Automaton, move: Transition) -> str:
@@ -579,10 +600,10 @@ def _guard_text(automaton: Automaton, move: Transition) -> str:
 
 
 def _hoa_guard(transition: Transition) -> str:
-    literals = (
+    cube_literals = (
         [str(number) if value else f"!{number}" for number, value in cube] for cube in transition.guard
     )
-    return " | ".join("&".join(cube) or "t" for cube in literals)
+    return " | ".join("&".join(cube) or "t" for cube in cube_literals)
 
 
 def _broken(text: str) -> list[str]:

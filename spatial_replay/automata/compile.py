@@ -178,18 +178,18 @@ def _output(executable: str, program: str) -> str:
         timer = Timer(_TIMEOUT_S, process.kill)
         timer.start()
         try:
-            printed = _exchange(process, program.encode("ascii"))
+            output = _exchange(process, program.encode("ascii"))
         finally:
             timer.cancel()
             process.kill()
-    if len(printed) > _MAX_OUTPUT:
+    if len(output) > _MAX_OUTPUT:
         raise NoAutomatonError(f"it printed more than {_MAX_OUTPUT} bytes")
     if process.returncode == -9:
         raise NoAutomatonError(f"it was ended after {_TIMEOUT_S:g} s or for lack of memory")
     if process.returncode != 0:
-        last = printed.decode("ascii", "replace").strip().splitlines()[-1:]
-        raise NoAutomatonError(f"it ended with code {process.returncode}: {''.join(last)[:200]}")
-    return printed.decode("ascii", "replace")
+        last_line = output.decode("ascii", "replace").strip().splitlines()[-1:]
+        raise NoAutomatonError(f"it ended with code {process.returncode}: {''.join(last_line)[:200]}")
+    return output.decode("ascii", "replace")
 
 
 def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
@@ -203,11 +203,11 @@ def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
         # MONA has ended; its exit code and output give the reason
         pass
     # one more byte shows that the output is too long
-    printed = process.stdout.read(_MAX_OUTPUT + 1)
+    output = process.stdout.read(_MAX_OUTPUT + 1)
     # a process with more output would wait for the full pipe forever; the caller kills it
-    if len(printed) <= _MAX_OUTPUT:
+    if len(output) <= _MAX_OUTPUT:
         process.wait()
-    return printed
+    return output
 
 
 class _Cube(NamedTuple):
@@ -224,24 +224,26 @@ def _machine(output: str, proposition_count: int) -> Machine:
     )
     if header is None or accepting is None or state_count_match is None:
         raise NoAutomatonError(f"it printed no automaton: {output.strip()[:200]!r}")
-    numbers = [int(name.removeprefix("P")) for name in header[1].split()]
+    proposition_numbers = [int(name.removeprefix("P")) for name in header[1].split()]
     state_count = int(state_count_match[1])
     printed_moves = _MOVE.findall(output)
     if len(printed_moves) > _MAX_MOVES:
         raise NoAutomatonError(f"the automaton has {state_count} states and more than {_MAX_MOVES} moves")
-    cubes: list[list[_Cube]] = [[] for _ in range(state_count)]
+    cubes_by_state: list[list[_Cube]] = [[] for _ in range(state_count)]
     for state, symbol, target in printed_moves:
         letters = ["X"] * proposition_count
-        for number, letter in zip(numbers, symbol, strict=True):
+        for number, letter in zip(proposition_numbers, symbol, strict=True):
             letters[number] = letter
-        cubes[int(state)].append(_Cube("".join(letters), int(target)))
-    if not all(cubes):
+        cubes_by_state[int(state)].append(_Cube("".join(letters), int(target)))
+    if not all(cubes_by_state):
         raise NoAutomatonError("it printed an automaton without moves from some state")
     diagrams = Diagrams()
-    moves = tuple(_node(diagrams, cubes_of_state, 0) for cubes_of_state in cubes)
-    initial = cubes[0][0].target
-    accepts = {int(number) for number in accepting[1].split()}
-    return machine_of(diagrams, moves, [state in accepts for state in range(state_count)], moves[initial])
+    moves = tuple(_node(diagrams, cubes_of_state, 0) for cubes_of_state in cubes_by_state)
+    initial = cubes_by_state[0][0].target
+    accepting_states = {int(number) for number in accepting[1].split()}
+    return machine_of(
+        diagrams, moves, [state in accepting_states for state in range(state_count)], moves[initial]
+    )
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
@@ -249,12 +251,14 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
-    low, high = ([cube for cube in cubes if cube.symbol[variable] != letter] for letter in ("1", "0"))
-    if not low or not high:
+    false_cubes, true_cubes = (
+        [cube for cube in cubes if cube.symbol[variable] != letter] for letter in ("1", "0")
+    )
+    if not false_cubes or not true_cubes:
         raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
-    when_false = _node(diagrams, low, variable + 1)
+    when_false = _node(diagrams, false_cubes, variable + 1)
     # without this, a variable that is free in every cube would double the work
-    when_true = when_false if low == high else _node(diagrams, high, variable + 1)
+    when_true = when_false if false_cubes == true_cubes else _node(diagrams, true_cubes, variable + 1)
     return diagrams.decide(variable, when_false, when_true)
 
 
@@ -289,26 +293,26 @@ class Obligations:
             longer: `chains` of a skeleton.
         """
         self._diagrams = diagrams
-        self._first = first
+        self._first_variable = first
         self._chains: list[Chain] = []
         self._members = _members(longer)
-        self._places: dict[Obligation, tuple[Chain, int]] = {}
+        self._chain_places: dict[Obligation, tuple[Chain, int]] = {}
 
     def diagram(self, obligation: Obligation) -> int:
         """Return the diagram of an obligation: true where it is met."""
-        if obligation not in self._places:
+        if obligation not in self._chain_places:
             self._begin(obligation)
-        chain, index = self._places[obligation]
+        chain, member_index = self._chain_places[obligation]
         node = YES
         for bit in range(chain.bits):
             # a member holds iff only earlier members fail, so iff their count is at most its index
-            branches = (YES, node) if index >> bit & 1 else (node, NO)
+            branches = (YES, node) if member_index >> bit & 1 else (node, NO)
             node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
         return node
 
     def chain(self, variable: int) -> Chain:
         """Return the chain that a variable belongs to."""
-        return self._chains[variable - self._first]
+        return self._chains[variable - self._first_variable]
 
     def cases(self, chain: Chain, node: int) -> list[tuple[int, int]]:
         """Split a function into cases by the number of failing members of its first chain.
@@ -318,12 +322,12 @@ class Obligations:
             count, and at least as many as the previous count.
         """
         cases: list[tuple[int, int]] = []
-        below = 0
-        for count, rest in self._rests(chain, node, 0):
-            below += count
-            if cases and cases[-1][1] == rest:
+        count_limit = 0
+        for span, function in self._rests(chain, node, 0):
+            count_limit += span
+            if cases and cases[-1][1] == function:
                 cases.pop()
-            cases.append((below, rest))
+            cases.append((count_limit, function))
         return cases
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
@@ -335,28 +339,33 @@ class Obligations:
             yield from self._rests(chain, branch, bit + 1)
 
     def _begin(self, obligation: Obligation) -> None:
-        number, strong = obligation
+        number, is_strong = obligation
         members = self._members.get(obligation, (number,))
         # the number of failing members is from 0 to len(members)
-        bits = len(members).bit_length()
-        chain = Chain(members, strong, self._first + len(self._chains), bits)
-        self._chains += [chain] * bits
-        self._places.update({(member, strong): (chain, index) for index, member in enumerate(members)})
+        bit_count = len(members).bit_length()
+        chain = Chain(members, is_strong, self._first_variable + len(self._chains), bit_count)
+        self._chains += [chain] * bit_count
+        self._chain_places.update(
+            {(member, is_strong): (chain, index) for index, member in enumerate(members)}
+        )
 
 
 def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
     """Map each obligation of a chain to the members of its chain."""
-    later = {(number, strong) for (_, strong), number in longer.items()}
+    later_members = {(number, is_strong) for (_, is_strong), number in longer.items()}
     chains: dict[Obligation, tuple[int, ...]] = {}
-    for begin, strong in longer:
-        if (begin, strong) in later:
+    for first_member, is_strong in longer:
+        if (first_member, is_strong) in later_members:
             continue
-        members = [begin]
-        while (after := longer.get((members[-1], strong))) is not None and (after, strong) not in chains:
-            members.append(after)
+        members = [first_member]
+        while (next_member := longer.get((members[-1], is_strong))) is not None and (
+            next_member,
+            is_strong,
+        ) not in chains:
+            members.append(next_member)
         # an until with a sooner deadline implies a later one; a longer release implies a shorter one
-        ordered = tuple(members if strong else reversed(members))
-        chains.update({(member, strong): ordered for member in members})
+        ordered_members = tuple(members if is_strong else reversed(members))
+        chains.update({(member, is_strong): ordered_members for member in members})
     return chains
 
 
@@ -396,39 +405,39 @@ def machine_by_progression(
 class _Progression:
     """The states of a skeleton, explored from its initial state."""
 
-    def __init__(self, skeleton: Skeleton, propositions: int, states: int, decisions: int) -> None:
+    def __init__(self, skeleton: Skeleton, propositions: int, max_states: int, max_decisions: int) -> None:
         self._skeleton = skeleton
         self._propositions = propositions
-        self._most = states
-        self._diagrams = Diagrams(decisions)
+        self._max_states = max_states
+        self._diagrams = Diagrams(max_decisions)
         self._obligations = Obligations(self._diagrams, propositions, skeleton.chains)
-        self._now: dict[int, int] = {FALSE: NO, TRUE: YES}
-        self._next: dict[int, int] = {NO: NO, YES: YES}
+        self._conditions: dict[int, int] = {FALSE: NO, TRUE: YES}
+        self._moves: dict[int, int] = {NO: NO, YES: YES}
 
     def machine(self, root: int) -> Machine:
-        states: dict[int, int] = {}
-        waiting: list[int] = []
+        state_numbers: dict[int, int] = {}
+        state_nodes: list[int] = []
 
         def number(node: int) -> int:
-            if node not in states:
-                if len(waiting) == self._most:
-                    raise NoAutomatonError(f"the automaton takes more than {self._most} states")
-                states[node] = len(waiting)
-                waiting.append(node)
-            return states[node]
+            if node not in state_numbers:
+                if len(state_nodes) == self._max_states:
+                    raise NoAutomatonError(f"the automaton takes more than {self._max_states} states")
+                state_numbers[node] = len(state_nodes)
+                state_nodes.append(node)
+            return state_numbers[node]
 
-        result = Diagrams()
-        copy = node_copier(self._diagrams, result, self._propositions, number)
+        result_diagrams = Diagrams()
+        copy = node_copier(self._diagrams, result_diagrams, self._propositions, number)
         start = copy(self._read(root))
         # the list grows while it is iterated: moves lead to new states
-        moves = [copy(self._after(node)) for node in waiting]
-        return machine_of(result, moves, [self._accepts(node) for node in waiting], start)
+        moves = [copy(self._after(node)) for node in state_nodes]
+        return machine_of(result_diagrams, moves, [self._accepts(node) for node in state_nodes], start)
 
     def _read(self, number: int) -> int:
         """Return the condition of a subformula on this sample and, as obligations, on the next sample."""
-        if number not in self._now:
-            self._now[number] = self._reading(number)
-        return self._now[number]
+        if number not in self._conditions:
+            self._conditions[number] = self._reading(number)
+        return self._conditions[number]
 
     def _reading(self, number: int) -> int:
         diagrams = self._diagrams
@@ -444,24 +453,24 @@ class _Progression:
             case "X" | "WX":
                 return self._obligations.diagram((first, kind == "X"))
             case "U":
-                later = diagrams.both(self._read(first), self._obligations.diagram((number, True)))
-                return diagrams.either(self._read(second), later)
+                later_case = diagrams.both(self._read(first), self._obligations.diagram((number, True)))
+                return diagrams.either(self._read(second), later_case)
             case "R":
-                later = diagrams.either(self._read(first), self._obligations.diagram((number, False)))
-                return diagrams.both(self._read(second), later)
+                later_case = diagrams.either(self._read(first), self._obligations.diagram((number, False)))
+                return diagrams.both(self._read(second), later_case)
         raise ValueError(kind)
 
     def _after(self, node: int) -> int:
         """Return the diagram from propositions to the next state of a state."""
-        if node not in self._next:
+        if node not in self._moves:
             chain = self._obligations.chain(self._diagrams[node].variable)
-            *cases, (_, rest) = self._obligations.cases(chain, node)
-            result = self._after(rest)
-            for below, rest in reversed(cases):
-                obliged = self._read(chain.members[below - 1])
-                result = self._diagrams.choose(obliged, self._after(rest), result)
-            self._next[node] = result
-        return self._next[node]
+            *cases, (_, remainder) = self._obligations.cases(chain, node)
+            result = self._after(remainder)
+            for count_limit, remainder in reversed(cases):
+                condition = self._read(chain.members[count_limit - 1])
+                result = self._diagrams.choose(condition, self._after(remainder), result)
+            self._moves[node] = result
+        return self._moves[node]
 
     def _accepts(self, node: int) -> bool:
         """Return whether a run that ends in a state satisfies the formula."""
@@ -500,13 +509,13 @@ class _Composition:
     def __init__(self, skeleton: Skeleton, propositions: int) -> None:
         self._skeleton = skeleton
         self._propositions = propositions
-        self._known: dict[int, Machine] = {}
+        self._machines: dict[int, Machine] = {}
 
     def machine(self, number: int) -> Machine:
         """Return the automaton of a subformula."""
-        if number not in self._known:
-            self._known[number] = self._compile(number)
-        return self._known[number]
+        if number not in self._machines:
+            self._machines[number] = self._compile(number)
+        return self._machines[number]
 
     def _compile(self, number: int) -> Machine:
         try:
@@ -521,20 +530,20 @@ class _Composition:
                 pass
         return self._progress(number, MAX_STATES, MAX_DECISIONS)
 
-    def _progress(self, number: int, states: int, decisions: int) -> Machine:
+    def _progress(self, number: int, max_states: int, max_decisions: int) -> Machine:
         return machine_by_progression(
-            self._skeleton, self._propositions, number, states=states, decisions=decisions
+            self._skeleton, self._propositions, number, states=max_states, decisions=max_decisions
         )
 
-    def _join(self, operands: tuple[int, ...], both: bool) -> Machine:
+    def _join(self, operands: tuple[int, ...], is_conjunction: bool) -> Machine:
         machines = [merge_equivalent_states(self.machine(operand)) for operand in operands]
-        waiting = [(machine.size, number) for number, machine in enumerate(machines)]
-        heapify(waiting)
+        size_heap = [(machine.size, number) for number, machine in enumerate(machines)]
+        heapify(size_heap)
         # the two smallest machines first, because the size of a product is up to the product of the sizes
-        while len(waiting) > 1:
-            first, second = (machines[heappop(waiting)[1]] for _ in range(2))
-            machines.append(merge_equivalent_states(join_machines(first, second, both)))
-            heappush(waiting, (machines[-1].size, len(machines) - 1))
+        while len(size_heap) > 1:
+            smallest, next_smallest = (machines[heappop(size_heap)[1]] for _ in range(2))
+            machines.append(merge_equivalent_states(join_machines(smallest, next_smallest, is_conjunction)))
+            heappush(size_heap, (machines[-1].size, len(machines) - 1))
         return machines[-1]
 
 
@@ -553,74 +562,81 @@ def join_machines(first: Machine, second: Machine, both: bool) -> Machine:
 class _Joining:
     """The visited pairs of places of two machines."""
 
-    def __init__(self, first: Machine, second: Machine, both: bool) -> None:
+    def __init__(self, first: Machine, second: Machine, is_conjunction: bool) -> None:
         self._machines = first, second
-        self._both = both
-        self._left, self._right = first.decisions.tolist(), second.decisions.tolist()
+        self._is_conjunction = is_conjunction
+        self._left_rows, self._right_rows = first.decisions.tolist(), second.decisions.tolist()
         # a trap decides a conjunction, and a permanently accepting state decides a disjunction
-        self._decided = _permanent_states(first, not both), _permanent_states(second, not both)
-        self._rows: list[tuple[int, int, int]] = []
-        self._known: dict[tuple[int, int], int] = {}
-        self._states: dict[tuple[int, int], int] = {}
+        self._deciding_places = (
+            _permanent_states(first, not is_conjunction),
+            _permanent_states(second, not is_conjunction),
+        )
+        self._decision_rows: list[tuple[int, int, int]] = []
+        self._places: dict[tuple[int, int], int] = {}
+        self._state_numbers: dict[tuple[int, int], int] = {}
         self._pairs: list[tuple[int, int]] = []
 
     def machine(self) -> Machine:
         first, second = self._machines
-        left, right = first.moves.tolist(), second.moves.tolist()
+        left_moves, right_moves = first.moves.tolist(), second.moves.tolist()
         start = self._place(first.start, second.start)
         # the list grows while it is iterated: moves lead to new pairs
         moves = [
-            ~state if left_state < 0 else self._place(left[left_state], right[right_state])
+            ~state if left_state < 0 else self._place(left_moves[left_state], right_moves[right_state])
             for state, (left_state, right_state) in enumerate(self._pairs)
         ]
-        join = np.logical_and if self._both else np.logical_or
-        pairs = np.array(self._pairs, np.int64)
-        accepting = join(first.accepting[pairs[:, 0]], second.accepting[pairs[:, 1]])
+        join = np.logical_and if self._is_conjunction else np.logical_or
+        state_pairs = np.array(self._pairs, np.int64)
+        accepting = join(first.accepting[state_pairs[:, 0]], second.accepting[state_pairs[:, 1]])
         # a decided pair is rejected by an intersection, and accepted by a union
-        accepting[pairs[:, 0] < 0] = not self._both
-        rows = np.array(self._rows, np.int64).reshape(-1, 3)
-        return Machine(np.array(moves, np.int64), rows, accepting, start)
+        accepting[state_pairs[:, 0] < 0] = not self._is_conjunction
+        decision_rows = np.array(self._decision_rows, np.int64).reshape(-1, 3)
+        return Machine(np.array(moves, np.int64), decision_rows, accepting, start)
 
-    def _place(self, left: int, right: int) -> int:
-        if left in self._decided[0] or right in self._decided[1]:
+    def _place(self, left_place: int, right_place: int) -> int:
+        if left_place in self._deciding_places[0] or right_place in self._deciding_places[1]:
             return self._state(-1, -1)
-        if left < 0 and right < 0:
-            return self._state(~left, ~right)
-        place = self._known.get((left, right))
+        if left_place < 0 and right_place < 0:
+            return self._state(~left_place, ~right_place)
+        place = self._places.get((left_place, right_place))
         if place is None:
-            place = self._known[left, right] = self._decision(left, right)
-            if len(self._known) > MAX_PAIRS:
+            place = self._places[left_place, right_place] = self._decision(left_place, right_place)
+            if len(self._places) > MAX_PAIRS:
                 raise NoAutomatonError(f"joining its operands takes more than {MAX_PAIRS} steps")
         return place
 
-    def _decision(self, left: int, right: int) -> int:
-        left_variable, left_low, left_high = self._left[left] if left >= 0 else (LEAF, left, left)
-        right_variable, right_low, right_high = self._right[right] if right >= 0 else (LEAF, right, right)
+    def _decision(self, left_place: int, right_place: int) -> int:
+        left_variable, left_low, left_high = (
+            self._left_rows[left_place] if left_place >= 0 else (LEAF, left_place, left_place)
+        )
+        right_variable, right_low, right_high = (
+            self._right_rows[right_place] if right_place >= 0 else (LEAF, right_place, right_place)
+        )
         if left_variable < right_variable:
-            right_low = right_high = right
+            right_low = right_high = right_place
         elif right_variable < left_variable:
-            left_low = left_high = left
+            left_low = left_high = left_place
         when_false, when_true = self._place(left_low, right_low), self._place(left_high, right_high)
         if when_false == when_true:
             return when_false
-        self._rows.append((min(left_variable, right_variable), when_false, when_true))
-        return len(self._rows) - 1
+        self._decision_rows.append((min(left_variable, right_variable), when_false, when_true))
+        return len(self._decision_rows) - 1
 
-    def _state(self, left: int, right: int) -> int:
+    def _state(self, left_state: int, right_state: int) -> int:
         """Return the place of a pair of states; (-1, -1) is any pair with a state that decides the result."""
-        number = self._states.get((left, right))
-        if number is None:
-            number = self._states[left, right] = len(self._pairs)
-            if number >= MAX_PRODUCT:
+        state = self._state_numbers.get((left_state, right_state))
+        if state is None:
+            state = self._state_numbers[left_state, right_state] = len(self._pairs)
+            if state >= MAX_PRODUCT:
                 raise NoAutomatonError(f"joining its operands takes more than {MAX_PRODUCT} states")
-            self._pairs.append((left, right))
-        return ~number
+            self._pairs.append((left_state, right_state))
+        return ~state
 
 
 def _permanent_states(machine: Machine, accepts: bool) -> frozenset[int]:
     """Return the places of states whose result is permanent: acceptance or, if not `accepts`, rejection."""
-    stays = machine.moves == ~np.arange(len(machine.moves))
-    return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
+    is_permanent = machine.moves == ~np.arange(len(machine.moves))
+    return frozenset((~np.flatnonzero(is_permanent & (machine.accepting == accepts))).tolist())
 
 
 _VERSION = 1
@@ -650,17 +666,17 @@ def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -
     if len(data) > _LONGEST:
         return None
     try:
-        stored = json.loads(data)
+        content = json.loads(data)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(stored, dict) or stored.get("version") != _VERSION:
+    if not isinstance(content, dict) or content.get("version") != _VERSION:
         return None
     propositions = Propositions(spec.formula).all
-    expected = (_canonical(specification, spec), [proposition.text for proposition in propositions])
-    if (stored.get("specification"), stored.get("propositions")) != expected:
+    expected_texts = (_canonical(specification, spec), [proposition.text for proposition in propositions])
+    if (content.get("specification"), content.get("propositions")) != expected_texts:
         return None
-    entries, accepting = _numbers(stored.get("entries")), _numbers(stored.get("accepting"))
-    decisions = _decisions(stored.get("decisions"))
+    entries, accepting = _numbers(content.get("entries")), _numbers(content.get("accepting"))
+    decisions = _decisions(content.get("decisions"))
     if entries is None or accepting is None or decisions is None or len(propositions) > MAX_PROPOSITIONS:
         return None
     automaton = Automaton(spec.name, tuple(propositions), frozenset(accepting), tuple(entries), decisions)
@@ -692,18 +708,28 @@ def _decisions(value: object) -> tuple[tuple[int, int, int], ...] | None:
 
 def _is_sound(automaton: Automaton) -> bool:
     """Return whether every decision leads to decisions on later propositions, and finally to valid states."""
-    rows, states, propositions = automaton.decisions, len(automaton.entries), len(automaton.propositions)
+    decision_rows, state_count, proposition_count = (
+        automaton.decisions,
+        len(automaton.entries),
+        len(automaton.propositions),
+    )
 
-    def leads(place: int, row: int, after: int) -> bool:
-        return ~place < states if place < 0 else place < row and rows[place][0] > after
+    def leads(place: int, row_index: int, last_proposition: int) -> bool:
+        return (
+            ~place < state_count
+            if place < 0
+            else place < row_index and decision_rows[place][0] > last_proposition
+        )
 
     return (
-        states > 0
-        and all(0 <= state < states for state in automaton.accepting)
-        and all(leads(place, len(rows), -1) for place in automaton.entries)
+        state_count > 0
+        and all(0 <= state < state_count for state in automaton.accepting)
+        and all(leads(place, len(decision_rows), -1) for place in automaton.entries)
         and all(
-            0 <= proposition < propositions and leads(low, row, proposition) and leads(high, row, proposition)
-            for row, (proposition, low, high) in enumerate(rows)
+            0 <= proposition < proposition_count
+            and leads(low, row_index, proposition)
+            and leads(high, row_index, proposition)
+            for row_index, (proposition, low, high) in enumerate(decision_rows)
         )
     )
 
@@ -772,18 +798,20 @@ def _compile_spec(
     Raises:
         NoAutomatonError: no compiler succeeds; the message has the reason of each.
     """
-    count = len(propositions.all)
-    if count > MAX_PROPOSITIONS:
-        raise NoAutomatonError(f"it has {count} propositions, an automaton at most {MAX_PROPOSITIONS}")
+    proposition_count = len(propositions.all)
+    if proposition_count > MAX_PROPOSITIONS:
+        raise NoAutomatonError(
+            f"it has {proposition_count} propositions, an automaton at most {MAX_PROPOSITIONS}"
+        )
     reasons = []
     for compiler in compilers:
-        if compiler == "mona" and (before := next(stored, None)) is not None:
-            return before
+        if compiler == "mona" and (stored_automaton := next(stored, None)) is not None:
+            return stored_automaton
         try:
             if compiler == "own":
-                machine = _compose_least(_Shape.of(skeleton, count))
+                machine = _compose_least(_Shape.of(skeleton, proposition_count))
             else:
-                machine = least(compiled_by_mona(skeleton, count))
+                machine = least(compiled_by_mona(skeleton, proposition_count))
         except NoAutomatonError as error:
             reasons.append(f"{_NAMES[compiler]}: {error}")
         else:
@@ -833,9 +861,9 @@ def _check_size(automaton: Automaton) -> Automaton:
     Raises:
         NoAutomatonError: the automaton has more than `MAX_ROWS` states or decisions.
     """
-    rows = max(len(automaton.entries), len(automaton.decisions))
-    if rows > MAX_ROWS:
-        raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
+    row_count = max(len(automaton.entries), len(automaton.decisions))
+    if row_count > MAX_ROWS:
+        raise NoAutomatonError(f"it takes {row_count} states or decisions, at most {MAX_ROWS} are kept")
     return automaton
 
 
@@ -848,8 +876,10 @@ def chosen_spec(specification: Specification, name: str | None) -> NamedSpec:
     specs_by_name = {spec.name: spec for spec in specification.specs}
     if name is None:
         if len(specification.results) != 1:
-            names = ", ".join(spec.name for spec in specification.results)
-            raise UsageError(f"{specification.filename} has several results; choose one with name=: {names}")
+            result_names = ", ".join(spec.name for spec in specification.results)
+            raise UsageError(
+                f"{specification.filename} has several results; choose one with name=: {result_names}"
+            )
         return specification.results[0]
     if name not in specs_by_name:
         hint = nearest_hint(name, specs_by_name)

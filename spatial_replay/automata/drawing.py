@@ -42,7 +42,7 @@ def layout_text(automaton: Automaton) -> str:
     return _graphviz(automaton, digraph_text(automaton), "json0")
 
 
-def _graphviz(automaton: Automaton, text: str, form: str) -> str:
+def _graphviz(automaton: Automaton, dot_text: str, output_format: str) -> str:
     executable = shutil.which("dot")
     if executable is None:
         raise UsageError(
@@ -50,9 +50,9 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
             "or write it as text to a file that ends in .dot"
         )
     try:
-        command = [executable, f"-T{form}"]
+        command = [executable, f"-T{output_format}"]
         process = subprocess.run(
-            command, input=text.encode(), capture_output=True, timeout=_DRAWING_S, check=False
+            command, input=dot_text.encode(), capture_output=True, timeout=_DRAWING_S, check=False
         )
     except subprocess.TimeoutExpired:
         raise OutputError(
@@ -123,24 +123,26 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     first_states = {automaton.initial, *visited}
     other_states = [state for state in automaton.states if state not in first_states]
     drawn_states = sorted([*sorted(first_states), *other_states][:MOST_STATES])
-    places = _places(automaton, drawn_states)
+    positions = _places(automaton, drawn_states)
     distances = automaton.distances
-    ends = [
+    state_pairs = [
         (source, target)
         for source in drawn_states
         for target in automaton.successors[source]
-        if target in places
+        if target in positions
     ]
-    ends.sort(key=lambda pair: pair[0] not in first_states)
+    state_pairs.sort(key=lambda pair: pair[0] not in first_states)
     moves = [
-        move for move_ends in ends[:MOST_MOVES] if (move := automaton.transition(*move_ends)) is not None
+        move
+        for state_pair in state_pairs[:MOST_MOVES]
+        if (move := automaton.transition(*state_pair)) is not None
     ]
     return AutomatonDrawing(
         size_words(automaton),
         tuple(
             DrawnState(
                 state,
-                *places[state],
+                *positions[state],
                 state_words(automaton, state),
                 state in automaton.accepting,
                 state not in automaton.can_accept,
@@ -162,68 +164,69 @@ def guard_of(automaton: Automaton, move: DrawnMove) -> str:
     return "" if transition is None else automaton.guard_words(transition, LONGEST_GUARD)
 
 
-def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
+def _places(automaton: Automaton, drawn_states: Sequence[int]) -> Mapping[int, tuple[int, float]]:
     """Return the column and row of each state.
 
     Columns follow the transitions. The barycentre heuristic orders the rows, so that few transitions cross
     (Sugiyama, Tagawa and Toda, 1981).
     """
-    state_set = set(shown)
+    state_set = set(drawn_states)
     successors = {
         state: [successor for successor in automaton.successors[state] if successor in state_set]
-        for state in shown
+        for state in drawn_states
     }
-    column = _columns(successors, automaton.initial)
+    column_by_state = _columns(successors, automaton.initial)
     layers = [
-        [state for state in shown if column[state] == number] for number in range(max(column.values()) + 1)
+        [state for state in drawn_states if column_by_state[state] == column_number]
+        for column_number in range(max(column_by_state.values()) + 1)
     ]
-    row = {state: height for layer in layers for state, height in _heights(layer)}
+    row_by_state = {state: layer_row for layer in layers for state, layer_row in _heights(layer)}
     for _ in range(_SWEEPS):
         for layer in layers[1:]:
-            aims = {state: _middle(row, successors, state) for state in layer}
-            layer.sort(key=lambda state: (aims[state], state))
-            row |= dict(_heights(layer))
-    return {state: (column[state], row[state]) for state in shown}
+            mean_rows = {state: _middle(row_by_state, successors, state) for state in layer}
+            layer.sort(key=lambda state: (mean_rows[state], state))
+            row_by_state |= dict(_heights(layer))
+    return {state: (column_by_state[state], row_by_state[state]) for state in drawn_states}
 
 
 def _columns(successors: Mapping[int, Sequence[int]], initial: int) -> Mapping[int, int]:
     """Return the length of the longest path to each state, without back edges."""
     # lists suffice, because a drawing has at most `MOST_STATES` states
-    ended: list[int] = []
-    on_way: set[int] = set()
-    back: set[tuple[int, int]] = set()
+    finished_states: list[int] = []
+    path_states: set[int] = set()
+    back_edges: set[tuple[int, int]] = set()
     for root in [initial, *successors]:
-        stack = [] if root in ended else [(root, iter(successors[root]))]
-        on_way.update(state for state, _ in stack)
+        stack = [] if root in finished_states else [(root, iter(successors[root]))]
+        path_states.update(state for state, _ in stack)
         while stack:
             state, targets = stack[-1]
             target = next(targets, None)
             if target is None:
                 stack.pop()
-                on_way.discard(state)
-                ended.append(state)
-            elif target in on_way:
-                back.add((state, target))
-            elif target not in ended:
-                on_way.add(target)
+                path_states.discard(state)
+                finished_states.append(state)
+            elif target in path_states:
+                back_edges.add((state, target))
+            elif target not in finished_states:
+                path_states.add(target)
                 stack.append((target, iter(successors[target])))
-    column = dict.fromkeys(successors, 0)
-    for state in reversed(ended):
+    column_by_state = dict.fromkeys(successors, 0)
+    for state in reversed(finished_states):
         for target in successors[state]:
-            if (state, target) not in back:
-                column[target] = max(column[target], column[state] + 1)
-    return column
+            if (state, target) not in back_edges:
+                column_by_state[target] = max(column_by_state[target], column_by_state[state] + 1)
+    return column_by_state
 
 
 def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
     """Yield the states of a column with rows centred on 0."""
-    for place, state in enumerate(layer):
-        yield state, place - (len(layer) - 1) / 2.0
+    for position, state in enumerate(layer):
+        yield state, position - (len(layer) - 1) / 2.0
 
 
-def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
+def _middle(row_by_state: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
     """Return the mean row of a state's predecessors; its own row if it has none."""
     rows_before = [
-        row[source] for source, targets in successors.items() if source != state and state in targets
+        row_by_state[source] for source, targets in successors.items() if source != state and state in targets
     ]
-    return sum(rows_before) / len(rows_before) if rows_before else row[state]
+    return sum(rows_before) / len(rows_before) if rows_before else row_by_state[state]

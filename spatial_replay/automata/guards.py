@@ -57,7 +57,7 @@ class Diagrams:
         """
         self._nodes: list[Decision] = []
         self._numbers: dict[Decision, int] = {}
-        self._chosen: dict[tuple[int, int, int], int] = {}
+        self._choices: dict[tuple[int, int, int], int] = {}
         self._limit = limit
         # the constants come first, so that their nodes are `NO` and `YES`
         self.leaf(0), self.leaf(1)
@@ -88,13 +88,13 @@ class Diagrams:
             return otherwise
         if then == YES and otherwise == NO:
             return condition
-        key = (condition, then, otherwise)
-        result = self._chosen.get(key)
+        operands = (condition, then, otherwise)
+        result = self._choices.get(operands)
         if result is None:
             nodes = self._nodes
             variable = min(nodes[condition].variable, nodes[then].variable, nodes[otherwise].variable)
-            lows, highs = zip(*(self.branches(node, variable) for node in key), strict=True)
-            result = self._chosen[key] = self.decide(variable, self.choose(*lows), self.choose(*highs))
+            lows, highs = zip(*(self.branches(node, variable) for node in operands), strict=True)
+            result = self._choices[operands] = self.decide(variable, self.choose(*lows), self.choose(*highs))
         return result
 
     def both(self, first: int, second: int) -> int:
@@ -212,9 +212,9 @@ class Propositions:
         if shape in (YES, NO):
             # a tautology or contradiction, except where a relation and its opposite are both 0
             shape = self._shapes.of_text(formula)
-        negated = self._shapes.negate(shape)
-        if negated in self._numbers:
-            self._literals[id(formula)] = self._numbers[negated], False
+        negated_shape = self._shapes.negate(shape)
+        if negated_shape in self._numbers:
+            self._literals[id(formula)] = self._numbers[negated_shape], False
             return
         if shape not in self._numbers:
             self._numbers[shape] = len(self.all)
@@ -229,8 +229,8 @@ class Propositions:
         text = format_formula(formula)
         if all(proposition.text != text for proposition in self.all):
             return text
-        ends = {"given": " or there is no rate", "with": " and there is a rate"}
-        return f"({text}){ends.get(operator_of(formula), '')}"
+        suffixes = {"given": " or there is no rate", "with": " and there is a rate"}
+        return f"({text}){suffixes.get(operator_of(formula), '')}"
 
 
 def _maximal(formula: Formula) -> Iterator[Formula]:
@@ -250,19 +250,19 @@ class Shapes:
     def __init__(self) -> None:
         self._diagrams = Diagrams(MAX_SHAPES)
         self._variables: dict[object, int] = {}
-        self._known: dict[int, tuple[Formula, int]] = {}
+        self._nodes: dict[int, tuple[Formula, int]] = {}
 
     def of(self, formula: Formula) -> int:
         """Return the node of a formula without temporal operators."""
-        if id(formula) not in self._known:
+        if id(formula) not in self._nodes:
             try:
                 node = self._of(expand(formula))
             except (NoAutomatonError, RecursionError):
                 # too large for a comparison by meaning: only equal texts are recognized as equivalent
                 node = self.of_text(formula)
             # the formula is kept, so that its id stays its own
-            self._known[id(formula)] = formula, node
-        return self._known[id(formula)][1]
+            self._nodes[id(formula)] = formula, node
+        return self._nodes[id(formula)][1]
 
     def of_text(self, formula: Formula) -> int:
         """Return a node that only formulas of the same text share."""
@@ -292,10 +292,10 @@ class Shapes:
                 return reduce(lambda below, operand: join(operand, below), reversed(nodes))
             case Quantified():
                 # `exists x: a` is stored as `not forall x: not a`
-                body, is_every = self.of(without_variables(formula)), formula.quantifier == "forall"
-                key = len(formula.variables), formula.group, body if is_every else self.negate(body)
-                every = self._variable(key)
-                return every if is_every else self.negate(every)
+                body, is_universal = self.of(without_variables(formula)), formula.quantifier == "forall"
+                signature = len(formula.variables), formula.group, body if is_universal else self.negate(body)
+                universal = self._variable(signature)
+                return universal if is_universal else self.negate(universal)
             case Temporal():
                 raise ValueError(f"{formula.operator} is not an operator about one sample")
 
@@ -319,8 +319,8 @@ def _split_sign(atom: Atom) -> tuple[Expression, bool]:
             case Negative(operand=operand):
                 expression = operand
             # of `a - b` and `b - a`, the one that sorts first
-            case Sum(first=first, second=Negative(operand=operand)) if repr(operand) < repr(first):
-                expression = Sum(operand, Negative(first))
+            case Sum(first=minuend, second=Negative(operand=operand)) if repr(operand) < repr(minuend):
+                expression = Sum(operand, Negative(minuend))
             case _:
                 break
         is_positive = not is_positive
@@ -352,7 +352,7 @@ class Covers:
 
     def __init__(self, diagrams: Diagrams) -> None:
         self._diagrams = diagrams
-        self._known: dict[tuple[int, int], _Cover] = {}
+        self._covers: dict[tuple[int, int], _Cover] = {}
 
     def guard(self, node: int) -> Guard:
         """Return the cubes of a function.
@@ -371,11 +371,11 @@ class Covers:
         cubes: list[Cube] = []
         stack: list[tuple[int, Cube]] = [(node, ())]
         while stack and len(cubes) < FEW_CUBES:
-            current, cube = stack.pop()
-            variable, low, high = self._diagrams[current]
-            if current == YES:
+            current_node, cube = stack.pop()
+            variable, low, high = self._diagrams[current_node]
+            if current_node == YES:
                 cubes.append(cube)
-            elif current != NO:
+            elif current_node != NO:
                 stack += ((high, (*cube, (variable, True))), (low, (*cube, (variable, False))))
         return tuple(cubes)
 
@@ -385,25 +385,31 @@ class Covers:
             return _Cover(0, NO)
         if upper == YES:
             return _Cover(1, YES)
-        key = (lower, upper)
-        if key not in self._known:
-            self._known[key] = self._split(lower, upper)
-        return self._known[key]
+        bounds = (lower, upper)
+        if bounds not in self._covers:
+            self._covers[bounds] = self._split(lower, upper)
+        return self._covers[bounds]
 
     def _split(self, lower: int, upper: int) -> _Cover:
         diagrams = self._diagrams
         variable = min(diagrams[lower].variable, diagrams[upper].variable)
-        low_0, low_1 = diagrams.branches(lower, variable)
-        high_0, high_1 = diagrams.branches(upper, variable)
-        low = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
-        high = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
+        lower_false, lower_true = diagrams.branches(lower, variable)
+        upper_false, upper_true = diagrams.branches(upper, variable)
+        false_cover = self._between(diagrams.both(lower_false, diagrams.complement(upper_true)), upper_false)
+        true_cover = self._between(diagrams.both(lower_true, diagrams.complement(upper_false)), upper_true)
         # cubes without this variable cover the rest of `lower`
-        open_0 = diagrams.both(low_0, diagrams.complement(low.covered))
-        open_1 = diagrams.both(low_1, diagrams.complement(high.covered))
-        rest = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
-        decided = diagrams.decide(variable, low.covered, high.covered)
-        size = low.size + high.size + rest.size
-        return _Cover(size, diagrams.either(decided, rest.covered), (variable, low, high, rest))
+        uncovered_false = diagrams.both(lower_false, diagrams.complement(false_cover.union))
+        uncovered_true = diagrams.both(lower_true, diagrams.complement(true_cover.union))
+        free_cover = self._between(
+            diagrams.either(uncovered_false, uncovered_true), diagrams.both(upper_false, upper_true)
+        )
+        covered_decision = diagrams.decide(variable, false_cover.union, true_cover.union)
+        size = false_cover.size + true_cover.size + free_cover.size
+        return _Cover(
+            size,
+            diagrams.either(covered_decision, free_cover.union),
+            (variable, false_cover, true_cover, free_cover),
+        )
 
 
 class _Cover(NamedTuple):
@@ -411,23 +417,27 @@ class _Cover(NamedTuple):
 
     Attributes:
         size: number of cubes.
-        covered: disjunction of the cubes.
+        union: disjunction of the cubes.
         split: variable, then the cubes with it false, with it true, and without it. The variable itself is
             omitted from the cubes. None for no cube, and for only the empty cube.
     """
 
     size: int
-    covered: int
+    union: int
     split: tuple[int, _Cover, _Cover, _Cover] | None = None
 
 
 def _cubes_of(cover: _Cover) -> Iterator[Cube]:
-    waiting: list[tuple[_Cover, Cube]] = [(cover, ())]
-    while waiting:
-        (size, _, split), cube = waiting.pop()
+    stack: list[tuple[_Cover, Cube]] = [(cover, ())]
+    while stack:
+        (size, _, split), cube = stack.pop()
         if split is not None:
-            variable, low, high, rest = split
-            waiting += ((low, (*cube, (variable, False))), (high, (*cube, (variable, True))), (rest, cube))
+            variable, false_cover, true_cover, free_cover = split
+            stack += (
+                (false_cover, (*cube, (variable, False))),
+                (true_cover, (*cube, (variable, True))),
+                (free_cover, cube),
+            )
         elif size:
             yield cube
 
@@ -457,16 +467,16 @@ def guard_words(move: Transition, propositions: Sequence[Proposition], longest: 
     """
     if move.guard == ((),):
         return "true"
-    parts: list[str] = []
-    length = 0
+    cube_texts: list[str] = []
+    total_length = 0
     for cube in move.guard:
         text = " and ".join(propositions[number].literal(value) for number, value in cube)
-        parts.append(text if len(move.guard) == 1 or len(cube) == 1 else f"({text})")
-        length += len(parts[-1])
+        cube_texts.append(text if len(move.guard) == 1 or len(cube) == 1 else f"({text})")
+        total_length += len(cube_texts[-1])
         # further cubes would be cut off below
-        if longest is not None and length > longest:
+        if longest is not None and total_length > longest:
             break
-    words = " or ".join([*parts, "…"] if move.is_cut else parts)
+    words = " or ".join([*cube_texts, "…"] if move.is_cut else cube_texts)
     return words if longest is None or len(words) <= longest else f"{words[: longest - 1].rstrip()}…"
 
 
@@ -477,16 +487,16 @@ class Moves:
         """Convert `entries` and `decisions` of an automaton."""
         self._diagrams = Diagrams()
         self._covers = Covers(self._diagrams)
-        places: list[int] = []
+        decision_nodes: list[int] = []
 
         def node(place: int) -> int:
-            return self._diagrams.leaf(~place) if place < 0 else places[place]
+            return self._diagrams.leaf(~place) if place < 0 else decision_nodes[place]
 
         for proposition, low, high in decisions:
-            places.append(self._diagrams.decide(proposition, node(low), node(high)))
+            decision_nodes.append(self._diagrams.decide(proposition, node(low), node(high)))
         self._nodes = tuple(node(place) for place in entries)
         self._successors: dict[int, tuple[int, ...]] = {}
-        self._leading: dict[int, dict[int, int]] = {}
+        self._conditions: dict[int, dict[int, int]] = {}
         self._transitions: dict[tuple[int, int], Transition] = {}
 
     def __len__(self) -> int:
@@ -501,41 +511,41 @@ class Moves:
 
     def transition(self, source: int, target: int) -> Transition:
         """Return the transition from a state to one of its successors."""
-        key = (source, target)
-        if key not in self._transitions:
-            node = self._to(target, self._nodes[source], self._leading.setdefault(target, {}))
+        ends = (source, target)
+        if ends not in self._transitions:
+            condition = self._to(target, self._nodes[source], self._conditions.setdefault(target, {}))
             try:
-                move = Transition(source, self._covers.guard(node), target)
+                move = Transition(source, self._covers.guard(condition), target)
             except NoAutomatonError:
-                move = Transition(source, self._covers.some(node), target, is_cut=True)
-            self._transitions[key] = move
-        return self._transitions[key]
+                move = Transition(source, self._covers.some(condition), target, is_cut=True)
+            self._transitions[ends] = move
+        return self._transitions[ends]
 
     def _leaves(self, node: int) -> set[int]:
-        visited = {node}
-        leaves = set()
+        visited_nodes = {node}
+        states = set()
         stack = [node]
         while stack:
             variable, low, high = self._diagrams[stack.pop()]
             if variable == LEAF:
-                leaves.add(low)
+                states.add(low)
                 continue
             for branch in (low, high):
-                if branch not in visited:
-                    visited.add(branch)
+                if branch not in visited_nodes:
+                    visited_nodes.add(branch)
                     stack.append(branch)
-        return leaves
+        return states
 
-    def _to(self, target: int, node: int, known: dict[int, int]) -> int:
+    def _to(self, target: int, node: int, conditions: dict[int, int]) -> int:
         """Return the condition under which a node leads to a state."""
-        if node not in known:
+        if node not in conditions:
             variable, low, high = self._diagrams[node]
             if variable == LEAF:
-                known[node] = YES if low == target else NO
+                conditions[node] = YES if low == target else NO
             else:
-                branches = self._to(target, low, known), self._to(target, high, known)
-                known[node] = self._diagrams.decide(variable, *branches)
-        return known[node]
+                branches = self._to(target, low, conditions), self._to(target, high, conditions)
+                conditions[node] = self._diagrams.decide(variable, *branches)
+        return conditions[node]
 
 
 class Successors(Sequence[tuple[int, ...]]):
@@ -549,7 +559,7 @@ class Successors(Sequence[tuple[int, ...]]):
 
     def __getitem__(self, state: Any) -> Any:
         if isinstance(state, slice):
-            return tuple(self[place] for place in range(len(self))[state])
+            return tuple(self[number] for number in range(len(self))[state])
         if not -len(self) <= state < len(self):
             raise IndexError(f"no state {state}; there are 0 to {len(self) - 1}")
         return self._moves.successors(state % len(self))

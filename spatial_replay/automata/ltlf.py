@@ -87,12 +87,12 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
 
     Its place is the operator with the widest window or, without windows, the whole formula.
     """
-    place = max(_temporal(spec.formula), key=_width, default=spec.formula)
-    if not _width(place):
-        place = _without_names(spec.formula)
-    message = f"`{operator_text(place)}` leaves {spec.name} without an automaton: {reason}"
+    widest_node = max(_temporal(spec.formula), key=_width, default=spec.formula)
+    if not _width(widest_node):
+        widest_node = _without_names(spec.formula)
+    message = f"`{operator_text(widest_node)}` leaves {spec.name} without an automaton: {reason}"
     hint = "for an automaton, write smaller bounds, or split it into several specs"
-    return obstacle(source, place, message, hint)
+    return obstacle(source, widest_node, message, hint)
 
 
 def obstacle(
@@ -192,11 +192,11 @@ class Skeleton:
         self._propositions = propositions
         self._source = source
         self.chains: dict[tuple[int, bool], int] = {}
-        self._known: dict[tuple[int, bool], int] = {}
+        self._formula_numbers: dict[tuple[int, bool], int] = {}
         # messages name the operators of the text, not those of their expansions
-        self._written = {id(node) for node in _temporal(formula)}
+        self._written_ids = {id(node) for node in _temporal(formula)}
         self._operator: Formula | None = None
-        self._unrolled: Formula | None = None
+        self._unrolled_operator: Formula | None = None
         # the constants come first, so that their numbers are `FALSE` and `TRUE`
         self._node("false"), self._node("true")
         self.root = self._of(formula, True)
@@ -212,10 +212,10 @@ class Skeleton:
             case "and" | "or":
                 return kind, self._operands(kind, number)
             case "R" | "U":
-                over: Literal["and", "or"] = "and" if kind == "R" else "or"
-                parts = self._operands(over, second)
-                if len(parts) > 1:
-                    return over, tuple(self._node(kind, first, part) for part in parts)
+                connective: Literal["and", "or"] = "and" if kind == "R" else "or"
+                operands = self._operands(connective, second)
+                if len(operands) > 1:
+                    return connective, tuple(self._node(kind, first, operand) for operand in operands)
         return "and", (number,)
 
     def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
@@ -223,79 +223,82 @@ class Skeleton:
         operands: dict[int, None] = {}
         stack = [number]
         while stack:
-            current = self.nodes[stack.pop()]
-            if current.kind == kind:
-                stack += (current.second, current.first)
+            node = self.nodes[stack.pop()]
+            if node.kind == kind:
+                stack += (node.second, node.first)
             else:
-                operands[self._numbers[current]] = None
+                operands[self._numbers[node]] = None
         return tuple(operands)
 
-    def _of(self, formula: Formula, positive: bool) -> int:
+    def _of(self, formula: Formula, is_positive: bool) -> int:
         """Return the number of a formula, or of its negation."""
         proposition = self._propositions.literal(formula)
         if proposition is not None:
-            number, value = proposition
-            return self._node("literal", number, int(value == positive))
-        outer = self._operator
-        if id(formula) in self._written:
+            number, is_affirmed = proposition
+            return self._node("literal", number, int(is_affirmed == is_positive))
+        outer_operator = self._operator
+        if id(formula) in self._written_ids:
             self._operator = formula
         formula = expand(formula)
         # the formula keeps its expansion in memory, so the id of the expansion stays valid
-        key = (id(formula), positive)
-        if key not in self._known:
-            self._known[key] = self._build(formula, positive)
-        self._operator = outer
-        return self._known[key]
+        formula_key = (id(formula), is_positive)
+        if formula_key not in self._formula_numbers:
+            self._formula_numbers[formula_key] = self._build(formula, is_positive)
+        self._operator = outer_operator
+        return self._formula_numbers[formula_key]
 
-    def _build(self, formula: Formula, positive: bool) -> int:
+    def _build(self, formula: Formula, is_positive: bool) -> int:
         match formula:
             case Truth():
-                return TRUE if formula.value == positive else FALSE
+                return TRUE if formula.value == is_positive else FALSE
             case Boolean(operator="not"):
-                return self._of(formula.operands[0], not positive)
+                return self._of(formula.operands[0], not is_positive)
             case Boolean():
-                join = self._both if (formula.operator == "and") == positive else self._either
-                return reduce(join, [self._of(operand, positive) for operand in formula.operands])
+                join = self._both if (formula.operator == "and") == is_positive else self._either
+                return reduce(join, [self._of(operand, is_positive) for operand in formula.operands])
             case Temporal():
-                operands = [self._of(operand, positive) for operand in formula.operands]
-                return self._temporal(formula, operands, positive)
+                operands = [self._of(operand, is_positive) for operand in formula.operands]
+                return self._temporal(formula, operands, is_positive)
         raise ValueError(f"{formula!r} is not a proposition")
 
-    def _temporal(self, formula: Temporal, operands: list[int], positive: bool) -> int:
-        self._unrolled = self._operator
+    def _temporal(self, formula: Temporal, operands: list[int], is_positive: bool) -> int:
+        self._unrolled_operator = self._operator
         # a negated until is a release, and a negated release is an until (strong)
-        strong = (formula.operator != "G") == positive
+        is_strong = (formula.operator != "G") == is_positive
         if formula.operator == "X":
-            return self._next(operands[0], strong)
-        left = operands[0] if formula.operator == "U" else TRUE if strong else FALSE
+            return self._next(operands[0], is_strong)
+        left_operand = operands[0] if formula.operator == "U" else TRUE if is_strong else FALSE
         bound = formula.bound
         if bound is not None and _counts_seconds(bound) and self._rate_hz is not None:
             bound = in_samples(bound, self._rate_hz)
-        return self._within(left, operands[-1], bound, strong)
+        return self._within(left_operand, operands[-1], bound, is_strong)
 
-    def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
+    def _within(self, left_operand: int, right_operand: int, bound: Bound | None, is_strong: bool) -> int:
         """Unroll an until (`strong`) or a release over a window."""
         lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
         # checked before the loops, which take a step for each sample of the window
         if max(lower, upper or 0) > MAX_NODES:
             raise self._too_large()
-        hold, free = (self._both, self._either) if strong else (self._either, self._both)
+        join_left, join_right = (self._both, self._either) if is_strong else (self._either, self._both)
         if upper is None:
-            result = self._node("U" if strong else "R", left, right)
+            result = self._node("U" if is_strong else "R", left_operand, right_operand)
         else:
-            result = right
+            result = right_operand
             for _ in range(upper - lower):
-                shorter, result = result, free(right, hold(left, self._next(result, strong)))
+                shorter, result = (
+                    result,
+                    join_right(right_operand, join_left(left_operand, self._next(result, is_strong))),
+                )
                 if result != shorter:
-                    self.chains.setdefault((shorter, strong), result)
+                    self.chains.setdefault((shorter, is_strong), result)
         for _ in range(lower):
-            result = hold(left, self._next(result, strong))
+            result = join_left(left_operand, self._next(result, is_strong))
         return result
 
-    def _next(self, operand: int, strong: bool) -> int:
-        if operand == (FALSE if strong else TRUE):
+    def _next(self, operand: int, is_strong: bool) -> int:
+        if operand == (FALSE if is_strong else TRUE):
             return operand
-        return self._node("X" if strong else "WX", operand)
+        return self._node("X" if is_strong else "WX", operand)
 
     def _both(self, first: int, second: int) -> int:
         return self._join("and", first, second, neutral=TRUE, final=FALSE)
@@ -323,7 +326,7 @@ class Skeleton:
         return self._numbers[node]
 
     def _too_large(self) -> NoAutomatonError:
-        place = self._unrolled
-        what = "the formula" if place is None else f"`{operator_text(place)}`"
-        message = f"with {what} unrolled into steps, there are more than {MAX_NODES} subformulas"
-        return obstacle(self._source, place, message, "for an automaton, write smaller bounds")
+        operator = self._unrolled_operator
+        subject = "the formula" if operator is None else f"`{operator_text(operator)}`"
+        message = f"with {subject} unrolled into steps, there are more than {MAX_NODES} subformulas"
+        return obstacle(self._source, operator, message, "for an automaton, write smaller bounds")

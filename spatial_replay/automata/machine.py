@@ -41,31 +41,31 @@ class Machine:
 
 def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[bool], start: int) -> Machine:
     """Convert moves, which are nodes of diagrams with states as leaves, into a machine."""
-    places: list[int] = []
-    rows: list[tuple[int, int, int]] = []
+    places_by_node: list[int] = []
+    decision_rows: list[tuple[int, int, int]] = []
     for node in range(len(diagrams)):
         variable, low, high = diagrams[node]
         if variable == LEAF:
-            places.append(~low)
+            places_by_node.append(~low)
         else:
-            places.append(len(rows))
-            rows.append((variable, places[low], places[high]))
-    return _machine([places[node] for node in moves], rows, accepting, places[start])
+            places_by_node.append(len(decision_rows))
+            decision_rows.append((variable, places_by_node[low], places_by_node[high]))
+    return _machine([places_by_node[node] for node in moves], decision_rows, accepting, places_by_node[start])
 
 
 def _machine(
-    moves: Sequence[int], rows: Sequence[tuple[int, int, int]], accepting: Sequence[bool], start: int
+    moves: Sequence[int], decision_rows: Sequence[tuple[int, int, int]], accepting: Sequence[bool], start: int
 ) -> Machine:
-    decisions = np.array(rows, np.int64).reshape(-1, 3)
+    decisions = np.array(decision_rows, np.int64).reshape(-1, 3)
     return Machine(np.array(moves, np.int64), decisions, np.array(accepting, np.bool_), start)
 
 
 def merge_equivalent_states(machine: Machine) -> Machine:
     """Return a machine that accepts the same runs and has no equivalent states."""
-    _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
-    places, decisions = _relabel(machine, classes)
-    moves = places[machine.moves[firsts]]
-    return Machine(moves, decisions, machine.accepting[firsts], int(places[machine.start]))
+    _, class_members, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
+    new_places, decisions = _relabel(machine, classes)
+    moves = new_places[machine.moves[class_members]]
+    return Machine(moves, decisions, machine.accepting[class_members], int(new_places[machine.start]))
 
 
 def least(machine: Machine) -> Machine:
@@ -78,40 +78,40 @@ def least(machine: Machine) -> Machine:
     machine = merge_equivalent_states(machine)
     reachable = _reachable(machine)
     # compilers differ in their unreachable states, so these are dropped
-    same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
-    if len(same):
+    start_states = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
+    if len(start_states):
         # argmin prefers False: a state that does not accept
-        first = int(same[np.argmin(machine.accepting[same])])
+        start_state = int(start_states[np.argmin(machine.accepting[start_states])])
     else:
-        first = len(machine.moves)
+        start_state = len(machine.moves)
         moves, accepting = np.append(machine.moves, machine.start), np.append(machine.accepting, False)
         machine = Machine(moves, machine.decisions, accepting, machine.start)
-    return _select_states(machine, [first, *(state for state in reachable if state != first)])
+    return _select_states(machine, [start_state, *(state for state in reachable if state != start_state)])
 
 
 def _reachable(machine: Machine) -> list[int]:
     """Return the reachable states by distance; at equal distance, false branches come before true ones."""
-    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
-    order: dict[int, None] = {}
-    waiting: list[int] = []
+    moves, decision_rows = machine.moves.tolist(), machine.decisions.tolist()
+    visited_states: dict[int, None] = {}
+    states: list[int] = []
     # a decision that was visited leads to no new state
-    visited = [False] * len(rows)
+    visited_rows = [False] * len(decision_rows)
     stack = [machine.start]
-    expanded = 0
+    expanded_count = 0
     while stack:
         place = stack.pop()
         if place < 0:
-            if ~place not in order:
-                order[~place] = None
-                waiting.append(~place)
-        elif not visited[place]:
-            visited[place] = True
-            _, low, high = rows[place]
+            if ~place not in visited_states:
+                visited_states[~place] = None
+                states.append(~place)
+        elif not visited_rows[place]:
+            visited_rows[place] = True
+            _, low, high = decision_rows[place]
             stack += (high, low)
-        if not stack and expanded < len(waiting):
-            stack.append(moves[waiting[expanded]])
-            expanded += 1
-    return waiting
+        if not stack and expanded_count < len(states):
+            stack.append(moves[states[expanded_count]])
+            expanded_count += 1
+    return states
 
 
 def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
@@ -119,28 +119,28 @@ def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
 
     No move of these states may lead to any other state.
     """
-    numbers = {state: number for number, state in enumerate(states)}
-    rows = machine.decisions.tolist()
-    places: dict[int, int] = {}
+    new_numbers = {state: number for number, state in enumerate(states)}
+    decision_rows = machine.decisions.tolist()
+    new_places: dict[int, int] = {}
     decisions: list[tuple[int, int, int]] = []
 
-    def place(before: int) -> int:
-        if before < 0:
-            return ~numbers[~before]
-        after = places.get(before)
-        if after is None:
-            variable, low, high = rows[before]
+    def place(old_place: int) -> int:
+        if old_place < 0:
+            return ~new_numbers[~old_place]
+        new_place = new_places.get(old_place)
+        if new_place is None:
+            variable, low, high = decision_rows[old_place]
             row = (variable, place(low), place(high))
-            after = places[before] = len(decisions)
+            new_place = new_places[old_place] = len(decisions)
             decisions.append(row)
-        return after
+        return new_place
 
-    moves = [place(before) for before in machine.moves[np.array(states, np.int64)].tolist()]
+    moves = [place(old_place) for old_place in machine.moves[np.array(states, np.int64)].tolist()]
     start = place(machine.start)
     return _machine(moves, decisions, machine.accepting[np.array(states, np.int64)].tolist(), start)
 
 
-def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
+def _relabel(machine: Machine, new_numbers: Integers) -> tuple[Integers, Integers]:
     """Renumber the states, and merge decisions that become equal.
 
     Returns:
@@ -148,24 +148,28 @@ def _relabel(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
         array from its end.
     """
     decisions = machine.decisions
-    places = np.concatenate([np.empty(len(decisions), np.int64), ~numbers[::-1]])
-    span = len(places) + 1
+    places = np.concatenate([np.empty(len(decisions), np.int64), ~new_numbers[::-1]])
+    place_span = len(places) + 1
     levels: list[Integers] = []
-    count = 0
+    decision_count = 0
     # rows of later propositions first, because rows of earlier propositions refer to them
-    for rows in _levels(decisions):
-        variable = decisions[rows[0], 0]
-        low, high = places[decisions[rows, 1]], places[decisions[rows, 2]]
-        places[rows] = low
-        differ = low != high
+    for level_rows in _levels(decisions):
+        variable = decisions[level_rows[0], 0]
+        low, high = places[decisions[level_rows, 1]], places[decisions[level_rows, 2]]
+        places[level_rows] = low
+        is_needed = low != high
         # each pair of places as one integer; places of states are negative, hence the span
-        keys = (low[differ] + span) * (2 * span) + high[differ] + span
-        kinds, firsts, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        places[rows[differ]] = count + inverse.ravel()
-        level = np.empty((len(kinds), 3), np.int64)
-        level[:, 0], level[:, 1], level[:, 2] = variable, low[differ][firsts], high[differ][firsts]
+        pair_keys = (low[is_needed] + place_span) * (2 * place_span) + high[is_needed] + place_span
+        distinct_keys, first_rows, key_ranks = np.unique(pair_keys, return_index=True, return_inverse=True)
+        places[level_rows[is_needed]] = decision_count + key_ranks.ravel()
+        level = np.empty((len(distinct_keys), 3), np.int64)
+        level[:, 0], level[:, 1], level[:, 2] = (
+            variable,
+            low[is_needed][first_rows],
+            high[is_needed][first_rows],
+        )
         levels.append(level)
-        count += len(kinds)
+        decision_count += len(distinct_keys)
     return places, np.concatenate(levels) if levels else np.empty((0, 3), np.int64)
 
 
@@ -173,9 +177,9 @@ def _levels(decisions: Integers) -> Iterator[Integers]:
     """Yield the rows of each proposition, from the last proposition to the first."""
     if not len(decisions):
         return
-    order = np.argsort(-decisions[:, 0], kind="stable")
-    bounds = np.flatnonzero(np.diff(decisions[order, 0])) + 1
-    yield from np.split(order, bounds)
+    row_order = np.argsort(-decisions[:, 0], kind="stable")
+    level_starts = np.flatnonzero(np.diff(decisions[row_order, 0])) + 1
+    yield from np.split(row_order, level_starts)
 
 
 def _split_classes(machine: Machine) -> list[int]:
@@ -185,14 +189,14 @@ def _split_classes(machine: Machine) -> list[int]:
     all members of a class lead to the same classes. The largest part of a class keeps its number, so that
     few states are checked again (Hopcroft, 1971).
     """
-    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
+    moves, decision_rows = machine.moves.tolist(), machine.decisions.tolist()
     classes: list[int] = machine.accepting.astype(np.int64).tolist()
-    parts: list[dict[int, set[int]]] = [{}, {}]
-    leading: dict[int, int] = {}
-    above = above_of(moves, rows)
+    class_parts: list[dict[int, set[int]]] = [{}, {}]
+    node_by_state: dict[int, int] = {}
+    parents = above_of(moves, decision_rows)
     diagrams = Diagrams()
-    pending: Collection[int] = range(len(classes))
-    while pending:
+    pending_states: Collection[int] = range(len(classes))
+    while pending_states:
         copies: dict[int, int] = {}
 
         # the default binds the dictionary of this round
@@ -200,50 +204,54 @@ def _split_classes(machine: Machine) -> list[int]:
             if place < 0:
                 return diagrams.leaf(classes[~place])
             if place not in copies:
-                variable, low, high = rows[place]
+                variable, low, high = decision_rows[place]
                 copies[place] = diagrams.decide(variable, copy(low), copy(high))
             return copies[place]
 
-        for state in pending:
-            parts_of_class = parts[classes[state]]
-            if state in leading:
-                parts_of_class[leading[state]].remove(state)
-                if not parts_of_class[leading[state]]:
-                    del parts_of_class[leading[state]]
-            leading[state] = copy(moves[state])
-            parts_of_class.setdefault(leading[state], set()).add(state)
-        moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
-        pending = sources_of(above, moved)
+        for state in pending_states:
+            parts_of_class = class_parts[classes[state]]
+            if state in node_by_state:
+                parts_of_class[node_by_state[state]].remove(state)
+                if not parts_of_class[node_by_state[state]]:
+                    del parts_of_class[node_by_state[state]]
+            node_by_state[state] = copy(moves[state])
+            parts_of_class.setdefault(node_by_state[state], set()).add(state)
+        changed_states = _split(
+            class_parts, classes, dict.fromkeys(classes[state] for state in pending_states)
+        )
+        pending_states = sources_of(parents, changed_states)
     return classes
 
 
-def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:
+def _split(
+    class_parts: list[dict[int, set[int]]], classes: list[int], candidates: Iterable[int]
+) -> list[int]:
     """Split classes into their parts, and return the states with a new class.
 
     The largest part of a class keeps the number of the class.
     """
-    moved: list[int] = []
-    for number in touched:
-        parts_of_class = parts[number]
+    changed_states: list[int] = []
+    for class_number in candidates:
+        parts_of_class = class_parts[class_number]
         largest = max(parts_of_class, key=lambda node: len(parts_of_class[node]))
         for node in [part for part in parts_of_class if part != largest]:
             members = parts_of_class.pop(node)
             for state in members:
-                classes[state] = len(parts)
-            parts.append({node: members})
-            moved += sorted(members)
-    return moved
+                classes[state] = len(class_parts)
+            class_parts.append({node: members})
+            changed_states += sorted(members)
+    return changed_states
 
 
 def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
     """Return the parents of each place: indices of rows, and ~q for a state q whose moves begin there."""
-    above: dict[int, list[int]] = {}
-    for number, (_, low, high) in enumerate(rows):
-        above.setdefault(low, []).append(number)
-        above.setdefault(high, []).append(number)
+    parents: dict[int, list[int]] = {}
+    for row_number, (_, low, high) in enumerate(rows):
+        parents.setdefault(low, []).append(row_number)
+        parents.setdefault(high, []).append(row_number)
     for state, place in enumerate(moves):
-        above.setdefault(place, []).append(~state)
-    return above
+        parents.setdefault(place, []).append(~state)
+    return parents
 
 
 def sources_of(
@@ -256,13 +264,13 @@ def sources_of(
         visited: rows to skip; rows that are followed are added to this set.
     """
     sources: dict[int, None] = {}
-    seen = set() if visited is None else visited
-    stack = [~target for target in targets]
-    while stack:
-        for parent_row in above.get(stack.pop(), ()):
+    visited_rows = set() if visited is None else visited
+    pending_places = [~target for target in targets]
+    while pending_places:
+        for parent_row in above.get(pending_places.pop(), ()):
             if parent_row < 0:
                 sources[~parent_row] = None
-            elif parent_row not in seen:
-                seen.add(parent_row)
-                stack.append(parent_row)
+            elif parent_row not in visited_rows:
+                visited_rows.add(parent_row)
+                pending_places.append(parent_row)
     return sources
