@@ -41,11 +41,11 @@ MAX_LISTED = 100_000
 MOST_STATES = 60
 """Maximum number of states in a drawing, and in a text that cannot list all transitions."""
 MOST_MOVES = 300
-"""Maximum number of transitions in such a drawing or text."""
+"""Maximum number of transitions in a drawing, and in a text that cannot list all transitions."""
 LONGEST_GUARD = 300
-"""Maximum length of a guard in such a drawing or text, characters."""
+"""Maximum length of a guard in a drawing, and in a text that cannot list all transitions, characters."""
 _LONGEST_LABEL = 12
-"""Maximum length of a proposition that is written on an arrow, characters."""
+"""Maximum length of a proposition's label on an arrow, characters."""
 _WIDTH = 20
 """Line length from which an arrow's label is wrapped, characters."""
 _LEGEND_WIDTH = 100
@@ -57,17 +57,17 @@ class Automaton(Displayed):
     """The minimal deterministic automaton of a formula over finite runs.
 
     Equal automata accept the same runs. Every state has a move for every symbol. State 0 is the state before
-    the first sample; later samples may lead back to it. The other states are numbered by their distance from
-    state 0.
+    the first sample. Later samples may lead back to state 0. The other states are numbered by their distance
+    from state 0.
 
     Attributes:
         name: name of the spec.
         propositions: propositions that the automaton reads; a *symbol* has the value of each in a sample.
-        accepting: states in which a run must end to satisfy the formula. For state 0 this matters only if
-            samples lead back to it, because no run is empty.
-        entries: for each state, the index of its first decision, or ~q if every symbol leads to state q.
-        decisions: rows (proposition, next place if it is false, next place if it is true). A place is an
-            index or ~q, as in `entries`, and decides on a later proposition.
+        accepting: states in which a run must end to satisfy the formula. Acceptance of state 0 matters only
+            if samples lead back to state 0, because no run is empty.
+        entries: for each state, the index of its first decision; ~q if every symbol leads to state q.
+        decisions: rows (proposition, next place if the proposition is false, next place if it is true). A
+            place is the index of a row, or ~q for state q. The next row decides on a later proposition.
     """
 
     name: str
@@ -87,8 +87,8 @@ class Automaton(Displayed):
         """All transitions, sorted by source and target; the guards of one source are disjoint.
 
         Raises:
-            NoAutomatonError: more than 100 000 transitions, or cubes in their guards. `iter_transitions`,
-                `successors` and `transition` compute them one by one.
+            NoAutomatonError: more than 100 000 transitions, or more than 100 000 cubes in their guards.
+                `iter_transitions`, `successors` and `transition` have no such limit.
         """
         transitions, cube_count = [], 0
         for transition in self.iter_transitions():
@@ -105,7 +105,7 @@ class Automaton(Displayed):
 
     @cached_property
     def is_listable(self) -> bool:
-        """Whether `transitions` raises no error."""
+        """Whether `transitions` can list all transitions without an error."""
         # the count of transitions needs no guards, which take longer to compute
         transition_count = 0
         for state in self.states:
@@ -118,7 +118,7 @@ class Automaton(Displayed):
             return False
 
     def iter_transitions(self) -> Iterator[Transition]:
-        """Iterate over all transitions, sorted by source and target; each is computed when it is consumed."""
+        """Iterate over all transitions, sorted by source and target; a transition is computed on demand."""
         moves = self._moves
         return (
             moves.transition(state, target) for state in self.states for target in moves.successors(state)
@@ -139,12 +139,12 @@ class Automaton(Displayed):
 
     @cached_property
     def can_accept(self) -> frozenset[int]:
-        """The states from which an accepting state can be reached; the others are traps."""
+        """The states that can reach an accepting state; all other states are traps."""
         return frozenset(self.distances)
 
     @cached_property
     def distances(self) -> Mapping[int, int]:
-        """The least number of samples to an accepting state, for each state that can reach one."""
+        """The least number of samples from each state to an accepting state; traps are missing."""
         return self._distances(self._ends(self.accepting))
 
     @cached_property
@@ -169,7 +169,7 @@ class Automaton(Displayed):
         return ~place
 
     def step_set(self, states: Collection[int], symbol: Sequence[bool | None]) -> frozenset[int]:
-        """Return the states that one sample may lead to from any of `states`.
+        """Return the possible states after one sample, for a run that is in any of `states`.
 
         Args:
             symbol: value of each proposition, None if it is unknown.
@@ -217,7 +217,7 @@ class Automaton(Displayed):
     def paths(
         self, state: int, without: Collection[tuple[int, int]] = ()
     ) -> Iterator[tuple[Transition, ...]]:
-        """Yield the shortest paths from a state to an accepting state; each is computed when it is consumed.
+        """Yield the shortest paths from a state to an accepting state; a path is computed on demand.
 
         The path from an accepting state is empty. A trap has no path.
 
@@ -284,7 +284,7 @@ class Automaton(Displayed):
 
         The format describes infinite runs and has no acceptance condition for finite runs. The accepting
         states are therefore acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a
-        state of that set. The header `finite-runs` says so, and readers may ignore it.
+        state of that set. The header `finite-runs` states this condition. Readers may ignore the header.
 
         Raises:
             UsageError: there are too many transitions to list.
@@ -325,8 +325,8 @@ class Automaton(Displayed):
     def _distances(
         self, goal_states: Collection[int], without: Collection[tuple[int, int]] = ()
     ) -> dict[int, int]:
-        """Return the least number of samples to a goal state, for each state that can reach one."""
-        # transitions to avoid are few, so the other transitions of their sources are followed one by one
+        """Map each state that can reach a goal state to the least number of samples that this takes."""
+        # few transitions are avoided, so the remaining transitions of their sources are followed one by one
         avoided_targets: dict[int, set[int]] = {}
         for source, target in without:
             if source in self.states:
@@ -351,7 +351,7 @@ class Automaton(Displayed):
         return distances
 
     def _ends(self, states: frozenset[int]) -> frozenset[int]:
-        """Return these states without the initial state, unless a run can end in it."""
+        """Drop the initial state from `states` if no run can end in it."""
         return states if self.has_returns else states - {self.initial}
 
     def _check(self, state: int, symbol: Sequence[object]) -> None:
@@ -442,7 +442,7 @@ def _spread(
     proposition_values: Flags,
     result: NDArray[np.bool_],
 ) -> None:
-    # sample of the last visit of each decision: states share decisions, which are followed once per sample
+    # sample in which each decision was last visited: a decision that states share is followed once per sample
     last_visits = np.full(decisions.shape[0], -1, np.int64)
     # each visited decision adds at most one entry to the stack
     stack = np.empty(decisions.shape[0] + 2, np.int64)
@@ -501,7 +501,7 @@ def size_words(automaton: Automaton) -> str:
 
 
 def state_words(automaton: Automaton, state: int) -> str:
-    """Return the verdict of a run that ends in a state, and whether it can change."""
+    """Return the verdict of a run that ends in a state, and whether the verdict can change."""
     prefix = "start, " if state == automaton.initial else ""
     if state == automaton.initial and not automaton.has_returns:
         return f"{prefix}before the first sample"
@@ -569,7 +569,7 @@ def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
 
 
 def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
-    """Return the transitions from each drawn state to other drawn states."""
+    """Return the transitions between drawn states, by source."""
     shown_states = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
     state_pairs = [
         (state, target)

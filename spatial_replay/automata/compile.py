@@ -35,7 +35,7 @@ from spatial_replay.text import named_arguments
 _MAX_DEPTH = 220
 """Maximum depth of nested operators: ltlf2dfa recurses, and fails beyond 243."""
 _MAX_SIZE = 20_000
-"""Maximum number of subformulas to translate, counted as often as they are written; about two seconds."""
+"""Maximum number of subformulas to translate, with repetitions; their translation takes about 2 s."""
 
 _SIGNS: MappingProxyType[Kind, str] = MappingProxyType({"and": "&", "or": "|", "U": "U", "R": "R"})
 
@@ -112,7 +112,7 @@ def _text(nodes: Sequence[Node], number: int) -> str:
 
 @cache
 def _parser() -> Callable[[str], object]:
-    """Return the cached parser of LTLf, because its construction takes longer than its use."""
+    """Return the parser of LTLf, cached because its construction takes longer than a parse."""
     from ltlf2dfa.parser.ltlf import LTLfParser
 
     parser: Callable[[str], object] = LTLfParser()
@@ -211,14 +211,14 @@ def _exchange(process: subprocess.Popen[bytes], program: bytes) -> bytes:
 
 
 class _Cube(NamedTuple):
-    """Moves of a state: for each proposition, "0" if it must be false, "1" if it must be true, else "X"."""
+    """Moves of a state; `symbol` has a letter for each proposition: "0" false, "1" true, "X" any value."""
 
     symbol: str
     target: int
 
 
 def _machine(output: str, proposition_count: int) -> Machine:
-    """Parse the automaton that MONA printed; its state 0 only leads to the state in which a run begins."""
+    """Parse the automaton that MONA printed; MONA's state 0 only leads to the state in which a run begins."""
     header, accepting, state_count_match = (
         pattern.search(output) for pattern in (_HEADER, _ACCEPTING, _COUNT)
     )
@@ -247,7 +247,7 @@ def _machine(output: str, proposition_count: int) -> Machine:
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
-    """Return the diagram of disjoint cubes that cover all symbols, deciding from `variable` on."""
+    """Return the diagram of disjoint cubes that cover all symbols; earlier variables are decided."""
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
@@ -267,13 +267,15 @@ Obligation: TypeAlias = tuple[int, bool]
 
 
 class Chain(NamedTuple):
-    """Obligations in an order in which each implies the next.
+    """Obligations in an order in which each obligation implies the next.
+
+    The variables of a chain encode the number of failing members in binary, most significant bit first.
 
     Attributes:
-        members: numbers of their subformulas.
+        members: numbers of the obligations' subformulas.
         strong: whether there must be a next sample.
-        first: first of the variables that encode the number of failing members in binary.
-        bits: number of these variables; the most significant bit comes first.
+        first: first variable.
+        bits: number of variables.
     """
 
     members: tuple[int, ...]
@@ -299,13 +301,13 @@ class Obligations:
         self._chain_places: dict[Obligation, tuple[Chain, int]] = {}
 
     def diagram(self, obligation: Obligation) -> int:
-        """Return the diagram of an obligation: true where it is met."""
+        """Return the diagram of an obligation: true iff the obligation is met."""
         if obligation not in self._chain_places:
             self._begin(obligation)
         chain, member_index = self._chain_places[obligation]
         node = YES
         for bit in range(chain.bits):
-            # a member holds iff only earlier members fail, so iff their count is at most its index
+            # a member holds iff only earlier members fail: iff at most `member_index` members fail
             branches = (YES, node) if member_index >> bit & 1 else (node, NO)
             node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
         return node
@@ -318,8 +320,8 @@ class Obligations:
         """Split a function into cases by the number of failing members of its first chain.
 
         Returns:
-            Pairs of an ascending count and a function. A function applies if fewer members fail than its
-            count, and at least as many as the previous count.
+            Pairs (count, function) with ascending counts. A function applies if the number of failing members
+            is below its count, and not below the previous count.
         """
         cases: list[tuple[int, int]] = []
         count_limit = 0
@@ -331,7 +333,7 @@ class Obligations:
         return cases
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
-        """Yield the remaining functions, each with the number of consecutive counts to which it applies."""
+        """Yield pairs: a number of consecutive counts, and the function that applies to these counts."""
         if self._diagrams[node].variable >= chain.first + chain.bits:
             yield 1 << (chain.bits - bit), node
             return
@@ -363,7 +365,7 @@ def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ..
             is_strong,
         ) not in chains:
             members.append(next_member)
-        # an until with a sooner deadline implies a later one; a longer release implies a shorter one
+        # an until implies the until with a later deadline; a release implies the shorter release
         ordered_members = tuple(members if is_strong else reversed(members))
         chains.update({(member, is_strong): ordered_members for member in members})
     return chains
@@ -434,7 +436,7 @@ class _Progression:
         return machine_of(result_diagrams, moves, [self._accepts(node) for node in state_nodes], start)
 
     def _read(self, number: int) -> int:
-        """Return the condition of a subformula on this sample and, as obligations, on the next sample."""
+        """Return a subformula's condition on the current sample, with obligations for the next sample."""
         if number not in self._conditions:
             self._conditions[number] = self._reading(number)
         return self._conditions[number]
@@ -461,7 +463,7 @@ class _Progression:
         raise ValueError(kind)
 
     def _after(self, node: int) -> int:
-        """Return the diagram from propositions to the next state of a state."""
+        """Return the diagram that maps propositions to the state after the state `node`."""
         if node not in self._moves:
             chain = self._obligations.chain(self._diagrams[node].variable)
             *cases, (_, remainder) = self._obligations.cases(chain, node)
@@ -476,7 +478,7 @@ class _Progression:
         """Return whether a run that ends in a state satisfies the formula."""
         while node not in (NO, YES):
             variable, low, high = self._diagrams[node]
-            # at the end strong obligations fail, and weak ones hold
+            # at the end of a run, strong obligations fail and weak obligations hold
             node = high if self._obligations.chain(variable).strong else low
         return node == YES
 
@@ -488,7 +490,7 @@ MAX_PRODUCT = 50_000
 """Maximum number of states of a product, before equivalent states are merged."""
 
 _FEW_STATES, _FEW_DECISIONS = 1_000, 20_000
-"""Maximum size of a formula that is compiled as a whole instead of operand by operand."""
+"""Limits of an automaton that is compiled as a whole; larger automata are compiled operand by operand."""
 
 
 def machine_by_composition(skeleton: Skeleton, propositions: int) -> Machine:
@@ -548,7 +550,9 @@ class _Composition:
 
 
 def join_machines(first: Machine, second: Machine, both: bool) -> Machine:
-    """Return the product of two machines, for the intersection of their runs or, if not `both`, the union.
+    """Return the product of two machines.
+
+    The product accepts the intersection of their runs if `both`, else the union.
 
     Args:
         first, second: machines without equivalent states.
@@ -623,7 +627,7 @@ class _Joining:
         return len(self._decision_rows) - 1
 
     def _state(self, left_state: int, right_state: int) -> int:
-        """Return the place of a pair of states; (-1, -1) is any pair with a state that decides the result."""
+        """Return the place of a pair of states; (-1, -1) stands for every pair that one state decides."""
         state = self._state_numbers.get((left_state, right_state))
         if state is None:
             state = self._state_numbers[left_state, right_state] = len(self._pairs)
@@ -634,7 +638,7 @@ class _Joining:
 
 
 def _permanent_states(machine: Machine, accepts: bool) -> frozenset[int]:
-    """Return the places of states whose result is permanent: acceptance or, if not `accepts`, rejection."""
+    """Return the places of states that accept permanently if `accepts`, else that reject permanently."""
     is_permanent = machine.moves == ~np.arange(len(machine.moves))
     return frozenset((~np.flatnonzero(is_permanent & (machine.accepting == accepts))).tolist())
 
@@ -749,21 +753,23 @@ def automaton(
     compiler: Compiler | None = None,
     stored: Iterable[bytes] = (),
 ) -> Automaton:
-    """Return the automaton of a spec: which runs satisfy it, sample by sample.
+    """Return the automaton of a spec, which decides sample by sample whether a run satisfies the spec.
 
-    It accepts every fully observed run with a robustness above 0, and no run with a robustness below 0.
+    The automaton accepts every fully observed run with a robustness above 0. It accepts no run with a
+    robustness below 0.
 
     Args:
         name: name of the spec; None for the only result of the file.
         rate_hz: sampling rate, which converts bounds in seconds into bounds in samples. The result is valid
             only for runs of this rate.
-        compiler: "own" or "mona"; both give equal automata. None tries this package first, and MONA if the
-            formula exceeds its limits.
+        compiler: "own" for this package, or "mona"; both give equal automata. None tries MONA only if the
+            formula exceeds this package's limits.
         stored: contents of automaton files. A stored automaton of this spec replaces a call of MONA, unless
             the spec has bounds in seconds.
 
     Raises:
-        NoAutomatonError: past operators, bounds in seconds without a rate, or too large.
+        NoAutomatonError: the formula has past operators, has bounds in seconds without a rate, or is too
+            large.
         UsageError: no specification, no such spec, several results without `name`, no such compiler, or a
             rate that is not above 0.
     """
@@ -796,7 +802,7 @@ def _compile_spec(
     """Return the automaton of the first compiler that succeeds; a stored automaton replaces a call of MONA.
 
     Raises:
-        NoAutomatonError: no compiler succeeds; the message has the reason of each.
+        NoAutomatonError: no compiler succeeds; the message has the reason of each compiler.
     """
     proposition_count = len(propositions.all)
     if proposition_count > MAX_PROPOSITIONS:
@@ -856,7 +862,7 @@ def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec
 
 
 def _check_size(automaton: Automaton) -> Automaton:
-    """Return the automaton, unless it has too many states or decisions.
+    """Refuse an automaton with too many states or decisions.
 
     Raises:
         NoAutomatonError: the automaton has more than `MAX_ROWS` states or decisions.

@@ -118,7 +118,7 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     the start.
 
     Args:
-        visited: states that are drawn first, with their transitions, if there are too many.
+        visited: states that a cut drawing includes first, with their transitions.
     """
     first_states = {automaton.initial, *visited}
     other_states = [state for state in automaton.states if state not in first_states]
@@ -225,7 +225,7 @@ def _heights(layer: Sequence[int]) -> Iterator[tuple[int, float]]:
 
 
 def _middle(row_by_state: Mapping[int, float], successors: Mapping[int, Sequence[int]], state: int) -> float:
-    """Return the mean row of a state's predecessors; its own row if it has none."""
+    """Return the mean row of a state's predecessors; the state's own row if it has no predecessor."""
     rows_before = [
         row_by_state[source] for source, targets in successors.items() if source != state and state in targets
     ]

@@ -27,11 +27,11 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import is_spatial, without_variables
 
 LEAF = 1 << 60
-"""Variable of leaves, which sorts after all others."""
+"""Variable of leaves, which sorts after all other variables."""
 
 
 class Decision(NamedTuple):
-    """A node of a decision diagram; `low` of a leaf is the leaf's number.
+    """A node of a decision diagram; `low` and `high` of a leaf are the leaf's number.
 
     Attributes:
         low, high: nodes for a false and for a true variable.
@@ -53,7 +53,7 @@ class Diagrams:
         """Add the nodes of the constants.
 
         Args:
-            limit: maximum number of nodes; one more raises NoAutomatonError.
+            limit: maximum number of nodes; a further node raises NoAutomatonError.
         """
         self._nodes: list[Decision] = []
         self._numbers: dict[Decision, int] = {}
@@ -77,7 +77,7 @@ class Diagrams:
         return low if low == high else self._add(Decision(variable, low, high))
 
     def variable(self, variable: int) -> int:
-        """Return the function that equals a variable."""
+        """Return the node of a variable's own function: true iff the variable is true."""
         return self._add(Decision(variable, NO, YES))
 
     def choose(self, condition: int, then: int, otherwise: int) -> int:
@@ -110,7 +110,7 @@ class Diagrams:
         return self.choose(node, NO, YES)
 
     def branches(self, node: int, variable: int) -> tuple[int, int]:
-        """Return the cofactors of a function: with a variable false, and with it true.
+        """Return two cofactors of a function: with the variable false, and with the variable true.
 
         The function may not depend on earlier variables.
         """
@@ -134,7 +134,7 @@ def node_copier(
 
     Args:
         variables: number of variables to copy; a node that decides on a later variable becomes a leaf.
-        leaf: function from such a node of the source to the number of its leaf in the target.
+        leaf: function from a source node that becomes a leaf to the leaf's number in the target.
     """
     copies: dict[int, int] = {}
 
@@ -165,11 +165,11 @@ class Proposition:
 
     @property
     def label(self) -> str:
-        """Its name or, without one, its text."""
+        """The proposition's name; its text if it has no name."""
         return self.name or self.text
 
     def literal(self, value: bool) -> str:
-        """Return the proposition or, if `value` is False, its negation as a sentence."""
+        """Return the proposition as a sentence; its negation if `value` is False."""
         if self.name is not None:
             return self.name if value else f"not {self.name}"
         if isinstance(self.formula, Boolean) and self.formula.operator == "not":
@@ -189,7 +189,8 @@ class Propositions:
     """The propositions of a formula, numbered in the order of the text.
 
     Equivalent subformulas are one proposition: `a and b` and `b and a`, `a leftof b` and
-    `not (a rightof b)`. A subformula and its negation are also one proposition: the one written first.
+    `not (a rightof b)`. A subformula and its negation are also one proposition. Whichever is written first
+    is the proposition, the other its negated literal.
     """
 
     def __init__(self, formula: Formula) -> None:
@@ -201,9 +202,9 @@ class Propositions:
             self._add(proposition)
 
     def literal(self, formula: Formula) -> tuple[int, bool] | None:
-        """Return the number of a maximal spatial subformula's proposition, and False if it is negated.
+        """Return the proposition of a maximal spatial subformula: its number, and False if it is negated.
 
-        None for all other formulas, including the formulas inside expansions.
+        The result is None for all other formulas, including the formulas inside expansions.
         """
         return self._literals.get(id(formula))
 
@@ -224,7 +225,8 @@ class Propositions:
     def _text(self, formula: Formula) -> str:
         """Return the text of a proposition.
 
-        If another proposition has the same text, it also states the result for a rate without a value.
+        If another proposition has the same text, the result also says whether the formula holds without a
+        rate.
         """
         text = format_formula(formula)
         if all(proposition.text != text for proposition in self.all):
@@ -260,7 +262,7 @@ class Shapes:
             except (NoAutomatonError, RecursionError):
                 # too large for a comparison by meaning: only equal texts are recognized as equivalent
                 node = self.of_text(formula)
-            # the formula is kept, so that its id stays its own
+            # the stored formula stays in memory, so no other formula gets its id
             self._nodes[id(formula)] = formula, node
         return self._nodes[id(formula)][1]
 
@@ -308,7 +310,7 @@ MAX_SHAPES = 200_000
 
 
 def _split_sign(atom: Atom) -> tuple[Expression, bool]:
-    """Return the normalized expression of a relation, and False if it is the relation's negation.
+    """Return a relation's normalized expression, and False if the relation is that expression's negation.
 
     Comparisons of signals are not normalized: signals are often equal to their limits, and at the limit a
     comparison and its negation both hold.
@@ -318,7 +320,7 @@ def _split_sign(atom: Atom) -> tuple[Expression, bool]:
         match expression:
             case Negative(operand=operand):
                 expression = operand
-            # of `a - b` and `b - a`, the one that sorts first
+            # `a - b` becomes `b - a` if `b` sorts before `a`
             case Sum(first=minuend, second=Negative(operand=operand)) if repr(operand) < repr(minuend):
                 expression = Sum(operand, Negative(minuend))
             case _:
@@ -341,7 +343,7 @@ MAX_CUBES = 100_000
 """Maximum number of cubes of a guard."""
 
 FEW_CUBES = 1_000
-"""Number of cubes that represent a guard of more than `MAX_CUBES`."""
+"""Number of listed cubes of a guard that has more than `MAX_CUBES` cubes."""
 
 
 class Covers:
@@ -413,13 +415,13 @@ class Covers:
 
 
 class _Cover(NamedTuple):
-    """A set of cubes that is not written out.
+    """A set of cubes in a recursive form, which is smaller than the list of cubes.
 
     Attributes:
         size: number of cubes.
         union: disjunction of the cubes.
-        split: variable, then the cubes with it false, with it true, and without it. The variable itself is
-            omitted from the cubes. None for no cube, and for only the empty cube.
+        split: a variable, then the cubes that require it to be false, to be true, and all other cubes. The
+            three sets omit the variable's literal. None if the only cube is empty, or there is no cube.
     """
 
     size: int
@@ -449,7 +451,7 @@ class Transition:
     Attributes:
         guard: disjunction of cubes, which are conjunctions of literals (number of a proposition, whether it
             must be true). No cube and no literal can be omitted.
-        is_cut: whether the guard takes more than `MAX_CUBES` cubes. Then `guard` has only some of them,
+        is_cut: whether the guard takes more than `MAX_CUBES` cubes. A cut guard has only some of the cubes,
             which are disjoint.
     """
 
@@ -473,7 +475,7 @@ def guard_words(move: Transition, propositions: Sequence[Proposition], longest: 
         text = " and ".join(propositions[number].literal(value) for number, value in cube)
         cube_texts.append(text if len(move.guard) == 1 or len(cube) == 1 else f"({text})")
         total_length += len(cube_texts[-1])
-        # further cubes would be cut off below
+        # the text is cut below, so further cubes would not appear
         if longest is not None and total_length > longest:
             break
     words = " or ".join([*cube_texts, "…"] if move.is_cut else cube_texts)

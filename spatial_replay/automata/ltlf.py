@@ -28,7 +28,7 @@ from spatial_replay.spec.formula import (
 )
 
 _ROUNDING = 1e-6
-"""Tolerance of bounds in seconds, samples: bounds and rates are decimal numbers, and are rounded."""
+"""Tolerance of bounds in seconds, samples; decimal bounds and rates have rounding errors."""
 
 
 def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
@@ -41,7 +41,7 @@ def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
 
 
 def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
-    """Return a sentence on bounds in seconds: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
+    """Return a sentence on bounds in seconds: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" if it has none."""
     sentences: dict[str, None] = {}
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
@@ -59,7 +59,7 @@ def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float
     """Refuse past operators, and bounds in seconds if the rate is unknown or no sample is in the window.
 
     Raises:
-        NoAutomatonError: names every such operator.
+        NoAutomatonError: names every refused operator.
     """
     faults = []
     for node in _temporal(formula):
@@ -85,7 +85,7 @@ def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float
 def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoAutomatonError:
     """Return the error for a spec that no compiler can compile.
 
-    Its place is the operator with the widest window or, without windows, the whole formula.
+    The error points at the operator with the widest window; without windows, at the whole formula.
     """
     widest_node = max(_temporal(spec.formula), key=_width, default=spec.formula)
     if not _width(widest_node):
@@ -98,7 +98,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
 def obstacle(
     source: SourceText | None, node: Formula | None, message: str, remedy: str = ""
 ) -> NoAutomatonError:
-    """Return the error for a node, with its place in the source text if there is one."""
+    """Return the error for a node, with the node's place in the source text if both are given."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
         return NoAutomatonError(f"{message}; {hint}", message)
@@ -122,13 +122,13 @@ def _counts_seconds(bound: Bound) -> bool:
 
 
 def _width(node: Formula) -> int:
-    """Return the end of a node's window, or its begin if the window is unbounded; 0 without a window."""
+    """Return the end of a node's window, or the begin of an unbounded window; 0 without a window."""
     bound = node.bound if isinstance(node, Temporal) else None
     return 0 if bound is None else bound.upper or bound.lower
 
 
 def _without_names(formula: Formula) -> Formula:
-    """Return the formula behind a formula that is only the name of another spec."""
+    """Return the formula of the spec that a formula names, if the formula is only a name."""
     while isinstance(formula, Boolean) and formula.operator == "spec":
         (formula,) = formula.operands
     return formula
@@ -144,8 +144,8 @@ class Node(NamedTuple):
     """One subformula.
 
     Attributes:
-        first, second: numbers of the operands. A literal has the number of its proposition, and 1 if the
-            proposition must be true or 0 if it must be false.
+        first, second: numbers of the operands. For a literal, `first` is the proposition's number; `second`
+            is 1 for a true and 0 for a false proposition.
     """
 
     kind: Kind
@@ -163,9 +163,9 @@ class Skeleton:
     Attributes:
         nodes: subformulas, indexed by number.
         root: number of the whole formula.
-        chains: mapping from (number of a subformula, whether it is an until) to the number of the same
-            subformula with a window that is longer by one sample. A shorter until implies the longer until.
-            A longer release implies the shorter release.
+        chains: mapping from (number of a subformula, whether it is an until) to the number of the subformula
+            whose window is one sample longer. A shorter until implies the longer until. A longer release
+            implies the shorter release.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class Skeleton:
         self._source = source
         self.chains: dict[tuple[int, bool], int] = {}
         self._formula_numbers: dict[tuple[int, bool], int] = {}
-        # messages name the operators of the text, not those of their expansions
+        # messages name operators of the text, not operators of expansions
         self._written_ids = {id(node) for node in _temporal(formula)}
         self._operator: Formula | None = None
         self._unrolled_operator: Formula | None = None
@@ -219,7 +219,7 @@ class Skeleton:
         return "and", (number,)
 
     def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
-        """Return the operands of a conjunction or disjunction, with nested ones flattened."""
+        """Return the operands of a conjunction or disjunction, which includes operands of nested ones."""
         operands: dict[int, None] = {}
         stack = [number]
         while stack:
@@ -274,7 +274,7 @@ class Skeleton:
         return self._within(left_operand, operands[-1], bound, is_strong)
 
     def _within(self, left_operand: int, right_operand: int, bound: Bound | None, is_strong: bool) -> int:
-        """Unroll an until (`strong`) or a release over a window."""
+        """Unroll an until (`is_strong`) or a release over a window."""
         lower, upper = (0, None) if bound is None else (bound.lower, bound.upper)
         # checked before the loops, which take a step for each sample of the window
         if max(lower, upper or 0) > MAX_NODES:

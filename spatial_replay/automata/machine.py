@@ -22,8 +22,8 @@ class Machine:
 
     Attributes:
         moves: (S,), place of each state's first decision.
-        decisions: (D, 3), rows (proposition, place if it is false, place if it is true). Rows at these places
-            decide on later propositions and have smaller indices.
+        decisions: (D, 3), rows (proposition, next place if the proposition is false, next place if it is
+            true). The next row decides on a later proposition and has a smaller index.
         accepting: (S,), whether each state accepts.
         start: place of the first decision of a run.
     """
@@ -72,8 +72,8 @@ def least(machine: Machine) -> Machine:
     """Return the minimal automaton, whose state 0 is the state before the first sample.
 
     Machines that accept the same non-empty runs give equal automata, because states are numbered by their
-    distance from state 0. Whether state 0 accepts is irrelevant, since no run is empty. So any state with
-    the start's moves serves as state 0, preferably one that does not accept.
+    distance from state 0. Acceptance of state 0 is irrelevant, since no run is empty. Any state with the
+    start's moves can serve as state 0; a state that does not accept is preferred.
     """
     machine = merge_equivalent_states(machine)
     reachable = _reachable(machine)
@@ -90,7 +90,7 @@ def least(machine: Machine) -> Machine:
 
 
 def _reachable(machine: Machine) -> list[int]:
-    """Return the reachable states by distance; at equal distance, false branches come before true ones."""
+    """Return the reachable states, sorted by distance, then false branches before true branches."""
     moves, decision_rows = machine.moves.tolist(), machine.decisions.tolist()
     visited_states: dict[int, None] = {}
     states: list[int] = []
@@ -115,9 +115,9 @@ def _reachable(machine: Machine) -> list[int]:
 
 
 def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
-    """Return the machine of only these states, in this order.
+    """Restrict a machine to `states`, and number them in this order.
 
-    No move of these states may lead to any other state.
+    The moves of `states` may only lead to `states`.
     """
     new_numbers = {state: number for number, state in enumerate(states)}
     decision_rows = machine.decisions.tolist()
@@ -158,7 +158,7 @@ def _relabel(machine: Machine, new_numbers: Integers) -> tuple[Integers, Integer
         low, high = places[decisions[level_rows, 1]], places[decisions[level_rows, 2]]
         places[level_rows] = low
         is_needed = low != high
-        # each pair of places as one integer; places of states are negative, hence the span
+        # each pair of places becomes one integer; the span shifts the negative places of states
         pair_keys = (low[is_needed] + place_span) * (2 * place_span) + high[is_needed] + place_span
         distinct_keys, first_rows, key_ranks = np.unique(pair_keys, return_index=True, return_inverse=True)
         places[level_rows[is_needed]] = decision_count + key_ranks.ravel()
@@ -186,8 +186,8 @@ def _split_classes(machine: Machine) -> list[int]:
     """Return the equivalence class of each state.
 
     States of one class accept the same runs, including the empty run. Classes are split until the moves of
-    all members of a class lead to the same classes. The largest part of a class keeps its number, so that
-    few states are checked again (Hopcroft, 1971).
+    all members of a class lead to the same classes. The largest part of a class keeps the class's number, so
+    that few states are checked again (Hopcroft, 1971).
     """
     moves, decision_rows = machine.moves.tolist(), machine.decisions.tolist()
     classes: list[int] = machine.accepting.astype(np.int64).tolist()
@@ -244,7 +244,7 @@ def _split(
 
 
 def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
-    """Return the parents of each place: indices of rows, and ~q for a state q whose moves begin there."""
+    """Return the parents of each place: decisions by index, and ~q for a state q whose moves begin there."""
     parents: dict[int, list[int]] = {}
     for row_number, (_, low, high) in enumerate(rows):
         parents.setdefault(low, []).append(row_number)
@@ -261,7 +261,7 @@ def sources_of(
 
     Args:
         above: result of `above_of`.
-        visited: rows to skip; rows that are followed are added to this set.
+        visited: decisions to skip; the function adds the decisions that it follows.
     """
     sources: dict[int, None] = {}
     visited_rows = set() if visited is None else visited
