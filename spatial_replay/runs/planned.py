@@ -68,12 +68,12 @@ _SAME_YAW: Final = math.radians(1.0)
 
 def settings_for(world: Tabletop) -> Settings:
     """Return the planner settings for a world."""
-    bodies = {
+    body_names = {
         "supports": [body.name for body in world.bodies if body.support],
         "movable": [body.name for body in world.bodies if body.movable],
     }
-    values = {"skill": world.skill, **world.workspace, **bodies, **_PRESETS[world.skill]}
-    return changed_settings(None, values)
+    setting_values = {"skill": world.skill, **world.workspace, **body_names, **_PRESETS[world.skill]}
+    return changed_settings(None, setting_values)
 
 
 def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> Settings:
@@ -93,14 +93,21 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
     These are the yaws of the compared objects, as in `a oriented[k] b`, and quarter turns of the first yaw.
     """
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
-    parts = [part for atom in atoms for part in iter_expressions(atom.expression)]
-    measurements = [part for part in parts if isinstance(part, Measurement) and part.needs_orientation]
-    compared = [term for measurement in measurements for term in measurement.terms]
-    tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
-    present_yaws = [present.yaw for present in tracked if present is not None and present.yaw is not None]
+    expressions = [part for atom in atoms for part in iter_expressions(atom.expression)]
+    measurements = [part for part in expressions if isinstance(part, Measurement) and part.needs_orientation]
+    compared_terms = [term for measurement in measurements for term in measurement.terms]
+    tracked_objects = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared_terms]
+    present_yaws = [
+        tracked_object.yaw
+        for tracked_object in tracked_objects
+        if tracked_object is not None and tracked_object.yaw is not None
+    ]
     yaws: list[float] = []
-    for yaw in (*present_yaws, *(turn * math.pi / 2 + yaw for yaw in present_yaws[:1] for turn in (1, 2, 3))):
-        if all(abs(math.remainder(yaw - before, math.tau)) > _SAME_YAW for before in yaws):
+    for yaw in (
+        *present_yaws,
+        *(quarters * math.pi / 2 + yaw for yaw in present_yaws[:1] for quarters in (1, 2, 3)),
+    ):
+        if all(abs(math.remainder(yaw - earlier_yaw, math.tau)) > _SAME_YAW for earlier_yaw in yaws):
             yaws.append(math.remainder(yaw, math.tau))
     return tuple(sorted(yaws))
 
@@ -199,14 +206,14 @@ def record_plan(
     """
     files = [default_specification(scenario) if file is None else file, *also]
     main_file, *further_files = logged_specifications(files, {})
-    results = [spec.name for spec in main_file.results]
-    if name is not None and name not in results:
+    result_names = [spec.name for spec in main_file.results]
+    if name is not None and name not in result_names:
         raise UsageError(
-            f"{main_file.filename} has no result {name!r}; its results are: {', '.join(results)}"
+            f"{main_file.filename} has no result {name!r}; its results are: {', '.join(result_names)}"
         )
     spec = chosen_spec(main_file, name)
     refuse_unsatisfiable(main_file, spec.name)
-    about = {**about_run(scenario, **conditions), "planned": "true"}
+    metadata = {**about_run(scenario, **conditions), "planned": "true"}
     # an error in the world or the planner leaves the output untouched
     with closing(make_world(scenario, **conditions)) as world:
         refuse_unknown_names([main_file, *further_files], world.sample())
@@ -219,34 +226,34 @@ def record_plan(
         )
         with (
             open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
-            run_log(output, [main_file, *further_files], about, inputs, automata, durability) as log,
+            run_log(output, [main_file, *further_files], metadata, inputs, automata, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, main_file.filename))
-            box = BlackBox(planner, log.write_messages, timings=timings)
+            black_box = BlackBox(planner, log.write_messages, timings=timings)
 
             def observe(sample: Sample) -> str:
                 log.write(sample)
-                box.observe(sample)
+                black_box.observe(sample)
                 if film is not None:
                     film.take(sample)
                 advance(1)
                 return planner.stop_reason
 
             world.attach(observe, lambda tick: _log_tick(log, tick, world.time_ns))
-            last = run_plan(box, partial(execute_in, world, planner.settings), world.step)
+            last_step = run_plan(black_box, partial(execute_in, world, planner.settings), world.step)
         return PlannedRun(
             samples=log.samples,
             seconds=log.seconds,
-            ended=last.kind,
+            ended=last_step.kind,
             name=planner.automaton.name,
             verdict=log.verdicts[planner.automaton.name],
-            reason=sentence_of(last),
+            reason=sentence_of(last_step),
             steps=planner.motions,
-            pruned=len(last.pruned),
-            planning_s=box.planning_s,
+            pruned=len(last_step.pruned),
+            planning_s=black_box.planning_s,
             bounds=planner.bounds,
             yaws="" if "yaws" in {*world.workspace, *changes} else _yaws_text(settings.workspace.yaws),
-            others={name: verdict for name, verdict in log.verdicts.items() if name not in results},
+            others={name: verdict for name, verdict in log.verdicts.items() if name not in result_names},
         )
 
 
@@ -261,10 +268,10 @@ def warm_up_planner() -> None:
 def _plan_trial() -> None:
     task = parse_specification("F (cup leftof jug and cup dist jug >= 1)")
     workspace = Workspace(Grid(0.0, 0.0, 1.0, 8, 8), obstacles=(Footprint.box(0, 0, 1, 1),))
-    box = BlackBox(Planner(task, Settings(workspace, "push")))
+    black_box = BlackBox(Planner(task, Settings(workspace, "push")))
     objects = {
         "cup": TrackedObject(Footprint.box(6, 6, 7, 7), yaw=0.0, height=(0.0, 1.0)),
         "jug": TrackedObject(Footprint.disc(4, 4, 1), height=(0.0, 1.0)),
     }
-    box.observe(Sample(0, objects))
-    box.next_step()
+    black_box.observe(Sample(0, objects))
+    black_box.next_step()

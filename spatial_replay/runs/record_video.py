@@ -67,18 +67,18 @@ def asked_colours(
         requirements: requirements of each result.
         updates: updates of all specifications at the sample.
     """
-    worst: dict[str, int] = {}
-    at = np.zeros(1, np.int64)
+    worst_ranks: dict[str, int] = {}
+    sample_indices = np.zeros(1, np.int64)
     specs = [spec for update in updates for spec in update.specs]
     for spec_requirements, spec in zip(requirements, specs, strict=True):
         if spec.numbers is None:
             continue
         series = spec.numbers[:, :, None]
         for requirement in spec_requirements:
-            standing = _RANKS[Standing(int(requirement.standing(series, at)[0]))]
+            rank = _RANKS[Standing(int(requirement.standing(series, sample_indices)[0]))]
             for name in _members(requirement, sample):
-                worst[name] = max(worst.get(name, 0), standing)
-    return {name: _COLOURS[worst.get(name, 0)] for name in sample.objects}
+                worst_ranks[name] = max(worst_ranks.get(name, 0), rank)
+    return {name: _COLOURS[worst_ranks.get(name, 0)] for name in sample.objects}
 
 
 _RANKS: Final = {
@@ -119,34 +119,34 @@ def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]
     for name, tracked_object in sample.objects.items():
         colour = colours.get(name, NEUTRAL)
         # outlines are drawn at the upper face, where the tags are
-        z = 0.0 if tracked_object.height is None else tracked_object.height[1]
-        lowest: Floats | None = None
+        upper_z = 0.0 if tracked_object.height is None else tracked_object.height[1]
+        label_pixel: Floats | None = None
         for part in tracked_object.footprint.parts:
             ring = _ring(part.vertices, part.radius)
-            places = np.concatenate([ring, np.full((len(ring), 1), z)], axis=1)
-            pixels = view.plane.pixels(places)
+            outline_points = np.concatenate([ring, np.full((len(ring), 1), upper_z)], axis=1)
+            pixels = view.plane.pixels(outline_points)
             if not np.isfinite(pixels).all():
                 continue
             _outline(message, time_ns, pixels, colour, _THICKNESS)
             bottom = pixels[pixels[:, 1].argmax()]
-            lowest = bottom if lowest is None or bottom[1] > lowest[1] else lowest
-        if lowest is not None:
-            _text(message, time_ns, name, lowest + np.array([0.0, _LETTERS]), colour, _LETTERS)
+            label_pixel = bottom if label_pixel is None or bottom[1] > label_pixel[1] else label_pixel
+        if label_pixel is not None:
+            _text(message, time_ns, name, label_pixel + np.array([0.0, _LETTERS]), colour, _LETTERS)
     return message.SerializeToString(deterministic=True)
 
 
 def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
     """Return the calibration of a camera."""
     width, height = camera.size
-    numbers = list(camera.distortion)
+    distortion = list(camera.distortion)
     # plumb_bob has five parameters, rational_polynomial has more
     # (https://docs.ros.org/en/noetic/api/sensor_msgs/html/msg/CameraInfo.html)
     message = CameraCalibration(
         frame_id=frame,
         width=width,
         height=height,
-        distortion_model="plumb_bob" if len(numbers) <= 5 else "rational_polynomial",
-        D=numbers + [0.0] * (5 - len(numbers)) if len(numbers) < 5 else numbers,
+        distortion_model="plumb_bob" if len(distortion) <= 5 else "rational_polynomial",
+        D=distortion + [0.0] * (5 - len(distortion)) if len(distortion) < 5 else distortion,
         K=camera.matrix.ravel().tolist(),
         R=np.eye(3).ravel().tolist(),
         P=np.concatenate([camera.matrix, np.zeros((3, 1))], axis=1).ravel().tolist(),
@@ -163,12 +163,12 @@ def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
     x, y, z = (-plane.rotation.T @ plane.pose[3:]).tolist()
     transform.translation.x, transform.translation.y, transform.translation.z = x, y, z
     # the inverse of the pose, which transforms from the scene to the camera
-    turn = -plane.pose[:3]
-    angle = float(np.linalg.norm(turn))
+    rotation_vector = -plane.pose[:3]
+    angle = float(np.linalg.norm(rotation_vector))
     # the limit at angle 0 is 0.5
-    part = math.sin(angle / 2) / angle if angle > 0 else 0.5
+    sine_ratio = math.sin(angle / 2) / angle if angle > 0 else 0.5
     transform.rotation.w = math.cos(angle / 2)
-    transform.rotation.x, transform.rotation.y, transform.rotation.z = (part * turn).tolist()
+    transform.rotation.x, transform.rotation.y, transform.rotation.z = (sine_ratio * rotation_vector).tolist()
     return message.SerializeToString(deterministic=True)
 
 
@@ -177,12 +177,12 @@ def _ring(vertices: Floats, radius: float) -> Floats:
     if not radius:
         return vertices
     angles = np.linspace(0, 2 * math.pi, _AROUND, endpoint=False)
-    around = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    circle_points = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     if len(vertices) == 1:
-        return vertices + around
+        return vertices + circle_points
     # each direction belongs to the corner that is farthest in it
-    support = (around @ vertices.T).argmax(axis=1)
-    return np.asarray(vertices[support] + around, np.float64)
+    farthest_corners = (circle_points @ vertices.T).argmax(axis=1)
+    return np.asarray(vertices[farthest_corners] + circle_points, np.float64)
 
 
 def _outline(
@@ -199,11 +199,11 @@ def _outline(
 
 
 def _text(
-    message: ImageAnnotations, time_ns: int, text: str, place: Floats, colour: Colour, size: float
+    message: ImageAnnotations, time_ns: int, text: str, pixel: Floats, colour: Colour, size: float
 ) -> None:
     label = message.texts.add(text=text, font_size=size)
     label.timestamp.FromNanoseconds(time_ns)
-    label.position.x, label.position.y = (place + 0.5).tolist()
+    label.position.x, label.position.y = (pixel + 0.5).tolist()
     label.text_color.r, label.text_color.g, label.text_color.b = colour
     label.text_color.a = 1.0
     label.background_color.r = label.background_color.g = label.background_color.b = 1.0
@@ -313,16 +313,16 @@ def record_cameras(
             raise UsageError(f"the video cannot be copied: {camera.copy_fault}; write --keep-video h264")
         keep_modes.append(keep or ("copy" if camera.copy_fault is None else "h264"))
     observer = TagObserver(tags, hold_ns=hold_ns, cameras=names)
-    coming = simultaneous(cameras, offsets_ns)
-    first = next(coming, None)
-    if first is None:
-        began = [fault for camera in cameras for fault in camera.faults[:1]]
+    frame_groups = simultaneous(cameras, offsets_ns)
+    first_frames = next(frame_groups, None)
+    if first_frames is None:
+        opening_faults = [fault for camera in cameras for fault in camera.faults[:1]]
         camera_list = " and ".join(dict.fromkeys(camera.name for camera in cameras))
-        raise LogError("; ".join([f"{camera_list}: no frame can be read", *began]))
-    if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first):
+        raise LogError("; ".join([f"{camera_list}: no frame can be read", *opening_faults]))
+    if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first_frames):
         raise UsageError("detections have no images to encode; leave out --keep-video h264")
     # reference tags that do not fit raise before the output is created
-    begun = observer.observe(*first)
+    first_observation = observer.observe(*first_frames)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes = VerdictChanges(files)
     requirements = [requirements_of(spec.formula) for file in files for spec in file.results]
@@ -332,72 +332,74 @@ def record_cameras(
         "keep_video": keep_modes[0] if len(keep_modes) == 1 else keep_modes,
         **({"cameras": names, "offsets_ns": [*offsets_ns]} if len(cameras) > 1 else {}),
     }
-    sources = list(dict.fromkeys(camera.name for camera in cameras))
-    about = {"source": ", ".join(sources), "options": json.dumps(options)}
-    about |= Axes(unit=tags.unit).metadata()
-    of_cameras = [tags.of_camera(name, number, count=len(names)) for number, name in enumerate(names, 1)]
-    alone = _Alone(names)
-    samples, first_ns = 0, begun.sample.time_ns
+    source_names = list(dict.fromkeys(camera.name for camera in cameras))
+    metadata = {"source": ", ".join(source_names), "options": json.dumps(options)}
+    metadata |= Axes(unit=tags.unit).metadata()
+    tag_files = [tags.of_camera(name, number, count=len(names)) for number, name in enumerate(names, 1)]
+    frame_counts = _FrameCounts(names)
+    sample_count, first_ns = 0, first_observation.sample.time_ns
     last_ns = first_ns
     begin(first_ns)
-    with run_log(output, files, about, inputs, durability=durability) as log:
+    with run_log(output, files, metadata, inputs, durability=durability) as log:
         log.add_attachment(f"{CAMERA_PREFIX}{tags.name}", "application/yaml", tags.text.encode())
         pictures = [
             _Picture(number, camera, mode)
             for number, (camera, mode) in enumerate(zip(cameras, keep_modes, strict=True), 1)
         ]
-        for observation in chain([begun], (observer.observe(*frames) for frames in coming)):
-            samples, last_ns = samples + 1, observation.sample.time_ns
+        for observation in chain([first_observation], (observer.observe(*frames) for frames in frame_groups)):
+            sample_count, last_ns = sample_count + 1, observation.sample.time_ns
             log.write(observation.sample)
             updates: list[Update] = [monitor.update(observation.sample) for monitor in monitors]
-            coloured = asked_colours(requirements, observation.sample, updates)
-            for picture, view, camera_tags in zip(pictures, observation.views, of_cameras, strict=True):
+            object_colours = asked_colours(requirements, observation.sample, updates)
+            for picture, view, camera_tags in zip(pictures, observation.views, tag_files, strict=True):
                 if view is not None:
-                    picture.write(log, view, observation.sample, coloured, camera_tags.camera)
-            alone.count(observation)
+                    picture.write(log, view, observation.sample, object_colours, camera_tags.camera)
+            frame_counts.count(observation)
             for change in changes.after(updates):
                 show(change)
             advance(1)
     endings = tuple(ending for monitor in monitors for ending in monitor.endings())
     faults = tuple(dict.fromkeys(fault for camera in cameras for fault in camera.faults))
-    of_sources = [camera.remark for camera in cameras if camera.remark is not None]
-    remarks = (*of_sources, *observer.remarks(), *alone.remarks(first_ns, last_ns))
+    source_remarks = [camera.remark for camera in cameras if camera.remark is not None]
+    remarks = (*source_remarks, *observer.remarks(), *frame_counts.remarks(first_ns, last_ns))
     fits = tuple(zip(names, observer.fits, strict=True))
-    return SeenRun(samples, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(keep_modes))
+    return SeenRun(
+        sample_count, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(keep_modes)
+    )
 
 
-class _Alone:
+class _FrameCounts:
     """Counts of simultaneous frames of the cameras, and the last frame of each camera."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
-        self._last: list[int] = [0] * len(names)
-        self._samples = self._together = 0
-        self._last_of = [-1] * len(names)
+        self._last_samples: list[int] = [0] * len(names)
+        self._sample_count = self._shared_count = 0
+        self._end_ns = [-1] * len(names)
 
     def count(self, observation: Observation) -> None:
         """Count the frames of a sample."""
-        self._samples += 1
-        places_seen = [place for place, view in enumerate(observation.views) if view is not None]
-        self._together += len(places_seen) > 1
-        for place in places_seen:
-            self._last[place], self._last_of[place] = self._samples, observation.sample.time_ns
+        self._sample_count += 1
+        camera_indices = [index for index, view in enumerate(observation.views) if view is not None]
+        self._shared_count += len(camera_indices) > 1
+        for index in camera_indices:
+            self._last_samples[index], self._end_ns[index] = self._sample_count, observation.sample.time_ns
 
     def remarks(self, first_ns: int, last_ns: int) -> Iterator[str]:
         """Yield remarks on cameras that ended early, and on cameras without simultaneous frames."""
         if len(self._names) == 1:
             return
-        if not self._together:
+        if not self._shared_count:
             yield (
                 f"no frames of {' and '.join(self._names)} are of the same time; are their clocks the same?"
                 " --offset shifts one"
             )
-        for name, last, ended_ns in zip(self._names, self._last, self._last_of, strict=True):
-            if not last:
+        for name, last_sample, end_ns in zip(self._names, self._last_samples, self._end_ns, strict=True):
+            if not last_sample:
                 yield f"{name} has no frame"
-            elif self._samples - last > _NOT_YET_ALONE:
+            elif self._sample_count - last_sample > _NOT_YET_ALONE:
                 yield (
-                    f"{name} ends after {(ended_ns - first_ns) / 1e9:.3f} s, and the run after"
+                    f"{name} ends after {(end_ns - first_ns) / 1e9:.3f} s, and the run after"
                     f" {(last_ns - first_ns) / 1e9:.3f} s: what only it showed is hidden from there on"
                 )
 
@@ -410,12 +412,12 @@ class _Picture:
         self._video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
         self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
         self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
-        self._kept, self._copied = keep_mode, camera.channel
+        self._keep_mode, self._copy_channel = keep_mode, camera.channel
         # a topic under /spatial/ would clash with the log's own topics
-        if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
-            self._kept = "none"
+        if self._copy_channel is not None and self._copy_channel.topic.startswith(OWN_PREFIX):
+            self._keep_mode = "none"
         self._encoder: H264Encoder | None = None
-        self._placed_ns: dict[str, int] = {}
+        self._last_ns: dict[str, int] = {}
 
     def write(
         self,
@@ -435,10 +437,10 @@ class _Picture:
             log.write_payload(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, self._frame))
 
     def _write_frame(self, log: RunLog, frame: Frame) -> None:
-        channel, data = self._copied, frame.data
-        if self._kept == "none":
+        channel, data = self._copy_channel, frame.data
+        if self._keep_mode == "none":
             return
-        if self._kept == "h264":
+        if self._keep_mode == "h264":
             if self._encoder is None:
                 height, width = frame.image.shape[:2]
                 self._encoder = H264Encoder(width, height)
@@ -446,13 +448,13 @@ class _Picture:
         if channel is not None:
             log.write_payload(channel, frame.time_ns, data)
         elif data:
-            encoded = encode_video(frame.time_ns, data, self._frame)
-            log.write_payload(self._video, frame.time_ns, encoded)
+            message = encode_video(frame.time_ns, data, self._frame)
+            log.write_payload(self._video, frame.time_ns, message)
 
-    def _is_due(self, what: str, time_ns: int) -> bool:
+    def _is_due(self, topic: str, time_ns: int) -> bool:
         """Return whether a constant message must be repeated now."""
-        last_ns = self._placed_ns.get(what)
+        last_ns = self._last_ns.get(topic)
         if last_ns is not None and time_ns - last_ns < _POSE_EVERY_NS:
             return False
-        self._placed_ns[what] = time_ns
+        self._last_ns[topic] = time_ns
         return True

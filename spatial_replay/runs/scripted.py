@@ -46,10 +46,10 @@ class RunLog:
     def __init__(self, writer: LogWriter, recording: Recording) -> None:
         self._writer = writer
         self._recording = recording
-        self._waiting: list[Sample] = []
-        self._beside: list[Messages] = []
+        self._pending_samples: list[Sample] = []
+        self._pending_messages: list[Messages] = []
         self._first_ns = self.newest_ns = self.samples = 0
-        self._written = Counter[str]()
+        self._message_counts = Counter[str]()
 
     @property
     def seconds(self) -> float:
@@ -72,20 +72,20 @@ class RunLog:
             self._first_ns = sample.time_ns
         self.newest_ns = sample.time_ns
         self.samples += 1
-        if len(self._waiting) >= _STRETCH:
+        if len(self._pending_samples) >= _STRETCH:
             # flushed only at the next sample, because messages about the newest sample have its time
             self.flush()
-        self._waiting.append(sample)
+        self._pending_samples.append(sample)
 
     def write_messages(self, messages: Messages) -> None:
         """Write messages of other channels, at the time of the newest sample."""
-        self._beside.append(messages)
+        self._pending_messages.append(messages)
 
     def write_payload(self, channel: Channel, time_ns: int, payload: bytes) -> None:
         """Write the next message of a channel."""
-        number = self._written[channel.topic]
-        self.write_messages(messages_of(channel, np.array([time_ns], np.int64), [payload], number))
-        self._written[channel.topic] += 1
+        sequence_number = self._message_counts[channel.topic]
+        self.write_messages(messages_of(channel, np.array([time_ns], np.int64), [payload], sequence_number))
+        self._message_counts[channel.topic] += 1
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record.
@@ -115,10 +115,10 @@ class RunLog:
 
     def write_waiting(self) -> None:
         """Write the waiting samples and messages, without flushing the file."""
-        waiting, self._waiting = self._waiting, []
-        beside, self._beside = self._beside, []
-        if waiting or beside:
-            self._recording.add(Trace.from_samples(waiting), merge(beside))
+        samples, self._pending_samples = self._pending_samples, []
+        messages, self._pending_messages = self._pending_messages, []
+        if samples or messages:
+            self._recording.add(Trace.from_samples(samples), merge(messages))
 
 
 @contextmanager
@@ -151,9 +151,9 @@ def run_log(
         leaving(output),
         terminable(),
         open_output(output, durability) as stream,
-        recording_in(stream, files, about, known) as opened,
+        recording_in(stream, files, about, known) as recording_parts,
     ):
-        log = RunLog(*opened)
+        log = RunLog(*recording_parts)
         try:
             yield log
         finally:
@@ -170,11 +170,13 @@ def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None
     Raises:
         SpecificationError: lists every missing name.
     """
-    objects, signals = sorted(sample.objects), sorted(sample.signals)
-    remarks = [remark for file in files for remark in check_names(file, objects, signals, where="world")]
-    missing = [remark for remark in remarks if remark.severity == "error"]
-    if missing:
-        raise SpecificationError(missing)
+    object_names, signal_names = sorted(sample.objects), sorted(sample.signals)
+    remarks = [
+        remark for file in files for remark in check_names(file, object_names, signal_names, where="world")
+    ]
+    errors = [remark for remark in remarks if remark.severity == "error"]
+    if errors:
+        raise SpecificationError(errors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,13 +226,13 @@ def record_script(
     if duration_ns is not None and duration_ns <= 0:
         raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
-    about = about_run(scenario, **conditions)
+    metadata = about_run(scenario, **conditions)
     # an error in the world or a missing name leaves the output untouched
     with closing(make_world(scenario, **conditions)) as world:
         refuse_unknown_names(files, world.sample())
         with (
             open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
-            run_log(output, files, about, inputs, durability=durability) as log,
+            run_log(output, files, metadata, inputs, durability=durability) as log,
         ):
 
             def observe(sample: Sample) -> None:

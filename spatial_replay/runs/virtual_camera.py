@@ -93,86 +93,112 @@ def render(
         backdrop: the rest of the scene, whose nearer parts hide plates.
     """
     width, height = camera.size
-    base = np.full((height, width), 120, np.uint8) if backdrop is None else backdrop.image
+    background = np.full((height, width), 120, np.uint8) if backdrop is None else backdrop.image
     depth = None if backdrop is None else backdrop.depth
     # plates at rest, which are most plates, are drawn once
-    moves = [
+    is_plate_moved = [
         any(
             (plate.centre != plates[0].centre).any() or (plate.axes != plates[0].axes).any()
             for plate in plates
         )
         for plates in zip(*instants, strict=True)
     ]
-    still = [plate for plate, is_moved in zip(instants[0], moves, strict=True) if not is_moved]
-    image = _expose(family, still, camera, pose, base, depth)
-    if any(moves):
-        total = np.zeros(image.shape, np.uint16)
+    plates_at_rest = [
+        plate for plate, is_moved in zip(instants[0], is_plate_moved, strict=True) if not is_moved
+    ]
+    image = _expose(family, plates_at_rest, camera, pose, background, depth)
+    if any(is_plate_moved):
+        image_sum = np.zeros(image.shape, np.uint16)
         for plates in instants:
-            moving = [plate for plate, is_moved in zip(plates, moves, strict=True) if is_moved]
-            total += _expose(family, moving, camera, pose, image, depth)
-        image = ((total + len(instants) // 2) // len(instants)).astype(np.uint8)
+            moving_plates = [
+                plate for plate, is_moved in zip(plates, is_plate_moved, strict=True) if is_moved
+            ]
+            image_sum += _expose(family, moving_plates, camera, pose, image, depth)
+        image = ((image_sum + len(instants) // 2) // len(instants)).astype(np.uint8)
     image = blur(image, blur_px)
     # noise of the brightness, so it is equal in all colour channels
     normal_noise = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
-    brighter = np.rint(normal_noise * noise).astype(np.int16)
-    image = np.clip(image + (brighter if image.ndim == 2 else brighter[..., None]), 0, 255)
+    brightness_noise = np.rint(normal_noise * noise).astype(np.int16)
+    image = np.clip(image + (brightness_noise if image.ndim == 2 else brightness_noise[..., None]), 0, 255)
     return np.ascontiguousarray(image.astype(np.uint8))
 
 
 def _expose(
-    family: str, plates: Sequence[Plate], camera: Camera, pose: Floats, base: Image, depth: Floats | None
+    family: str,
+    plates: Sequence[Plate],
+    camera: Camera,
+    pose: Floats,
+    background: Image,
+    depth: Floats | None,
 ) -> Image:
-    image = base.copy()
-    turn = rotations(pose[None, :3])[0]
+    image = background.copy()
+    rotation = rotations(pose[None, :3])[0]
     # far plates first, so that near plates cover them
-    nearness = [float((turn @ plate.centre + pose[3:])[2]) for plate in plates]
-    for index in np.argsort(nearness)[::-1].tolist():
-        _draw(image, _tile(family, plates[index].id), plates[index], camera, turn, pose[3:], depth)
+    depths = [float((rotation @ plate.centre + pose[3:])[2]) for plate in plates]
+    for plate_index in np.argsort(depths)[::-1].tolist():
+        _draw(
+            image,
+            _tile(family, plates[plate_index].id),
+            plates[plate_index],
+            camera,
+            rotation,
+            pose[3:],
+            depth,
+        )
     return image
 
 
 def _draw(
-    image: Image, tile: Image, plate: Plate, camera: Camera, turn: Floats, shift: Floats, depth: Floats | None
+    image: Image,
+    tile: Image,
+    plate: Plate,
+    camera: Camera,
+    rotation: Floats,
+    translation: Floats,
+    depth: Floats | None,
 ) -> None:
     """Draw the visible part of a plate into an image."""
-    cells = tile.shape[0]
+    cell_count = tile.shape[0]
     # the tile has a margin of one cell around the black square
-    half = plate.size / 2 * cells / (cells - 2)
-    right, up = plate.axes * half
+    half_edge = plate.size / 2 * cell_count / (cell_count - 2)
+    right, up = plate.axes * half_edge
     corners = np.stack([plate.centre + i * right + j * up for i, j in ((-1, 1), (1, 1), (1, -1), (-1, -1))])
-    seen = corners @ turn.T + shift
+    vertices = corners @ rotation.T + translation
     # a plate behind the camera, or seen from its back, is not drawn
-    if (seen[:, 2] <= 0).any() or np.dot(np.cross(seen[1] - seen[0], seen[3] - seen[0]), seen[0]) <= 0:
+    if (vertices[:, 2] <= 0).any() or np.dot(
+        np.cross(vertices[1] - vertices[0], vertices[3] - vertices[0]), vertices[0]
+    ) <= 0:
         return
-    pixels = camera.pixels(seen)
-    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 1, 0)
-    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, np.array(camera.size))
-    if (high <= low).any():
+    pixels = camera.pixels(vertices)
+    low_px = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 1, 0)
+    high_px = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 2, np.array(camera.size))
+    if (high_px <= low_px).any():
         return
-    width, height = (high - low).tolist()
+    width, height = (high_px - low_px).tolist()
     # coordinates count from the centre of the first pixel, so its outer corner is at -0.5
-    edge = cells - 0.5
-    outer = np.array([(-0.5, -0.5), (edge, -0.5), (edge, edge), (-0.5, edge)])
-    matrix = fit_homography(outer, _OVERSAMPLED * (pixels - low + 0.5) - 0.5)
+    tile_edge = cell_count - 0.5
+    tile_corners = np.array([(-0.5, -0.5), (tile_edge, -0.5), (tile_edge, tile_edge), (-0.5, tile_edge)])
+    matrix = fit_homography(tile_corners, _OVERSAMPLED * (pixels - low_px + 0.5) - 0.5)
     if matrix is None:
         return
     size = (width * _OVERSAMPLED, height * _OVERSAMPLED)
     tile_pixels = reduce(warp(tile, matrix, size), _OVERSAMPLED).astype(np.float64)
-    share = reduce(warp(np.full_like(tile, 255), matrix, size), _OVERSAMPLED) / 255.0
+    opacity = reduce(warp(np.full_like(tile, 255), matrix, size), _OVERSAMPLED) / 255.0
     if depth is not None:
-        rows, columns = np.mgrid[low[1] : high[1], low[0] : high[0]]
-        rays = camera.directions(np.stack([columns, rows], axis=-1).astype(np.float64))
-        normal = np.cross(seen[1] - seen[0], seen[3] - seen[0])
-        along = rays @ normal[:2] + normal[2]
-        share = share * (
-            float(normal @ seen[0]) / along <= depth[low[1] : high[1], low[0] : high[0]] + _BEHIND
+        pixel_rows, pixel_columns = np.mgrid[low_px[1] : high_px[1], low_px[0] : high_px[0]]
+        rays = camera.directions(np.stack([pixel_columns, pixel_rows], axis=-1).astype(np.float64))
+        normal = np.cross(vertices[1] - vertices[0], vertices[3] - vertices[0])
+        ray_normals = rays @ normal[:2] + normal[2]
+        opacity = opacity * (
+            float(normal @ vertices[0]) / ray_normals
+            <= depth[low_px[1] : high_px[1], low_px[0] : high_px[0]] + _BEHIND
         )
-        tile_pixels = tile_pixels * (share > 0)
-    part = image[low[1] : high[1], low[0] : high[0]]
+        tile_pixels = tile_pixels * (opacity > 0)
+    image_part = image[low_px[1] : high_px[1], low_px[0] : high_px[0]]
     if image.ndim == 3:
-        tile_pixels, share = tile_pixels[..., None], share[..., None]
+        tile_pixels, opacity = tile_pixels[..., None], opacity[..., None]
     # `tile_pixels` is already weighted: outside the tile it was averaged with black
-    part[:] = np.clip(part * (1 - share) + tile_pixels, 0, 255).round().astype(np.uint8)
+    image_part[:] = np.clip(image_part * (1 - opacity) + tile_pixels, 0, 255).round().astype(np.uint8)
 
 
 @cache
@@ -305,8 +331,8 @@ class Film:
         """
         self._world, self._writers, self._seed = world, writers, seed
         self._views = _VIEWS[world.name][len(writers) - 1]
-        self._before: dict[str, Pose] | None = None
-        self._taken = 0
+        self._previous_poses: dict[str, Pose] | None = None
+        self._frame_count = 0
 
     def take(self, sample: Sample) -> None:
         """Add a frame of the current state of the world to each video.
@@ -322,45 +348,47 @@ class Film:
         scene, views = self._world.scene, self._views
         poses = {name: scene.pose(name) for name in scene.bodies}
         instants = [self._plates(poses, 0.0)]
-        if self._before is not None:
+        if self._previous_poses is not None:
             instants = [self._plates(poses, share) for share in (-_EXPOSURE / 2, 0.0, _EXPOSURE / 2)]
-        self._before = poses
-        self._taken += 1
+        self._previous_poses = poses
+        self._frame_count += 1
         size = (views.size[0] // views.coarse, views.size[1] // views.coarse)
-        for number, look in enumerate(views.looks):
+        for camera_index, look in enumerate(views.looks):
             colours, depth = scene.engine.picture(size, views.focal / views.coarse, look.eye, look.look_at)
             # inverse depth can be interpolated: on a plane it is linear in the pixel coordinates
-            nearness = 1 / depth
+            inverse_depth = 1 / depth
             # the simulator gives the depths at the lower edges of pixels
-            nearness[1:] = (nearness[1:] + nearness[:-1]) / 2
+            inverse_depth[1:] = (inverse_depth[1:] + inverse_depth[:-1]) / 2
             image = render(
                 FAMILY,
                 instants,
                 views.camera,
                 look.pose,
                 # the first camera's noise does not depend on the number of cameras
-                seed=(self._seed, self._taken, *([number] if number else [])),
+                seed=(self._seed, self._frame_count, *([camera_index] if camera_index else [])),
                 # OpenCV orders colours as blue, green, red
                 backdrop=Backdrop(
-                    enlarge(colours[..., ::-1], views.coarse), 1 / enlarge(nearness, views.coarse)
+                    enlarge(colours[..., ::-1], views.coarse), 1 / enlarge(inverse_depth, views.coarse)
                 ),
             )
             yield Frame(time_ns, image)
 
-    def _plates(self, poses: Mapping[str, Pose], share: float) -> list[Plate]:
+    def _plates(self, poses: Mapping[str, Pose], interval_share: float) -> list[Plate]:
         """Return all tags, displaced by a share of their motion since the previous frame."""
         plates = [
             Plate(_FIRST_REFERENCE + index, np.array([x, y, 0.0]), np.eye(3)[:2], self._views.reference)
             for index, (x, y) in enumerate(self._views.places)
         ]
-        for number, body in _bodies_with_tags(self._world):
+        for first_tag, body in _bodies_with_tags(self._world):
             pose = poses[body.name]
-            moved = np.zeros(3)
-            if self._before is not None:
-                moved = share * (pose.position - self._before[body.name].position)
+            displacement = np.zeros(3)
+            if self._previous_poses is not None:
+                displacement = interval_share * (pose.position - self._previous_poses[body.name].position)
             for index, (x, y) in enumerate(_spots(body)):
-                centre = pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + moved
-                plates.append(Plate(number + index, centre, pose.rotation.T[:2], self._views.tag))
+                centre = (
+                    pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + displacement
+                )
+                plates.append(Plate(first_tag + index, centre, pose.rotation.T[:2], self._views.tag))
         return plates
 
 
@@ -373,7 +401,7 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
     """Return the tags file of a world at rest, for one or two cameras."""
     view = _VIEWS[world.name][cameras - 1]
     lines = [f"family: {FAMILY}", f"size: {view.tag:g}", "objects:"]
-    for number, body in _bodies_with_tags(world):
+    for first_tag, body in _bodies_with_tags(world):
         shape = body.shape
         # adding 0.0 turns -0.0 into 0.0, which has no sign in the text
         bottom, top = (round(height, 4) + 0.0 for height in world.scene.height(body.name))
@@ -383,16 +411,16 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
             else f"disc: {shape.radius:g}"
         )
         tags = [
-            f"{{id: {number + index}, at: [{x:g}, {y:g}], z: {top:g}}}"
+            f"{{id: {first_tag + index}, at: [{x:g}, {y:g}], z: {top:g}}}"
             for index, (x, y) in enumerate(_spots(body))
         ]
-        parts = [f"class: {body.class_name}", outline, f"tags: [{', '.join(tags)}]"]
+        entries = [f"class: {body.class_name}", outline, f"tags: [{', '.join(tags)}]"]
         if not body.support:
-            parts.append(f"height: [{bottom:g}, {top:g}]")
+            entries.append(f"height: [{bottom:g}, {top:g}]")
         if world.skill == "place" and body.movable:
-            parts.append("lifted: true")
-        parts.append(f"fastest: {_FASTEST[world.skill] if body.movable else _NUDGED:g}")
-        lines.append(f"  {body.name}: {{{', '.join(parts)}}}")
+            entries.append("lifted: true")
+        entries.append(f"fastest: {_FASTEST[world.skill] if body.movable else _NUDGED:g}")
+        lines.append(f"  {body.name}: {{{', '.join(entries)}}}")
     lines += ["plane:", f"  size: {view.reference:g}", "  tags:"]
     lines += [f"    {_FIRST_REFERENCE + index}: [{x:g}, {y:g}]" for index, (x, y) in enumerate(view.places)]
     lines.append(f"hold: {_HOLD}")
@@ -411,8 +439,8 @@ def _spots(body: Body) -> list[tuple[float, float]]:
     if isinstance(body.shape, Box):
         x, y = body.shape.length / 2 - 0.03, body.shape.width / 2 - 0.03
         return [(x, y), (-x, -y)]
-    r = body.shape.radius - 0.03
-    return [(r, 0.0), (-r, 0.0)]
+    edge_distance = body.shape.radius - 0.03
+    return [(edge_distance, 0.0), (-edge_distance, 0.0)]
 
 
 @contextmanager
@@ -434,13 +462,13 @@ def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Iterator
             raise UsageError(f"{video}: a film is a video; name it {video.stem}.mp4")
     if len({video.resolve() for video in videos}) < len(videos):
         raise UsageError(f"{videos[0]} is the film of two cameras; give each a name of its own")
-    tags = tags_of_film(videos)
-    with ExitStack() as opened:
+    tags_path = tags_of_film(videos)
+    with ExitStack() as stack:
         try:
             for video in videos:
                 refuse_inputs(video, ())
-            writers = [opened.enter_context(VideoWriter(video, SAMPLES_PER_S)) for video in videos]
-            tags.write_text(tags_text(world, len(videos)), encoding="utf-8")
+            writers = [stack.enter_context(VideoWriter(video, SAMPLES_PER_S)) for video in videos]
+            tags_path.write_text(tags_text(world, len(videos)), encoding="utf-8")
         except OSError as error:
-            raise OutputError(f"{tags}: {(error.strerror or str(error)).lower()}") from None
+            raise OutputError(f"{tags_path}: {(error.strerror or str(error)).lower()}") from None
         yield Film(world, writers, seed)

@@ -61,11 +61,11 @@ class Arm:
         self._engine = engine
         self._joints = joints_for(np.array([0.4, 0.0, ABOVE]), downwards(0.0), REST, 50)
         self._position, self._yaw = np.array([0.4, 0.0, ABOVE]), 0.0
-        self._width = WIDEST
+        self._commanded_width = WIDEST
         self._velocities = np.zeros_like(self._joints)
         self.limp = False
         """Whether the gripper stays open, regardless of its commands."""
-        engine.set_joints(self._joints, self._width)
+        engine.set_joints(self._joints, self._commanded_width)
 
     @property
     def position(self) -> Floats:
@@ -80,11 +80,11 @@ class Arm:
     @property
     def holds(self) -> bool:
         """Whether a body between the fingers keeps them from their commanded distance."""
-        return self.width > self._width + _PINCHED
+        return self.width > self._commanded_width + _PINCHED
 
     def drive(self) -> None:
         """Send the latest command to the motors, for one tick."""
-        width = WIDEST if self.limp else self._width
+        width = WIDEST if self.limp else self._commanded_width
         self._engine.drive(self._joints, self._velocities, width, _GRIP_FORCE)
 
     def aim(self, position: Floats, yaw: float) -> None:
@@ -96,11 +96,11 @@ class Arm:
     def move(self, x: float, y: float, z: float, yaw: float | None = None, *, speed: float = _FAST) -> Motion:
         """Move the tool in a straight line, and wait until it has reached the point."""
         goal = np.array([x, y, z])
-        start, turned = self._position, self._yaw
-        turn = 0.0 if yaw is None else yaw - turned
+        start, start_yaw = self._position, self._yaw
+        yaw_change = 0.0 if yaw is None else yaw - start_yaw
         distance = math.dist(start, goal)
-        for share in _shares(distance / speed, abs(turn) / _TURNING):
-            self.aim(start + share * (goal - start), turned + share * turn)
+        for share in _shares(distance / speed, abs(yaw_change) / _TURNING):
+            self.aim(start + share * (goal - start), start_yaw + share * yaw_change)
             yield
         yield from self._settle()
 
@@ -111,32 +111,34 @@ class Arm:
             yield from self.move(start[0], start[1], ABOVE)
             start = self._position
         radius, angle = math.hypot(start[0], start[1]), math.atan2(start[1], start[0])
-        longer, further = math.hypot(x, y) - radius, math.atan2(y, x) - angle
-        turned = self._yaw
-        turn = yaw - turned
+        radius_change, angle_change = math.hypot(x, y) - radius, math.atan2(y, x) - angle
+        start_yaw = self._yaw
+        yaw_change = yaw - start_yaw
         # the radius counts at least 0.4 m, which limits the angular speed around the base
-        lengths = math.hypot(longer, further * max(radius, 0.4))
-        for share in _shares(lengths / _FAST, abs(turn) / _TURNING):
-            r, a = max(radius + share * longer, _INSIDE), angle + share * further
-            self.aim(np.array([r * math.cos(a), r * math.sin(a), ABOVE]), turned + share * turn)
+        arc_length = math.hypot(radius_change, angle_change * max(radius, 0.4))
+        for share in _shares(arc_length / _FAST, abs(yaw_change) / _TURNING):
+            tool_radius = max(radius + share * radius_change, _INSIDE)
+            tool_angle = angle + share * angle_change
+            x_now, y_now = tool_radius * math.cos(tool_angle), tool_radius * math.sin(tool_angle)
+            self.aim(np.array([x_now, y_now, ABOVE]), start_yaw + share * yaw_change)
             yield
         # the goal may be closer to the base than the travel radius
         yield from self.move(x, y, ABOVE)
 
     def grip(self, width: float) -> Motion:
         """Move the fingers to a distance, or until a body stops them."""
-        self._width = width
+        self._commanded_width = width
         self._velocities = np.zeros_like(self._joints)
-        last = self.width
+        previous_width = self.width
         yield
         for _ in range(TICKS_PER_S):
             for _ in range(6):
                 yield
-            now = self.width
+            current_width = self.width
             # the fingers have stopped: at their distance, or at a body
-            if abs(now - last) < 2e-4:
+            if abs(current_width - previous_width) < 2e-4:
                 return
-            last = now
+            previous_width = current_width
 
     def wait(self, seconds: float) -> Motion:
         """Hold still."""
@@ -171,8 +173,8 @@ class Arm:
 def _shares(*durations_s: float) -> list[float]:
     """Return the completed share of a motion after each tick: a cubic, slow at both ends."""
     # the maximum speed of the cubic, in the middle, is 1.5 times its mean speed
-    count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
-    return [3 * (k / count) ** 2 - 2 * (k / count) ** 3 for k in range(1, count + 1)]
+    tick_count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
+    return [3 * (k / tick_count) ** 2 - 2 * (k / tick_count) ** 3 for k in range(1, tick_count + 1)]
 
 
 def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> float:
@@ -180,8 +182,8 @@ def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> flo
 
     The period is pi for an empty gripper, because it is symmetric, and 2 pi for a gripper that holds a body.
     """
-    low = math.atan2(y, x) + _MIDDLE - period / 2
-    return low + (yaw - low) % period
+    lower_bound = math.atan2(y, x) + _MIDDLE - period / 2
+    return lower_bound + (yaw - lower_bound) % period
 
 
 def in_reach(x: float, y: float) -> bool:
@@ -225,10 +227,10 @@ class Scene:
 
     def clearance(self, covered: Footprint, name: str, *, above: float = 0.0) -> float:
         """Return the distance, metres, to the nearest body other than `name` that is higher than `above`."""
-        others = [
+        other_footprints = [
             self.footprint(body) for body in self.bodies if body != name and self.height(body)[1] > above
         ]
-        return least_distance(covered, others) if others else math.inf
+        return least_distance(covered, other_footprints) if other_footprints else math.inf
 
 
 def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
@@ -240,10 +242,10 @@ def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
 
 def extent(covered: Footprint, angle: float) -> tuple[float, float]:
     """Return the smallest and largest coordinate of a footprint along a direction."""
-    along = np.array([math.cos(angle), math.sin(angle)])
-    spans = [(part.vertices @ along, part.radius) for part in covered.parts]
-    low = min(float(values.min()) - radius for values, radius in spans)
-    return low, max(float(values.max()) + radius for values, radius in spans)
+    direction = np.array([math.cos(angle), math.sin(angle)])
+    spans = [(part.vertices @ direction, part.radius) for part in covered.parts]
+    lowest = min(float(coordinates.min()) - radius for coordinates, radius in spans)
+    return lowest, max(float(coordinates.max()) + radius for coordinates, radius in spans)
 
 
 # ----------------------------------------------------------------------------------------------------- grasps
@@ -289,29 +291,29 @@ def best_grasp(
     Among equal grasps, the one across the thinnest side is preferred. A body that is not lifted is turned in
     the shorter direction.
     """
-    start = scene.place_of(name)
-    if not in_reach(*start):
+    start_point = scene.place_of(name)
+    if not in_reach(*start_point):
         return Outcome(False, f"{name} lies out of the robot's reach", "pick")
     if not in_reach(*goal):
         return Outcome(False, f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach", "place")
-    angles = _angles(scene, name)
-    across = [(thickness, angle) for thickness, angle in angles if thickness <= _THICKEST]
-    if not across:
-        thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
+    candidates = _angles(scene, name)
+    thin_candidates = [(thickness, angle) for thickness, angle in candidates if thickness <= _THICKEST]
+    if not thin_candidates:
+        thinnest = f"{min(candidates)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
         return Outcome(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
     bottom, top = scene.height(name)
     # the fingertips stay 3 mm above the body's lowest point
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
-    for thickness, angle in sorted(across):
+    for thickness, angle in sorted(thin_candidates):
         opening = min(WIDEST, thickness + _OPENING)
-        for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw, is_lifted):
-            grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
-            room_at_pick = _room(scene, name, start, grasp.yaw, grasp, bottom)
-            room_at_goal = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
+        for grasp_yaw, place_yaw in _turns(scene, name, angle, goal, yaw, is_lifted):
+            grasp = Grasp(grasp_yaw, place_yaw, above_bottom, opening)
+            pick_room = _room(scene, name, start_point, grasp.yaw, grasp, bottom)
+            goal_room = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
             can_turn_hand = True
-            can_pick, can_place = can_pick or room_at_pick > _ROOM, can_place or room_at_goal > _ROOM
-            room = min(room_at_pick, room_at_goal, _AMPLE)
+            can_pick, can_place = can_pick or pick_room > _ROOM, can_place or goal_room > _ROOM
+            room = min(pick_room, goal_room, _AMPLE)
             if room > best_room:
                 best, best_room = grasp, room
     if best is not None:
@@ -319,67 +321,67 @@ def best_grasp(
     if not can_turn_hand:
         return Outcome(False, f"the hand cannot turn as far as {name} has to be turned", "place")
     if can_pick and can_place:
-        said = f"no grasp of {name} has room for the fingers both where it lies and where it should go"
-        return Outcome(False, said, "place")
-    where = (
+        reason = f"no grasp of {name} has room for the fingers both where it lies and where it should go"
+        return Outcome(False, reason, "place")
+    sites = (
         "where it lies" if can_place else "where it should go" if can_pick else "where it lies and should go"
     )
-    return Outcome(False, f"no room for the fingers around {name} {where}", "place" if can_pick else "pick")
+    return Outcome(False, f"no room for the fingers around {name} {sites}", "place" if can_pick else "pick")
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:
     """Return the height of the surface under a point: the table, or a support."""
-    spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
-    under = [
+    goal_spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
+    surface_heights = [
         scene.height(support)[1]
         for support, body in scene.bodies.items()
-        if body.support and support != name and least_distance(spot, [scene.footprint(support)]) <= 0
+        if body.support and support != name and least_distance(goal_spot, [scene.footprint(support)]) <= 0
     ]
-    return max(under, default=0.0)
+    return max(surface_heights, default=0.0)
 
 
 def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
     """Return pairs (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
     pose, covered = scene.pose(name), scene.footprint(name)
     if isinstance(scene.bodies[name].shape, Box) and pose.is_level:
-        turns = [pose.yaw, pose.yaw + math.pi / 2]
+        tool_yaws = [pose.yaw, pose.yaw + math.pi / 2]
     else:
-        turns = [k * math.pi / _ANGLES for k in range(_ANGLES)]
-    spans = [(extent(covered, turn + math.pi / 2), turn) for turn in turns]
-    across = [(high - low, turn) for (low, high), turn in spans]
-    if len(across) == 2:
-        return across
-    thinnest = min(across)[0]
-    return [(thickness, turn) for thickness, turn in across if thickness < thinnest + 1e-3]
+        tool_yaws = [k * math.pi / _ANGLES for k in range(_ANGLES)]
+    spans = [(extent(covered, tool_yaw + math.pi / 2), tool_yaw) for tool_yaw in tool_yaws]
+    grasp_angles = [(high - low, tool_yaw) for (low, high), tool_yaw in spans]
+    if len(grasp_angles) == 2:
+        return grasp_angles
+    thinnest = min(grasp_angles)[0]
+    return [(thickness, tool_yaw) for thickness, tool_yaw in grasp_angles if thickness < thinnest + 1e-3]
 
 
 def _turns(
-    scene: Scene, name: str, angle: float, goal: Point, yaw: float | None, is_lifted: bool
+    scene: Scene, name: str, grasp_angle: float, goal: Point, yaw: float | None, is_lifted: bool
 ) -> Iterator[tuple[float, float]]:
     """Yield pairs of tool yaws, at the pick and at the place, that the arm can reach."""
-    pose, start = scene.pose(name), scene.place_of(name)
+    pose, start_point = scene.pose(name), scene.place_of(name)
     # a round body has no yaw, so the tool keeps its yaw relative to the direction from the base
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
     # the hand can hold a body in two opposite orientations
-    for picked in (angle, angle + math.pi):
-        grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
-        further = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
+    for hand_angle in (grasp_angle, grasp_angle + math.pi):
+        grasp_yaw = turn_towards(hand_angle, *start_point, 2 * math.pi)
+        yaw_change = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
         if is_round:
-            further = math.atan2(goal[1], goal[0]) - math.atan2(start[1], start[0])
-        turn = grasp_yaw + math.remainder(further, math.tau)
+            yaw_change = math.atan2(goal[1], goal[0]) - math.atan2(start_point[1], start_point[0])
+        place_yaw = grasp_yaw + math.remainder(yaw_change, math.tau)
         if is_lifted:
-            turn = turn_towards(grasp_yaw + further, *goal, 2 * math.pi)
-        if can_turn(grasp_yaw, *start) and can_turn(turn, *goal):
-            yield grasp_yaw, turn
+            place_yaw = turn_towards(grasp_yaw + yaw_change, *goal, 2 * math.pi)
+        if can_turn(grasp_yaw, *start_point) and can_turn(place_yaw, *goal):
+            yield grasp_yaw, place_yaw
 
 
-def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bottom: float) -> float:
+def _room(scene: Scene, name: str, place: Point, tool_yaw: float, grasp: Grasp, support_z: float) -> float:
     """Return the clearance of fingers and hand to other bodies while they hold a body at a place."""
-    tool = bottom + grasp.above_bottom
-    fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, turn)
-    hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, turn)
-    around_fingers = scene.clearance(fingers, name, above=tool - FINGERTIP)
-    return min(around_fingers, scene.clearance(hand, name, above=tool + _HAND_ABOVE))
+    tool_z = support_z + grasp.above_bottom
+    fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, tool_yaw)
+    hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, tool_yaw)
+    around_fingers = scene.clearance(fingers, name, above=tool_z - FINGERTIP)
+    return min(around_fingers, scene.clearance(hand, name, above=tool_z + _HAND_ABOVE))
 
 
 # ---------------------------------------------------------------------------------------------------- picking
@@ -403,25 +405,25 @@ def picking(
     grasp = best_grasp(scene, name, goal, yaw)
     if isinstance(grasp, Outcome):
         return grasp
-    stood = scene.pose(name).stands
-    at: Stage = "pick"
-    trouble = yield from pick_up(scene, name, grasp)
-    if not trouble:
-        at, trouble = "way", (yield from carry(scene, name, grasp, goal, via))
-    if not trouble:
-        at, trouble = "place", (yield from set_down(scene, name, goal))
+    is_standing = scene.pose(name).stands
+    stage: Stage = "pick"
+    failure = yield from pick_up(scene, name, grasp)
+    if not failure:
+        stage, failure = "way", (yield from carry(scene, name, grasp, goal, via))
+    if not failure:
+        stage, failure = "place", (yield from set_down(scene, name, goal))
     yield from let_go(scene, grasp.opening)
-    trouble = trouble or miss_text(scene, name, goal, stood=stood)
-    return Outcome(False, trouble, at) if trouble else Outcome(True, f"placed {name}")
+    failure = failure or miss_text(scene, name, goal, stood=is_standing)
+    return Outcome(False, failure, stage) if failure else Outcome(True, f"placed {name}")
 
 
 def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
     """Grasp a body and lift it; return the reason of a failure, or ""."""
-    (x, y), trouble = scene.place_of(name), (yield from take_hold(scene, name, grasp))
-    if trouble:
-        return trouble
-    lifted = yield from _holding(scene, name, scene.arm.move(x, y, ABOVE, speed=2 * _SLOW))
-    return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
+    (x, y), failure = scene.place_of(name), (yield from take_hold(scene, name, grasp))
+    if failure:
+        return failure
+    is_lifted = yield from _holding(scene, name, scene.arm.move(x, y, ABOVE, speed=2 * _SLOW))
+    return "" if is_lifted else f"{name} slipped out of the fingers as it was lifted"
 
 
 def take_hold(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
@@ -443,11 +445,11 @@ def carry(
 ) -> Generator[None, None, str]:
     """Move the held body along `via` to a position above `goal`; return the reason of a failure, or ""."""
     # `travel` moves around the base; between such close points its path is nearly straight
-    way = (scene.place_of(name), *via, goal)
-    for point in islice(points_along(way, _STRAIGHT), 1, None) if via else (goal,):
+    waypoints = (scene.place_of(name), *via, goal)
+    for point in islice(points_along(waypoints, _STRAIGHT), 1, None) if via else (goal,):
         x, y = _tool_for(scene, name, point, grasp.turn)
-        carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
-        if not carried:
+        is_carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
+        if not is_carried:
             return f"{name} slipped out of the fingers on the way"
     return ""
 
@@ -457,12 +459,12 @@ def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, Non
     grasp = best_grasp(scene, name, scene.place_of(name), yaw, is_lifted=False)
     if isinstance(grasp, Outcome):
         return grasp.reason
-    trouble = yield from take_hold(scene, name, grasp)
-    if not trouble:
-        turned = yield from _holding(scene, name, scene.arm.move(*scene.arm.commanded, grasp.turn))
-        trouble = "" if turned else f"{name} slipped out of the fingers as it was turned"
+    failure = yield from take_hold(scene, name, grasp)
+    if not failure:
+        is_turned = yield from _holding(scene, name, scene.arm.move(*scene.arm.commanded, grasp.turn))
+        failure = "" if is_turned else f"{name} slipped out of the fingers as it was turned"
     yield from let_go(scene, grasp.opening)
-    return trouble
+    return failure
 
 
 def put_back(scene: Scene, name: str) -> Motion:
@@ -475,13 +477,13 @@ def put_back(scene: Scene, name: str) -> Motion:
 def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
     """Lower the held body onto its support; return the reason of a failure, or ""."""
     arm = scene.arm
-    x, y, above = arm.commanded
+    x, y, tool_z = arm.commanded
     # measured now, because the grasp may have changed the pose of the body
-    z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
-    lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
-    if lowered:
-        lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
-    return "" if lowered else f"{name} slipped out of the fingers as it was set down"
+    z = surface(scene, name, goal) + tool_z - scene.height(name)[0] + _SETTING_DOWN
+    is_lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
+    if is_lowered:
+        is_lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
+    return "" if is_lowered else f"{name} slipped out of the fingers as it was set down"
 
 
 def let_go(scene: Scene, opening: float) -> Motion:
@@ -495,26 +497,26 @@ def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> st
     """Return a sentence on a released body that misses its goal, or ""."""
     if stood and not scene.pose(name).stands:
         return f"{name} fell over"
-    away = math.dist(scene.place_of(name), goal)
-    return "" if away <= _NEAR else f"{name} lies {away * 100:.1f} cm from where it was put"
+    miss_m = math.dist(scene.place_of(name), goal)
+    return "" if miss_m <= _NEAR else f"{name} lies {miss_m * 100:.1f} cm from where it was put"
 
 
-def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
+def _tool_for(scene: Scene, name: str, goal: Point, tool_yaw: float) -> Point:
     """Return the tool position at which the held body, usually off centre, is at a point."""
     x, y = scene.place_of(name)
     tool_x, tool_y, _ = scene.arm.commanded
-    dx, dy, turned = x - tool_x, y - tool_y, turn - scene.arm.yaw
-    cosine, sine = math.cos(turned), math.sin(turned)
+    dx, dy, yaw_change = x - tool_x, y - tool_y, tool_yaw - scene.arm.yaw
+    cosine, sine = math.cos(yaw_change), math.sin(yaw_change)
     return goal[0] - dx * cosine + dy * sine, goal[1] - dx * sine - dy * cosine
 
 
 def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
     """Run a motion while the fingers hold a body; stop and return False if they lose it."""
-    lost = 0
+    lost_ticks = 0
     for _ in motion:
         yield
-        lost = lost + 1 if scene.engine.fingers_touching(name) == 0 else 0
-        if lost >= _LOST_TICKS:
+        lost_ticks = lost_ticks + 1 if scene.engine.fingers_touching(name) == 0 else 0
+        if lost_ticks >= _LOST_TICKS:
             return False
     return True
 
@@ -554,33 +556,33 @@ def pushing(
     corners = straighten([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
         # corners need less precision than the goal
-        trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
-        if trouble is not None:
-            return trouble
-    trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
-    if trouble is not None:
-        return trouble
-    if turning := (yield from _turn_to(scene, name, corners[-1], yaw)):
-        return Outcome(False, turning, "place")
+        failure = yield from _push_to(scene, name, corner, max_strokes=1, tolerance_m=3 * _FAR)
+        if failure is not None:
+            return failure
+    failure = yield from _push_to(scene, name, corners[-1], max_strokes=_STROKES, tolerance_m=_FAR)
+    if failure is not None:
+        return failure
+    if turn_failure := (yield from _turn_to(scene, name, corners[-1], yaw)):
+        return Outcome(False, turn_failure, "place")
     is_straight = len(corners) == 1
-    way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
-    turned = "" if yaw is None else ", and turned it there"
-    return Outcome(True, f"pushed {name} {way}{turned}")
+    way_text = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
+    turn_text = "" if yaw is None else ", and turned it there"
+    return Outcome(True, f"pushed {name} {way_text}{turn_text}")
 
 
 def _push_to(
-    scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
+    scene: Scene, name: str, goal: Point, *, max_strokes: int, tolerance_m: float
 ) -> Generator[None, None, Outcome | None]:
     """Push a body to a point in up to `strokes` strokes; return the failure, or None."""
     miss_m = 0.0
-    for _ in range(strokes):
-        trouble = yield from _stroke(scene, name, goal)
-        if trouble is not None:
-            return trouble
+    for _ in range(max_strokes):
+        failure = yield from _stroke(scene, name, goal)
+        if failure is not None:
+            return failure
         miss_m = math.dist(scene.place_of(name), goal)
         if miss_m <= _CLOSE:
             break
-    if miss_m <= allowed:
+    if miss_m <= tolerance_m:
         return None
     return Outcome(False, f"{name} ended {miss_m * 100:.1f} cm from where it was pushed to", "place")
 
@@ -592,12 +594,12 @@ def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generat
     for _ in range(_TURNS):
         if abs(scene.pose(name).turned_from(yaw)) <= _TURNED:
             break
-        trouble = yield from turn_on_the_spot(scene, name, yaw)
-        if trouble:
-            return trouble
-    left = abs(scene.pose(name).turned_from(yaw))
-    if left > _TURNED:
-        return f"{name} is {math.degrees(left):.0f} degrees from how it was turned"
+        failure = yield from turn_on_the_spot(scene, name, yaw)
+        if failure:
+            return failure
+    remaining_yaw = abs(scene.pose(name).turned_from(yaw))
+    if remaining_yaw > _TURNED:
+        return f"{name} is {math.degrees(remaining_yaw):.0f} degrees from how it was turned"
     miss_m = math.dist(scene.place_of(name), goal)
     return "" if miss_m <= _FAR else f"{name} ended {miss_m * 100:.1f} cm from where it was pushed to"
 
@@ -608,74 +610,77 @@ def straighten(path: Sequence[Point]) -> list[Point]:
         return list(path)
     points = np.array(path)
     chord = points[-1] - points[0]
-    length = float(np.hypot(*chord))
+    chord_length = float(np.hypot(*chord))
     offsets = points - points[0]
-    if length > 0:
-        away = np.abs(offsets[:, 0] * chord[1] - offsets[:, 1] * chord[0]) / length
+    if chord_length > 0:
+        distances = np.abs(offsets[:, 0] * chord[1] - offsets[:, 1] * chord[0]) / chord_length
     else:
-        away = np.hypot(offsets[:, 0], offsets[:, 1])
-    farthest = int(np.argmax(away))
-    if away[farthest] <= _STRAIGHTENED:
+        distances = np.hypot(offsets[:, 0], offsets[:, 1])
+    farthest_index = int(np.argmax(distances))
+    if distances[farthest_index] <= _STRAIGHTENED:
         return [path[0], path[-1]]
-    return straighten(path[: farthest + 1])[:-1] + straighten(path[farthest:])
+    return straighten(path[: farthest_index + 1])[:-1] + straighten(path[farthest_index:])
 
 
 def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outcome | None]:
     """Push a body in a straight line to a point; return the failure, or None."""
     x, y = scene.place_of(name)
-    length = math.dist((x, y), goal)
-    if length < _CLOSE:
+    distance = math.dist((x, y), goal)
+    if distance < _CLOSE:
         return None
     heading = math.atan2(goal[1] - y, goal[0] - x)
-    u, v = math.cos(heading), math.sin(heading)
-    back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
-    behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
+    unit_x, unit_y = math.cos(heading), math.sin(heading)
+    back = unit_x * x + unit_y * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
+    start_point = (x - unit_x * (back + _AWAY), y - unit_y * (back + _AWAY))
     if not in_reach(*goal):
-        said = f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
-        return Outcome(False, said, "place")
-    if not in_reach(*behind):
+        reason = f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
+        return Outcome(False, reason, "place")
+    if not in_reach(*start_point):
         return Outcome(False, f"the robot does not reach behind {name} where it lies", "pick")
-    gap = _gap(scene, name, behind, heading)
-    if gap is None:
+    finger_width = _gap(scene, name, start_point, heading)
+    if finger_width is None:
         return Outcome(False, f"no room for the fingers behind {name}", "pick")
     arm = scene.arm
-    yield from arm.travel(*behind, turn_towards(heading, *behind))
-    yield from arm.grip(gap)
-    yield from arm.move(*behind, 0.08)
-    yield from arm.move(*behind, _LOW, speed=0.2)
-    reached = yield from _advance(scene, name, behind, heading, length, back)
+    yield from arm.travel(*start_point, turn_towards(heading, *start_point))
+    yield from arm.grip(finger_width)
+    yield from arm.move(*start_point, 0.08)
+    yield from arm.move(*start_point, _LOW, speed=0.2)
+    is_pushed = yield from _advance(scene, name, start_point, heading, distance, back)
     x, y, z = arm.commanded
-    yield from arm.move(x - 0.02 * u, y - 0.02 * v, z)
-    yield from arm.move(x - 0.02 * u, y - 0.02 * v, 0.1)
-    return None if reached else Outcome(False, f"the fingers lost {name}", "way")
+    yield from arm.move(x - 0.02 * unit_x, y - 0.02 * unit_y, z)
+    yield from arm.move(x - 0.02 * unit_x, y - 0.02 * unit_y, 0.1)
+    return None if is_pushed else Outcome(False, f"the fingers lost {name}", "way")
 
 
 def _advance(
-    scene: Scene, name: str, behind: Point, heading: float, length: float, back: float
+    scene: Scene, name: str, start_point: Point, heading: float, distance: float, back: float
 ) -> Generator[None, None, bool]:
     """Move the fingers forward until the body has moved by `length`; return False if it does not."""
-    u, v = math.cos(heading), math.sin(heading)
+    unit_x, unit_y = math.cos(heading), math.sin(heading)
     x, y = scene.place_of(name)
-    travelled = 0.0
+    advance = 0.0
     while True:
-        now = scene.place_of(name)
-        remaining = length - (now[0] - x) * u - (now[1] - y) * v
+        body_place = scene.place_of(name)
+        remaining = distance - (body_place[0] - x) * unit_x - (body_place[1] - y) * unit_y
         if remaining <= _MARGIN:
             return True
         # the fingers have passed the goal without the body
-        if travelled > length + back + _AWAY:
+        if advance > distance + back + _AWAY:
             return False
-        travelled += min(_PUSH_FAST, _PUSH_SLOW + 2.0 * remaining) / TICKS_PER_S
-        scene.arm.aim(np.array([behind[0] + u * travelled, behind[1] + v * travelled, _LOW]), scene.arm.yaw)
+        advance += min(_PUSH_FAST, _PUSH_SLOW + 2.0 * remaining) / TICKS_PER_S
+        scene.arm.aim(
+            np.array([start_point[0] + unit_x * advance, start_point[1] + unit_y * advance, _LOW]),
+            scene.arm.yaw,
+        )
         yield
 
 
-def _gap(scene: Scene, name: str, behind: Point, heading: float) -> float | None:
+def _gap(scene: Scene, name: str, place: Point, heading: float) -> float | None:
     """Return the widest distance of the fingers that fits behind a body; None if no distance fits."""
-    low, high = extent(scene.footprint(name), heading + math.pi / 2)
-    widest = max(0.0, min(0.05, high - low - 2 * FINGER_WIDTH))
+    lowest, highest = extent(scene.footprint(name), heading + math.pi / 2)
+    widest = max(0.0, min(0.05, highest - lowest - 2 * FINGER_WIDTH))
     for gap in (widest, widest / 2, 0.0):
-        fingers = rectangle(*behind, FINGER_DEPTH, gap + 2 * FINGER_WIDTH, heading)
+        fingers = rectangle(*place, FINGER_DEPTH, gap + 2 * FINGER_WIDTH, heading)
         if scene.clearance(fingers, name) > _MARGIN:
             return gap
     return None

@@ -70,16 +70,16 @@ def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _
     """
     joints = start
     for _ in range(steps):
-        reached, turned, jacobian = _chain(joints)
-        error = np.concatenate([position - reached, _rotation_between(turned, rotation)])
-        square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
-        inverse = np.linalg.solve(square, jacobian).T
-        free = np.eye(JOINTS) - inverse @ jacobian
-        rest = REST.copy()
-        rest[0] = math.atan2(position[1], position[0])
+        tool_position, tool_rotation, jacobian = _chain(joints)
+        error = np.concatenate([position - tool_position, _rotation_between(tool_rotation, rotation)])
+        damped_square = jacobian @ jacobian.T + _DAMPING * np.eye(6)
+        inverse = np.linalg.solve(damped_square, jacobian).T
+        null_space = np.eye(JOINTS) - inverse @ jacobian
+        rest_joints = REST.copy()
+        rest_joints[0] = math.atan2(position[1], position[0])
         # the last joint sets the yaw of the tool and has no rest position
-        rest[6] = joints[6]
-        change = inverse @ error + free @ (0.1 * (rest - joints))
+        rest_joints[6] = joints[6]
+        change = inverse @ error + null_space @ (0.1 * (rest_joints - joints))
         joints = np.clip(joints + change * min(1.0, _LONGEST / max(1e-9, np.abs(change).max())), LOWER, UPPER)
     return joints
 
@@ -96,19 +96,19 @@ def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
         rotation = rotation @ _about_z(angle)
     position = position + rotation[:, 2] * _TOOL
     rotation = rotation @ _about_z(-math.pi / 4)
-    a, b, c = around = np.array(axes).T
+    a, b, c = axis_rows = np.array(axes).T
     x, y, z = position[:, None] - np.array(origins).T
-    return position, rotation, np.stack([b * z - c * y, c * x - a * z, a * y - b * x, *around])
+    return position, rotation, np.stack([b * z - c * y, c * x - a * z, a * y - b * x, *axis_rows])
 
 
 def _rotation_between(first: Floats, second: Floats) -> Floats:
     """Return the rotation vector (3,) between two rotations, exact enough for an iteration."""
-    between = second @ first.T
+    rotation = second @ first.T
     axis = np.array(
-        [between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]]
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
     sine = float(np.sqrt(axis @ axis)) / 2
-    angle = math.atan2(sine, (float(np.trace(between)) - 1) / 2)
+    angle = math.atan2(sine, (float(np.trace(rotation)) - 1) / 2)
     return axis * (angle / (2 * sine)) if sine > 1e-9 else axis / 2
 
 
@@ -192,26 +192,27 @@ class Engine:
         colour: tuple[float, float, float],
     ) -> None:
         """Add a body with its z axis upwards; a mass of 0 fixes it."""
-        number = self._add(shape, mass, position, yaw, (*colour, 1.0))
-        self._call("changeDynamics", number, -1, **_FRICTION)
-        self._bodies[name] = number
+        body_id = self._add(shape, mass, position, yaw, (*colour, 1.0))
+        self._call("changeDynamics", body_id, -1, **_FRICTION)
+        self._bodies[name] = body_id
 
     def pose(self, name: str) -> Pose:
         """Return the pose of a body."""
-        position, turn = self._call("getBasePositionAndOrientation", self._bodies[name])
-        return Pose(np.array(position), np.array(self._bullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
+        position, quaternion = self._call("getBasePositionAndOrientation", self._bodies[name])
+        rotation = np.array(self._bullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+        return Pose(np.array(position), rotation)
 
     def move(self, name: str, x: float, y: float) -> None:
         """Move a fixed body without regard to collisions; its height and orientation do not change."""
-        (*_, z), turn = self._call("getBasePositionAndOrientation", self._bodies[name])
-        self._call("resetBasePositionAndOrientation", self._bodies[name], (x, y, z), turn)
+        (*_, z), quaternion = self._call("getBasePositionAndOrientation", self._bodies[name])
+        self._call("resetBasePositionAndOrientation", self._bodies[name], (x, y, z), quaternion)
 
     # -------------------------------------------------------------------------------------- the robot
 
     def set_joints(self, joints: Floats, width: float) -> None:
         """Reset the arm's joints (7,) and the fingers, `width` metres apart, without motion."""
-        for number, angle in enumerate(joints.tolist()):
-            self._call("resetJointState", self._robot, number, angle)
+        for joint_index, angle in enumerate(joints.tolist()):
+            self._call("resetJointState", self._robot, joint_index, angle)
         for finger in FINGERS:
             self._call("resetJointState", self._robot, finger, width / 2)
 
@@ -252,10 +253,10 @@ class Engine:
 
     def fingers_touching(self, name: str) -> int:
         """Return how many of the two fingers touch a body."""
-        touching = (
+        contact_points = (
             self._call("getContactPoints", self._robot, self._bodies[name], finger) for finger in FINGERS
         )
-        return sum(bool(points) for points in touching)
+        return sum(bool(points) for points in contact_points)
 
     def picture(
         self,
@@ -272,19 +273,25 @@ class Engine:
         """
         width, height = size
         # PyBullet's field of view is vertical, in degrees
-        angle = math.degrees(2 * math.atan(height / 2 / focal))
+        view_angle = math.degrees(2 * math.atan(height / 2 / focal))
         bullet = self._bullet
-        view = bullet.computeViewMatrix(eye, look_at, (0.0, 0.0, 1.0))
-        lens = bullet.computeProjectionMatrixFOV(angle, width / height, _NEAR, _FAR)
+        view_matrix = bullet.computeViewMatrix(eye, look_at, (0.0, 0.0, 1.0))
+        projection_matrix = bullet.computeProjectionMatrixFOV(view_angle, width / height, _NEAR, _FAR)
         # the software renderer also works without a display
-        seen = self._call(
-            "getCameraImage", width, height, view, lens, renderer=bullet.ER_TINY_RENDERER, shadow=0
+        camera_image = self._call(
+            "getCameraImage",
+            width,
+            height,
+            view_matrix,
+            projection_matrix,
+            renderer=bullet.ER_TINY_RENDERER,
+            shadow=0,
         )
         # a PyBullet that was built without NumPy returns tuples
-        colours = np.asarray(seen[2], np.uint8).reshape(height, width, 4)[..., :3]
+        colours = np.asarray(camera_image[2], np.uint8).reshape(height, width, 4)[..., :3]
         # the depth buffer is not linear: 0 at _NEAR, 1 at _FAR
-        share = np.asarray(seen[3], np.float64).reshape(height, width)
-        return colours, _FAR * _NEAR / (_FAR - (_FAR - _NEAR) * share)
+        depth_buffer = np.asarray(camera_image[3], np.float64).reshape(height, width)
+        return colours, _FAR * _NEAR / (_FAR - (_FAR - _NEAR) * depth_buffer)
 
     def set_grip(self, friction: float) -> None:
         """Set the friction of the fingers: 1 for rubber, close to 0 for oil."""
@@ -296,9 +303,9 @@ class Engine:
     def _couple_fingers(self) -> None:
         """Couple the fingers, as in the real hand, so that a held body stays in the middle."""
         left, right = FINGERS
-        kind, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
+        joint_type, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
         gear = self._call(
-            "createConstraint", self._robot, left, self._robot, right, kind, axis, centre, centre
+            "createConstraint", self._robot, left, self._robot, right, joint_type, axis, centre, centre
         )
         self._call("changeConstraint", gear, gearRatio=-1, erp=0.1, maxForce=50)
 
@@ -312,16 +319,18 @@ class Engine:
     ) -> int:
         bullet = self._bullet
         if isinstance(shape, Box):
-            half = [shape.length / 2, shape.width / 2, shape.height / 2]
-            collision = self._call("createCollisionShape", bullet.GEOM_BOX, halfExtents=half)
-            visual = self._call("createVisualShape", bullet.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+            half_lengths = [shape.length / 2, shape.width / 2, shape.height / 2]
+            collision = self._call("createCollisionShape", bullet.GEOM_BOX, halfExtents=half_lengths)
+            visual = self._call(
+                "createVisualShape", bullet.GEOM_BOX, halfExtents=half_lengths, rgbaColor=colour
+            )
         else:
-            kind, r, h = bullet.GEOM_CYLINDER, shape.radius, shape.height
-            collision = self._call("createCollisionShape", kind, radius=r, height=h)
-            visual = self._call("createVisualShape", kind, radius=r, length=h, rgbaColor=colour)
-        turn = bullet.getQuaternionFromEuler((0.0, 0.0, yaw))
-        number: int = self._call("createMultiBody", mass, collision, visual, position, turn)
-        return number
+            cylinder_type, r, h = bullet.GEOM_CYLINDER, shape.radius, shape.height
+            collision = self._call("createCollisionShape", cylinder_type, radius=r, height=h)
+            visual = self._call("createVisualShape", cylinder_type, radius=r, length=h, rgbaColor=colour)
+        quaternion = bullet.getQuaternionFromEuler((0.0, 0.0, yaw))
+        body_id: int = self._call("createMultiBody", mass, collision, visual, position, quaternion)
+        return body_id
 
     def _call(self, function: str, *arguments: Any, **named: Any) -> Any:
         """Call a function of the simulator for this world, because a process may have several worlds."""
@@ -349,8 +358,8 @@ def _refuse_no_display() -> None:
     Raises:
         UsageError: there is no display.
     """
-    name = os.environ.get("DISPLAY")
-    if not name:
+    display_name = os.environ.get("DISPLAY")
+    if not display_name:
         raise UsageError("there is no display to show the world on (DISPLAY is not set); run without gui")
     try:
         x11 = ctypes.CDLL("libX11.so.6")
@@ -359,7 +368,9 @@ def _refuse_no_display() -> None:
     x11.XOpenDisplay.restype = ctypes.c_void_p
     display = x11.XOpenDisplay(None)
     if display is None:
-        raise UsageError(f"the display {name} cannot be opened (DISPLAY); correct it, or run without gui")
+        raise UsageError(
+            f"the display {display_name} cannot be opened (DISPLAY); correct it, or run without gui"
+        )
     x11.XCloseDisplay(ctypes.c_void_p(display))
 
 
@@ -369,8 +380,8 @@ def _without_greeting() -> Iterator[None]:
     # C code writes it, so only the file descriptor can be redirected
     stderr = os.dup(2)
     try:
-        with Path(os.devnull).open("wb") as nothing:
-            os.dup2(nothing.fileno(), 2)
+        with Path(os.devnull).open("wb") as null_file:
+            os.dup2(null_file.fileno(), 2)
         yield
     finally:
         os.dup2(stderr, 2)

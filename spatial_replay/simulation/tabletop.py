@@ -139,12 +139,12 @@ class Tabletop:
             raise UsageError(f"the noise is {noise_m} m; give 0 or more")
         for injection in injections:
             if injection.kind == "drop" and scenario.skill == "push":
-                what = f"nothing is held in {scenario.name}"
-                raise UsageError(f"{injection}: {what}; slip can be injected there")
-        names = [placement.body.name for placement in scenario.placements]
+                reason = f"nothing is held in {scenario.name}"
+                raise UsageError(f"{injection}: {reason}; slip can be injected there")
+        body_names = [placement.body.name for placement in scenario.placements]
         for start in starts:
-            if start.name not in names:
-                hint = nearest_hint(start.name, names) or f"there are {', '.join(names)}"
+            if start.name not in body_names:
+                hint = nearest_hint(start.name, body_names) or f"there are {', '.join(body_names)}"
                 raise UsageError(f"{start}: {scenario.name} has no {start.name!r}; {hint}")
         self._scenario = scenario
         self._starts = {start.name: start for start in starts}
@@ -152,7 +152,7 @@ class Tabletop:
         self._injections = tuple(injections)
         self._listen: Callable[[Sample], str | None] = lambda sample: None
         self._listen_to_tree: Callable[[TreeTick], None] = lambda tick: None
-        self._halt = ""
+        self._halt_reason = ""
         self._gui = gui
         self._engine: Engine | None = None
         self.reset(seed)
@@ -203,21 +203,21 @@ class Tabletop:
         if seed < 0:
             raise UsageError(f"the seed is {seed}; give 0 or more")
         self.close()
-        self._seed, self._ticks, self._last_sampled = seed, 0, -1
+        self._seed, self._ticks, self._last_sampled_tick = seed, 0, -1
         # a reset of PyBullet leaves internal state behind; only a new simulator repeats a run exactly
         self._engine = engine = Engine(gui=self._gui)
         # another stream of random numbers than the detection noise has
         scenario, generator = self._scenario, np.random.default_rng([seed, 0])
         for placement in scenario.placements:
             dx, dy, turn = (generator.random(3) * 2 - 1).tolist()
-            tall = placement.body.shape.height
+            body_height = placement.body.shape.height
             x, y = placement.x + dx * scenario.scatter_m, placement.y + dy * scenario.scatter_m
             yaw = placement.yaw + turn * scenario.scatter_rad
             if (start := self._starts.get(placement.body.name)) is not None:
                 x, y, yaw = start.x, start.y, yaw if start.turn is None else start.turn
-            place = (x, y, placement.bottom + tall / 2 + 5e-4)
+            centre = (x, y, placement.bottom + body_height / 2 + 5e-4)
             engine.add(
-                placement.body.name, placement.body.shape, placement.mass_kg, place, yaw, placement.colour
+                placement.body.name, placement.body.shape, placement.mass_kg, centre, yaw, placement.colour
             )
         bodies = {placement.body.name: placement.body for placement in scenario.placements}
         arm, bodies_by_name = Arm(engine), MappingProxyType(bodies)
@@ -229,8 +229,8 @@ class Tabletop:
     def sample(self) -> Sample:
         """Return the current sample of all bodies with detection noise; repeated calls give equal samples."""
         self._open_engine()
-        number = self._ticks // _TICKS_PER_SAMPLE
-        errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
+        sample_number = self._ticks // _TICKS_PER_SAMPLE
+        errors = _displacements(self._noise_m, self._seed, sample_number, len(self._scene.bodies))
         objects = {
             name: self._tracked_object(body, self._scene.pose(name), error)
             for (name, body), error in zip(self._scene.bodies.items(), errors, strict=True)
@@ -287,10 +287,10 @@ class Tabletop:
 
     def _move(self, name: str, motion: Generator[None, None, Outcome]) -> Outcome:
         """Run a motion of a body to its end, or until the listener stops it."""
-        self._halt = ""
-        if (result := self.run(motion, lambda: self._halt)) is not None:
+        self._halt_reason = ""
+        if (result := self.run(motion, lambda: self._halt_reason)) is not None:
             return result
-        reason = self._halt
+        reason = self._halt_reason
         motion.close()
         if self._scenario.skill == "place":
             self.run(put_back(self._scene, name))
@@ -315,14 +315,14 @@ class Tabletop:
         """Advance by one command of the arm."""
         engine = self._open_engine()
         self._emit()
-        began = time.monotonic() if self._gui else 0.0
+        start_s = time.monotonic() if self._gui else 0.0
         self._inject()
         self._scene.arm.drive()
         for _ in range(STEPS_PER_TICK):
             engine.step()
         self._ticks += 1
         if self._gui:
-            time.sleep(max(0.0, began + 1 / TICKS_PER_S - time.monotonic()))
+            time.sleep(max(0.0, start_s + 1 / TICKS_PER_S - time.monotonic()))
         self._emit()
 
     def close(self) -> None:
@@ -333,25 +333,25 @@ class Tabletop:
 
     def _emit(self) -> None:
         """Pass the current sample to the listener if a sample is due and was not passed yet."""
-        if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
-            self._last_sampled = self._ticks
-            self._halt = self._listen(self.sample()) or ""
+        if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled_tick:
+            self._last_sampled_tick = self._ticks
+            self._halt_reason = self._listen(self.sample()) or ""
 
     def _inject(self) -> None:
         if not self._injections:
             return
-        going_on = {injection.kind for injection in self._injections if injection.holds(self.time_ns)}
-        self._scene.arm.limp = "drop" in going_on
-        self._scene.engine.set_grip(_OIL if "slip" in going_on else _RUBBER)
+        active_kinds = {injection.kind for injection in self._injections if injection.holds(self.time_ns)}
+        self._scene.arm.limp = "drop" in active_kinds
+        self._scene.engine.set_grip(_OIL if "slip" in active_kinds else _RUBBER)
 
     def _tracked_object(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
-        detected = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
+        detected_pose = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
         yaw = pose.yaw if isinstance(body.shape, Box) and pose.is_level else None
         return TrackedObject(
-            footprint(body.shape, detected),
+            footprint(body.shape, detected_pose),
             class_name=body.class_name,
             yaw=yaw,
-            height=None if body.support else height(body.shape, detected),
+            height=None if body.support else height(body.shape, detected_pose),
             uncertainty=self._noise_m,
         )
 
@@ -370,25 +370,27 @@ class Tabletop:
         if self._scenario.skill != skill:
             robot_skill = self._scenario.skill
             raise UsageError(f"the robot of {self.name} does not {skill} objects; it can {robot_skill} them")
-        movable = [body.name for body in self.bodies if body.movable]
-        if name not in movable:
-            raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable)} can")
+        movable_names = [body.name for body in self.bodies if body.movable]
+        if name not in movable_names:
+            raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable_names)} can")
         if not numbers or not all(map(math.isfinite, numbers)):
             raise UsageError(f"{name} cannot be moved to {list(numbers)}; give finite numbers")
 
 
-def _displacements(radius_m: float, seed: int, sample: int, count: int) -> list[tuple[float, float]]:
+def _displacements(
+    radius_m: float, seed: int, sample_number: int, body_count: int
+) -> list[tuple[float, float]]:
     """Return the detection error of each of `count` bodies in a sample, metres along x and y.
 
     Errors are uniform on a disc, so that no error exceeds the radius. They depend only on the arguments, so
     that a repeated sample has equal errors.
     """
     if radius_m == 0:
-        return [(0.0, 0.0)] * count
-    polar = np.random.default_rng([seed, sample, 1]).random((count, 2))
+        return [(0.0, 0.0)] * body_count
+    random_numbers = np.random.default_rng([seed, sample_number, 1]).random((body_count, 2))
     # the square root makes the density uniform over the disc
-    radii = (radius_m * np.sqrt(polar[:, 0])).tolist()
-    angles = (2 * math.pi * polar[:, 1]).tolist()
+    radii = (radius_m * np.sqrt(random_numbers[:, 0])).tolist()
+    angles = (2 * math.pi * random_numbers[:, 1]).tolist()
     return [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
 
 

@@ -98,11 +98,11 @@ def footprint(shape: Shape, pose: Pose) -> Footprint:
 def height(shape: Shape, pose: Pose) -> tuple[float, float]:
     """Return the lowest and highest z of a body, metres."""
     z = float(pose.position[2])
-    up = np.abs(pose.rotation[2])
+    z_shares = np.abs(pose.rotation[2])
     if isinstance(shape, Box):
-        half = float(up @ np.array([shape.length, shape.width, shape.height])) / 2
+        half = float(z_shares @ np.array([shape.length, shape.width, shape.height])) / 2
     else:
-        half = shape.radius * math.hypot(up[0], up[1]) + shape.height / 2 * float(up[2])
+        half = shape.radius * math.hypot(z_shares[0], z_shares[1]) + shape.height / 2 * float(z_shares[2])
     return z - half, z + half
 
 
@@ -123,8 +123,8 @@ def _outline(shape: Shape, pose: Pose) -> Floats:
         # a circumscribed polygon, so that the footprint covers the body
         rim = shape.radius / math.cos(math.pi / _RIM) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         points = np.concatenate([np.c_[rim, np.full(_RIM, z)] for z in (-shape.height / 2, shape.height / 2)])
-    moved: Floats = points @ pose.rotation.T + pose.position
-    return moved
+    world_points: Floats = points @ pose.rotation.T + pose.position
+    return world_points
 
 
 # ----------------------------------------------------------------------------------------------------- worlds
@@ -220,15 +220,15 @@ class Start:
         """
         name, _, place = text.partition("=")
         try:
-            numbers = [float(number) for number in place.split(",")]
+            coordinates = [float(number) for number in place.split(",")]
         except ValueError:
-            numbers = []
-        if not name or not 2 <= len(numbers) <= 3 or not all(map(math.isfinite, numbers)):
+            coordinates = []
+        if not name or not 2 <= len(coordinates) <= 3 or not all(map(math.isfinite, coordinates)):
             raise UsageError(
                 f"{text!r} is no start; write NAME=X,Y in metres, or NAME=X,Y,TURN with radians, such as "
                 "red=0.47,-0.09,0.4"
             )
-        return cls(name.strip(), *numbers)
+        return cls(name.strip(), *coordinates)
 
     def __str__(self) -> str:
         numbers = [self.x, self.y] + ([] if self.turn is None else [self.turn])

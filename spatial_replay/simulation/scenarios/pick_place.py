@@ -13,14 +13,14 @@ from spatial_replay.simulation.world import Body, Box, Cylinder, Shape
 
 def _thing(
     name: str,
-    kind: str,
+    class_name: str,
     shape: Shape,
     place: tuple[float, float],
     mass_kg: float,
     colour: tuple[float, float, float],
     yaw: float = 0.0,
 ) -> Placement:
-    return Placement(Body(name, kind, shape), *place, yaw, mass_kg, colour)
+    return Placement(Body(name, class_name, shape), *place, yaw, mass_kg, colour)
 
 
 def _script(scene: Scene) -> Generator[None, None, Outcome]:

@@ -20,9 +20,9 @@ def _script(scene: Scene) -> Generator[None, None, Outcome]:
     """Push red above blue, then green to the right of both."""
     blue_x, blue_y = scene.place_of("blue")
     red_x, _ = scene.place_of("red")
-    first = yield from pushing(scene, "red", [(red_x, blue_y + 0.06)])
-    if not first.succeeded:
-        return first
+    red_outcome = yield from pushing(scene, "red", [(red_x, blue_y + 0.06)])
+    if not red_outcome.succeeded:
+        return red_outcome
     _, green_y = scene.place_of("green")
     return (yield from pushing(scene, "green", [(blue_x + 0.05, green_y)]))
 

@@ -52,26 +52,26 @@ def setting_by_tree(
     while tree.status is Status.RUNNING:
         yield
         ticks.tick()
-    succeeded = tree.status is Status.SUCCESS
+    is_success = tree.status is Status.SUCCESS
     summary = f"placed {', '.join(goals)}"
     if blackboard.failures:
         summary += f", after this went wrong: {'; '.join(failure.reason for failure in blackboard.failures)}"
-    return Outcome(True, summary) if succeeded else blackboard.failures[-1]
+    return Outcome(True, summary) if is_success else blackboard.failures[-1]
 
 
 class _Ticks:
     """Runner of a tree, which reports each tick that changes the status of a node."""
 
     def __init__(self, scene: Scene, tree: Behaviour) -> None:
-        self._scene, self._tree, self._count = scene, tree, 0
-        self._reported: tuple[TreeNode, ...] = ()
+        self._scene, self._tree, self._tick_count = scene, tree, 0
+        self._reported_nodes: tuple[TreeNode, ...] = ()
 
     def tick(self) -> None:
         self._tree.tick_once()
         nodes = tree_nodes(self._tree)
-        if nodes != self._reported:
-            self._scene.report_tick(TreeTick(self._count, nodes))
-        self._reported, self._count = nodes, self._count + 1
+        if nodes != self._reported_nodes:
+            self._scene.report_tick(TreeTick(self._tick_count, nodes))
+        self._reported_nodes, self._tick_count = nodes, self._tick_count + 1
 
 
 class _Blackboard:
@@ -95,17 +95,20 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: Seq
         yield from let_go(scene, _opening(blackboard, name))
         return miss_text(scene, name, point)
 
-    steps: dict[str, tuple[Stage, _Motion]] = {
+    motions_by_verb: dict[str, tuple[Stage, _Motion]] = {
         "pick": ("pick", lambda: pick_up(scene, name, blackboard.grasps[name])),
         "carry": ("way", lambda: carry(scene, name, blackboard.grasps[name], point, via)),
         "place": ("place", lambda: set_down(scene, name, point)),
         "leave": ("place", leave),
     }
-    leaves = (_Moving(f"{verb} {name}", motion, blackboard, stage) for verb, (stage, motion) in steps.items())
-    stages = [_Detecting(scene, name, goal, blackboard), *leaves]
-    move = composites.Sequence(f"move {name}", memory=True, children=stages)
-    options = [_Placed(scene, name, goal), move, _Moving(f"recover {name}", recover, None)]
-    attempt = composites.Selector(f"bring {name}", memory=True, children=options)
+    leaves = (
+        _Moving(f"{verb} {name}", motion, blackboard, stage)
+        for verb, (stage, motion) in motions_by_verb.items()
+    )
+    move_children = [_Detecting(scene, name, goal, blackboard), *leaves]
+    move = composites.Sequence(f"move {name}", memory=True, children=move_children)
+    attempt_children = [_Placed(scene, name, goal), move, _Moving(f"recover {name}", recover, None)]
+    attempt = composites.Selector(f"bring {name}", memory=True, children=attempt_children)
     return Retry(f"try {name}", attempt, num_failures=_ATTEMPTS)
 
 
@@ -173,9 +176,9 @@ class _Placed(Behaviour):
     def update(self) -> Status:
         """Compare position and yaw with the goal."""
         point, yaw = self._goal
-        is_there = not miss_text(self._scene, self._body, point)
-        turned = 0.0 if yaw is None else abs(self._scene.pose(self._body).turned_from(yaw))
-        return Status.SUCCESS if is_there and turned <= _TURNED else Status.FAILURE
+        is_near = not miss_text(self._scene, self._body, point)
+        yaw_error = 0.0 if yaw is None else abs(self._scene.pose(self._body).turned_from(yaw))
+        return Status.SUCCESS if is_near and yaw_error <= _TURNED else Status.FAILURE
 
 
 # ----------------------------------------------------------------------------------------------- the scenario
