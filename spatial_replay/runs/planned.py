@@ -1,6 +1,6 @@
 """Recordings of a planner that moves objects in a simulated world, with every decision.
 
-`record_plan` sets up the world, the planner and the log. `recording.plan_loop` runs them.
+`record_plan` sets up the world, the planner and the log. `recording.plan_loop` runs the planner.
 """
 
 from __future__ import annotations
@@ -88,9 +88,10 @@ def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> 
 
 
 def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
-    """Return the yaws, in radians, that objects may need for a formula; none if it compares no yaws.
+    """Return the yaws, in radians, that objects may need for a formula; none if the formula compares no yaws.
 
-    These are the yaws of the compared objects, as in `a oriented[k] b`, and quarter turns of the first yaw.
+    These are the yaws of the compared objects, as in `a oriented[k] b`. The first of these yaws is also
+    returned with quarter turns.
     """
     atoms = [part for part in iter_formulas(formula) if isinstance(part, Atom)]
     expressions = [part for atom in atoms for part in iter_expressions(atom.expression)]
@@ -141,7 +142,7 @@ class PlannedRun:
     Attributes:
         samples: number of samples.
         seconds: time from the first to the last sample.
-        ended: kind of the last decision: "hold" if, by the planner's observations, the spec is satisfied.
+        ended: kind of the last decision; "hold" if the planner observed that the spec is satisfied.
         name: name of the planned spec.
         verdict: verdict of the planned spec in the log, which includes the uncertainty of positions.
         reason: sentence on the last decision.
@@ -189,7 +190,7 @@ def record_plan(
     Args:
         file: specification to plan for; None for the scenario's specification.
         also: further specifications to evaluate, which the planner does not receive.
-        name: result to plan for, required if there are several. All results are evaluated.
+        name: result to plan for, required if the file has several results. All results are evaluated.
         cameras: paths of one or two videos of the run. Their tags file is written next to the first video.
         inputs: input files, which the output must not overwrite.
         advance: called with the number of new samples.

@@ -108,7 +108,7 @@ def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:
 
 
 def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]) -> bytes:
-    """Return the message with the outlines of objects and tags, their names and numbers, in a view."""
+    """Return the message with the outlines in a view: objects with names, tags with numbers."""
     message = ImageAnnotations()
     time_ns = view.frame.time_ns
     for detection in view.detections:
@@ -136,7 +136,7 @@ def encode_annotations(view: View, sample: Sample, colours: Mapping[str, Colour]
 
 
 def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
-    """Return the calibration of a camera."""
+    """Return the message with the calibration of a camera."""
     width, height = camera.size
     distortion = list(camera.distortion)
     # plumb_bob has five parameters, rational_polynomial has more
@@ -180,7 +180,7 @@ def _ring(vertices: Floats, radius: float) -> Floats:
     circle_points = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     if len(vertices) == 1:
         return vertices + circle_points
-    # each direction belongs to the corner that is farthest in it
+    # each direction belongs to the corner that is farthest in that direction
     farthest_corners = (circle_points @ vertices.T).argmax(axis=1)
     return np.asarray(vertices[farthest_corners] + circle_points, np.float64)
 
@@ -213,10 +213,10 @@ def _text(
 # -------------------------------------------------------------------------------------------------- recording
 
 KeepVideo: TypeAlias = Literal["copy", "h264", "none"]
-"""Form of a video in a log: an unchanged copy, encoded again, or left out."""
+"""Form of a video in a log: an unchanged copy, a new encoding, or no video."""
 
 _NOT_YET_ALONE: Final = 2
-"""Number of final samples that a camera may lack, because cameras do not end at the same time."""
+"""Number of final samples without a camera's frame that need no remark; cameras end at different times."""
 
 _POSE_EVERY_NS: Final = 10**9
 """Interval at which a log repeats the camera's constant calibration and pose, ns."""
@@ -229,7 +229,7 @@ class FrameSource(Protocol):
         name: name for error messages.
         channel: channel whose messages are the frames' `data`; None if `data` is H.264.
         faults: sentences on lost frames.
-        copy_fault: reason why `data` cannot be copied into a log; None if it can.
+        copy_fault: reason why `data` cannot be copied into a log; None if `data` can be copied.
         remark: sentence on the options of the source, available after the last frame; None without a remark.
     """
 
@@ -256,7 +256,7 @@ class SeenRun:
         samples: number of samples; each has at most one frame of each camera.
         seconds: time from the first to the last sample.
         endings: result of each spec at the end.
-        fits: name of each camera and fit of its reference tags, None without reference tags.
+        fits: name of each camera, and fit of the camera's reference tags; None without reference tags.
         remarks: sentences on tags and objects that were missing, doubtful or not mapped.
         faults: sentences on lost parts of the videos.
         kept: form of each camera's video in the log.
@@ -293,7 +293,8 @@ def record_cameras(
         offsets_ns: offset of each camera's time stamps; empty for no offsets.
         hold_ns: time for which a hidden object keeps its position, with growing uncertainty. None for the
             value of the tags file.
-        keep: form of the videos in the log; None copies each video if possible, and else encodes it.
+        keep: form of the videos in the log; None copies each video if possible, and
+            encodes other videos.
         inputs: input files, which the output must not overwrite.
         begin: called with the time of the first sample.
         show: called with each change of a verdict.
@@ -321,7 +322,7 @@ def record_cameras(
         raise LogError("; ".join([f"{camera_list}: no frame can be read", *opening_faults]))
     if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first_frames):
         raise UsageError("detections have no images to encode; leave out --keep-video h264")
-    # reference tags that do not fit raise before the output is created
+    # reference tags that do not fit raise an error before the output is created
     first_observation = observer.observe(*first_frames)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes = VerdictChanges(files)
@@ -452,7 +453,7 @@ class _Picture:
             log.write_payload(self._video, frame.time_ns, message)
 
     def _is_due(self, topic: str, time_ns: int) -> bool:
-        """Return whether a constant message must be repeated now."""
+        """Return whether the constant message of a topic is due; a due message counts as written."""
         last_ns = self._last_ns.get(topic)
         if last_ns is not None and time_ns - last_ns < _POSE_EVERY_NS:
             return False

@@ -34,9 +34,9 @@ _STRETCH = 30
 
 
 class RunLog:
-    """The open log of a run: samples, and messages on decisions between samples.
+    """The open log of a run: samples, and messages of other channels between samples.
 
-    Equal samples, specifications and messages give equal bytes. `run_log` opens one.
+    Equal samples, specifications and messages give equal bytes. `run_log` opens a `RunLog`.
 
     Attributes:
         samples: number of samples.
@@ -73,7 +73,7 @@ class RunLog:
         self.newest_ns = sample.time_ns
         self.samples += 1
         if len(self._pending_samples) >= _STRETCH:
-            # flushed only at the next sample, because messages about the newest sample have its time
+            # flushed only at the next sample, because messages may follow with the time of the newest sample
             self.flush()
         self._pending_samples.append(sample)
 
@@ -114,7 +114,7 @@ class RunLog:
             self._writer.flush()
 
     def write_waiting(self) -> None:
-        """Write the waiting samples and messages, without flushing the file."""
+        """Write the pending samples and messages, without flushing the file."""
         samples, self._pending_samples = self._pending_samples, []
         messages, self._pending_messages = self._pending_messages, []
         if samples or messages:
@@ -130,15 +130,15 @@ def run_log(
     known: Sequence[SpecAutomaton] = (),
     durability: Durability = "process",
 ) -> Iterator[RunLog]:
-    """Open the log of a run in a file that has its final name from the start, and always close it.
+    """Open the log of a run, and close the log in any case. The file has its final name from the start.
 
-    After an interruption or an error the log is shorter, and marked as interrupted.
+    After an interruption or an error, the log is shorter and is marked as interrupted.
 
     Args:
         files: specifications to evaluate and to store in the log.
         about: further metadata, such as the scenario or a seed.
         inputs: input files, which the output must not overwrite.
-        known: compiled automata of specs of these files, which are not compiled again.
+        known: compiled automata of specs in `files`; these specs are not compiled again.
         durability: "disk" to force each written chunk to the disk at once.
 
     Raises:

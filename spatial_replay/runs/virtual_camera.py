@@ -38,10 +38,10 @@ from spatial_replay.trace.trace import Sample
 
 _BLACK, _WHITE = 30, 220
 _OVERSAMPLED: Final = 4
-"""Samples along each edge of a pixel, which are averaged."""
+"""Number of averaged samples along each edge of a pixel."""
 
 _BEHIND: Final = 3e-3
-"""Depth up to which a plate may lie behind the surface that carries it, footprint units."""
+"""Tolerance of a plate's depth behind the surface that carries the plate, footprint units."""
 
 
 class Plate(NamedTuple):
@@ -49,7 +49,7 @@ class Plate(NamedTuple):
 
     Attributes:
         centre: (3,), centre of the face.
-        axes: (2, 3), unit vectors to the tag's right and to its top.
+        axes: (2, 3), unit vectors to the right and to the top of the tag.
         size: edge length of the black square.
     """
 
@@ -175,7 +175,7 @@ def _draw(
     if (high_px <= low_px).any():
         return
     width, height = (high_px - low_px).tolist()
-    # coordinates count from the centre of the first pixel, so its outer corner is at -0.5
+    # coordinates count from the centre of the first pixel, so the outer corner of this pixel is at -0.5
     tile_edge = cell_count - 0.5
     tile_corners = np.array([(-0.5, -0.5), (tile_edge, -0.5), (tile_edge, tile_edge), (-0.5, tile_edge)])
     matrix = fit_homography(tile_corners, _OVERSAMPLED * (pixels - low_px + 0.5) - 0.5)
@@ -244,10 +244,10 @@ class _Views:
 
     Attributes:
         size: width and height of a picture, pixels.
-        coarse: number of pixels along each edge that share a pixel of the simulator's picture. Its rendering
-            takes most of the time.
+        coarse: scale from the simulator's picture to the camera's picture, along each edge. A coarse picture
+            saves time, because the simulator's rendering takes most of the time.
         focal: focal length, pixels; the principal point is in the middle.
-        looks: pose of each camera; a second camera sees objects that the arm hides from the first.
+        looks: pose of each camera; a second camera sees objects that the arm hides from the first camera.
         tag: edge length of the tags on objects, metres.
         reference: edge length of the tags on the table, metres.
         places: positions (x, y) of the tags on the table, metres.
@@ -294,7 +294,7 @@ _SET_TWICE: Final = replace(
     _WHOLE_TABLE,
     looks=(_Look((1.51, -0.33, 1.0), (0.27, 0.0, 0.0)), _Look((-0.37, -1.11, 1.0), (0.27, 0.0, 0.0))),
 )
-# chosen by casting rays from the tags to positions all around: the arm never hides a block from both cameras
+# positions from a search with rays from the tags: the arm never hides a block from both cameras
 _PUSHED_TWICE: Final = replace(
     _PUSHED,
     size=(1280, 960),
@@ -338,7 +338,7 @@ class Film:
         """Add a frame of the current state of the world to each video.
 
         Args:
-            sample: sample of the same state.
+            sample: sample of the current state.
         """
         for writer, frame in zip(self._writers, self.frames(sample.time_ns), strict=True):
             writer.write(frame)
@@ -428,7 +428,7 @@ def tags_text(world: Tabletop, cameras: int = 1) -> str:
 
 
 def _bodies_with_tags(world: Tabletop) -> list[tuple[int, Body]]:
-    """Return the bodies, each with the number of its first tag; a body has up to two."""
+    """Return the bodies, each with the number of its first tag; a body has up to two tags."""
     return [(2 * index, body) for index, body in enumerate(world.bodies)]
 
 
@@ -445,11 +445,13 @@ def _spots(body: Body) -> list[tuple[float, float]]:
 
 @contextmanager
 def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Iterator[Film | None]:
-    """Open one or two videos of a world, and write the tags file next to the first; None without videos.
+    """Open one or two videos of a world, and write the tags file next to the first video.
+
+    Yields None without videos.
 
     Raises:
-        UsageError: the extra `vision` is not installed, there are more than two cameras, or a name is
-            duplicate or has no ending of a video.
+        UsageError: the extra `vision` is not installed, there are more than two cameras, two videos have the
+            same name, or a name has no suffix of a video.
         OutputError: a file cannot be written.
     """
     if not videos:

@@ -32,7 +32,7 @@ ABOVE = 0.3
 """Travel height of the tool, metres."""
 
 Motion: TypeAlias = Generator[None, None, None]
-"""A motion; each of its steps commands the arm for one tick."""
+"""A motion of the arm; each step of the generator commands the arm for one tick."""
 
 _FAST = 0.45
 """Travel speed of the tool, m/s."""
@@ -45,13 +45,13 @@ _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
 """Force of the fingers, N."""
 _PINCHED = 0.004
-"""Excess of the fingers' actual distance over the commanded one if they hold a body, metres."""
+"""Excess of the fingers' actual distance over the commanded distance that shows a held body, metres."""
 _MIDDLE, _FURTHEST = 0.78, 2.75
-"""Centre of the tool's yaw range relative to the direction from the base, and half width, radians."""
+"""Tool yaw range relative to the direction from the base: its centre and its half width, radians."""
 _NEAREST, _FARTHEST = 0.27, 0.77
 """Smallest and largest distance from the base at which the tool reaches the table, metres."""
 _INSIDE = 0.33
-"""Smallest distance from the base during travel around it, metres."""
+"""Smallest distance from the base during travel around the base, metres."""
 
 
 class Arm:
@@ -88,13 +88,13 @@ class Arm:
         self._engine.drive(self._joints, self._velocities, width, _GRIP_FORCE)
 
     def aim(self, position: Floats, yaw: float) -> None:
-        """Command the tool to a pose that it can reach within one tick."""
+        """Command the tool to a pose (metres, yaw in radians) that it can reach within one tick."""
         joints = joints_for(position, downwards(yaw), self._joints)
         self._velocities = (joints - self._joints) * TICKS_PER_S
         self._joints, self._position, self._yaw = joints, position, yaw
 
     def move(self, x: float, y: float, z: float, yaw: float | None = None, *, speed: float = _FAST) -> Motion:
-        """Move the tool in a straight line, and wait until it has reached the point."""
+        """Move the tool in a straight line, and wait until the tool has reached the point."""
         goal = np.array([x, y, z])
         start, start_yaw = self._position, self._yaw
         yaw_change = 0.0 if yaw is None else yaw - start_yaw
@@ -105,7 +105,7 @@ class Arm:
         yield from self._settle()
 
     def travel(self, x: float, y: float, yaw: float) -> Motion:
-        """Lift the tool, and move it around the base to a position above a point."""
+        """Lift the tool, and move the tool around the base to a position above a point."""
         start = self._position
         if start[2] < ABOVE - 0.01:
             yield from self.move(start[0], start[1], ABOVE)
@@ -171,14 +171,17 @@ class Arm:
 
 
 def _shares(*durations_s: float) -> list[float]:
-    """Return the completed share of a motion after each tick: a cubic, slow at both ends."""
+    """Return the completed share of a motion after each tick: a cubic, slow at both ends.
+
+    The motion takes the longest of the durations, or more.
+    """
     # the maximum speed of the cubic, in the middle, is 1.5 times its mean speed
     tick_count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
     return [3 * (k / tick_count) ** 2 - 2 * (k / tick_count) ** 3 for k in range(1, tick_count + 1)]
 
 
 def turn_towards(yaw: float, x: float, y: float, period: float = math.pi) -> float:
-    """Return `yaw` shifted by whole periods to be closest to the middle of the last joint's range.
+    """Shift `yaw` by whole periods towards the middle of the last joint's range.
 
     The period is pi for an empty gripper, because it is symmetric, and 2 pi for a gripper that holds a body.
     """
@@ -201,7 +204,7 @@ def can_turn(yaw: float, x: float, y: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The physics, the arm, the bodies by name, and a function that receives ticks of behaviour trees."""
+    """The physics engine, the arm, the bodies by name, and a listener for ticks of behaviour trees."""
 
     engine: Engine
     arm: Arm
@@ -234,14 +237,14 @@ class Scene:
 
 
 def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
-    """Return the distance, metres, to the nearest of the other footprints; below 0 for an overlap."""
+    """Return the distance, metres, from a footprint to the nearest of the others; below 0 for an overlap."""
     batch = FootprintBatch.from_footprints([covered, *others])
     operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
     return float(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0, 0])
 
 
 def extent(covered: Footprint, angle: float) -> tuple[float, float]:
-    """Return the smallest and largest coordinate of a footprint along a direction."""
+    """Return the smallest and largest coordinate of a footprint along the direction `angle`, metres."""
     direction = np.array([math.cos(angle), math.sin(angle)])
     spans = [(part.vertices @ direction, part.radius) for part in covered.parts]
     lowest = min(float(coordinates.min()) - radius for coordinates, radius in spans)
@@ -261,7 +264,7 @@ _BELOW_TOP = 0.022
 _HAND_DEPTH, _HAND_WIDTH, _HAND_ABOVE = 0.064, 0.21, 0.035
 """Size of the hand across and along its opening, and its height above the tool point, metres."""
 _ROOM, _AMPLE = 0.0015, 0.01
-"""Required clearance around the fingers, and clearance from which more does not count, metres."""
+"""Required clearance around the fingers, and clearance above which grasps count as equal, metres."""
 _ANGLES = 12
 """Number of tool yaws to try for a body without flat sides."""
 
@@ -271,8 +274,8 @@ class Grasp:
     """A grasp of a body.
 
     Attributes:
-        yaw: yaw of the tool at the pick, radians.
-        turn: yaw of the tool at the place, radians.
+        yaw: yaw of the tool when the body is picked, radians.
+        turn: yaw of the tool when the body is placed, radians.
         above_bottom: height of the tool point above the body's lowest point, metres.
         opening: distance of the fingers before and after the grasp, metres.
     """
@@ -286,10 +289,10 @@ class Grasp:
 def best_grasp(
     scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
 ) -> Grasp | Outcome:
-    """Return the grasp with the most clearance, or the failure if there is none.
+    """Return the grasp with the most clearance, or the failure if no grasp is possible.
 
-    Among equal grasps, the one across the thinnest side is preferred. A body that is not lifted is turned in
-    the shorter direction.
+    Among grasps of equal clearance, the grasp across the thinnest side is preferred. A body that is not
+    lifted is turned in the shorter direction.
     """
     start_point = scene.place_of(name)
     if not in_reach(*start_point):
@@ -330,7 +333,7 @@ def best_grasp(
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:
-    """Return the height of the surface under a point: the table, or a support."""
+    """Return the height of the surface under a point, metres: the table, or the highest support."""
     goal_spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
     surface_heights = [
         scene.height(support)[1]
@@ -341,7 +344,7 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
 
 
 def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
-    """Return pairs (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
+    """Return pairs (body's thickness, tool yaw) of possible grasps; a body with flat sides has two."""
     pose, covered = scene.pose(name), scene.footprint(name)
     if isinstance(scene.bodies[name].shape, Box) and pose.is_level:
         tool_yaws = [pose.yaw, pose.yaw + math.pi / 2]
@@ -358,7 +361,7 @@ def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
 def _turns(
     scene: Scene, name: str, grasp_angle: float, goal: Point, yaw: float | None, is_lifted: bool
 ) -> Iterator[tuple[float, float]]:
-    """Yield pairs of tool yaws, at the pick and at the place, that the arm can reach."""
+    """Yield pairs of reachable tool yaws: when the body is picked, and when it is placed."""
     pose, start_point = scene.pose(name), scene.place_of(name)
     # a round body has no yaw, so the tool keeps its yaw relative to the direction from the base
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
@@ -376,7 +379,7 @@ def _turns(
 
 
 def _room(scene: Scene, name: str, place: Point, tool_yaw: float, grasp: Grasp, support_z: float) -> float:
-    """Return the clearance of fingers and hand to other bodies while they hold a body at a place."""
+    """Return the clearance between the hand, which holds a body at a place, and other bodies, metres."""
     tool_z = support_z + grasp.above_bottom
     fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, tool_yaw)
     hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, tool_yaw)
@@ -391,9 +394,9 @@ _SLOW = 0.15
 _SETTING_DOWN = 0.002
 """Height above its support at which a body is released, metres."""
 _LOST_TICKS = 6
-"""Number of ticks without contact after which a body is lost."""
+"""Number of ticks without contact after which a body counts as lost."""
 _STRAIGHT = 0.08
-"""Maximum length of a segment on which the tool's path is nearly straight, metres."""
+"""Maximum length of a segment of a carried body's way, on which `travel` is nearly straight, metres."""
 _NEAR = 0.02
 """Tolerance of a placed body's position, metres."""
 
@@ -401,7 +404,7 @@ _NEAR = 0.02
 def picking(
     scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point] = ()
 ) -> Generator[None, None, Outcome]:
-    """Pick a body up, carry it along `via` and place its centre at `goal`; None keeps its yaw."""
+    """Pick a body up, carry it along `via` and place its centre at `goal`; a yaw of None keeps the yaw."""
     grasp = best_grasp(scene, name, goal, yaw)
     if isinstance(grasp, Outcome):
         return grasp
@@ -444,7 +447,7 @@ def carry(
     scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
 ) -> Generator[None, None, str]:
     """Move the held body along `via` to a position above `goal`; return the reason of a failure, or ""."""
-    # `travel` moves around the base; between such close points its path is nearly straight
+    # `travel` moves around the base; between close points its path is nearly straight
     waypoints = (scene.place_of(name), *via, goal)
     for point in islice(points_along(waypoints, _STRAIGHT), 1, None) if via else (goal,):
         x, y = _tool_for(scene, name, point, grasp.turn)
@@ -468,7 +471,7 @@ def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, Non
 
 
 def put_back(scene: Scene, name: str) -> Motion:
-    """Put down the held body at its current position, and open the fingers."""
+    """Put down the held body at its current position, if there is one, and open the fingers."""
     if scene.engine.fingers_touching(name):
         yield from set_down(scene, name, scene.place_of(name))
     yield from let_go(scene, WIDEST)
@@ -494,7 +497,7 @@ def let_go(scene: Scene, opening: float) -> Motion:
 
 
 def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
-    """Return a sentence on a released body that misses its goal, or ""."""
+    """Return the reason why a released body misses its goal, or "" if it is at its goal."""
     if stood and not scene.pose(name).stands:
         return f"{name} fell over"
     miss_m = math.dist(scene.place_of(name), goal)
@@ -502,7 +505,7 @@ def miss_text(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> st
 
 
 def _tool_for(scene: Scene, name: str, goal: Point, tool_yaw: float) -> Point:
-    """Return the tool position at which the held body, usually off centre, is at a point."""
+    """Return the tool position that brings the held body to `goal`; the body may be off the tool's centre."""
     x, y = scene.place_of(name)
     tool_x, tool_y, _ = scene.arm.commanded
     dx, dy, yaw_change = x - tool_x, y - tool_y, tool_yaw - scene.arm.yaw
@@ -511,7 +514,7 @@ def _tool_for(scene: Scene, name: str, goal: Point, tool_yaw: float) -> Point:
 
 
 def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
-    """Run a motion while the fingers hold a body; stop and return False if they lose it."""
+    """Run a motion while the fingers hold a body; stop and return False if the body is lost."""
     lost_ticks = 0
     for _ in motion:
         yield
@@ -529,11 +532,11 @@ _LOW = FINGERTIP + 0.006
 _AWAY = 0.01
 """Distance behind a body at which the fingers come down, metres."""
 _MARGIN = 0.001
-"""Remaining distance at which a stroke ends, and required clearance behind a body, metres."""
+"""Remaining distance at which a stroke ends; also the required clearance behind a body; metres."""
 _PUSH_FAST, _PUSH_SLOW = 0.1, 0.015
-"""Speed of a push, at its beginning and at its end, m/s."""
+"""Speed of a push at the beginning and at the end, m/s."""
 _CLOSE = 0.004
-"""Distance to its goal at which a body needs no further stroke, metres."""
+"""Distance to the goal up to which a body needs no further stroke, metres."""
 _FAR = 0.015
 """Tolerance of a body's position after all strokes, metres."""
 _STRAIGHTENED = 0.0025
@@ -551,7 +554,7 @@ def pushing(
 ) -> Generator[None, None, Outcome]:
     """Push a body along a path, one stroke for each straight segment, with corrections at the end.
 
-    With `yaw`, turn the body at the end, because strokes rotate it: its side aligns with the fingers.
+    Strokes rotate the body: its side aligns with the fingers. With `yaw`, the body is turned at the end.
     """
     corners = straighten([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
@@ -573,7 +576,7 @@ def pushing(
 def _push_to(
     scene: Scene, name: str, goal: Point, *, max_strokes: int, tolerance_m: float
 ) -> Generator[None, None, Outcome | None]:
-    """Push a body to a point in up to `strokes` strokes; return the failure, or None."""
+    """Push a body to a point in up to `max_strokes` strokes; return the failure, or None."""
     miss_m = 0.0
     for _ in range(max_strokes):
         failure = yield from _stroke(scene, name, goal)
@@ -630,6 +633,7 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outco
         return None
     heading = math.atan2(goal[1] - y, goal[0] - x)
     unit_x, unit_y = math.cos(heading), math.sin(heading)
+    # distance from the body's centre back to the fingers
     back = unit_x * x + unit_y * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
     start_point = (x - unit_x * (back + _AWAY), y - unit_y * (back + _AWAY))
     if not in_reach(*goal):
@@ -655,7 +659,11 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outco
 def _advance(
     scene: Scene, name: str, start_point: Point, heading: float, distance: float, back: float
 ) -> Generator[None, None, bool]:
-    """Move the fingers forward until the body has moved by `length`; return False if it does not."""
+    """Move the fingers until the body has moved by `distance`; return False if the body stays behind.
+
+    Args:
+        back: distance from the body's centre back to the fingers, metres.
+    """
     unit_x, unit_y = math.cos(heading), math.sin(heading)
     x, y = scene.place_of(name)
     advance = 0.0

@@ -1,6 +1,6 @@
-"""Physics, and kinematics of a Franka arm; the only module that uses PyBullet.
+"""Physics, and kinematics of a Franka arm; no other module uses PyBullet.
 
-The tool frame is between the fingertips. Its axis z is along the fingers; they open along its axis y.
+The tool frame is between the fingertips. Its axis z points along the fingers, which open along its axis y.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
 """Joint limits, radians, from the data sheet."""
 
 REST = np.array([0.0, -0.3, 0.0, -2.3, 0.0, 2.0, math.pi / 4])
-"""Rest position of the joints, radians: the tool in front of the base, the elbow up, the fingers down."""
+"""Rest position of the joints, radians; the tool is in front of the base, the elbow up, the fingers down."""
 
 _OFFSETS = np.array(
     [(0, 0, 0.333), (0, 0, 0), (0, -0.316, 0), (0.0825, 0, 0), (-0.0825, 0.384, 0), (0, 0, 0), (0.088, 0, 0)]
@@ -43,7 +43,7 @@ _TOOL = 0.107 + 0.105
 """Distance from the last joint to the tool frame, metres."""
 
 _DAMPING = 1e-5
-"""Damping of the least squares, which keeps them solvable near singular poses."""
+"""Damping of the least squares, so that they have a solution near singular poses."""
 _STEPS = 3
 """Default number of iterations."""
 _LONGEST = 0.2
@@ -57,7 +57,7 @@ def tool_frame(joints: Floats) -> tuple[Floats, Floats]:
 
 
 def downwards(yaw: float) -> Floats:
-    """Return the rotation (3, 3) of a downward tool with a yaw; the fingers open across the yaw."""
+    """Return the rotation (3, 3) of a downward tool; the fingers open at right angles to `yaw`."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     return np.array([[cosine, sine, 0.0], [sine, -cosine, 0.0], [0.0, 0.0, -1.0]])
 
@@ -65,8 +65,8 @@ def downwards(yaw: float) -> Floats:
 def joints_for(position: Floats, rotation: Floats, start: Floats, steps: int = _STEPS) -> Floats:
     """Return joints (7,) that bring the tool near a pose, by damped least squares from `start`.
 
-    The arm is redundant: its remaining freedom moves it towards the rest position. The result for a pose out
-    of reach is as near as possible. `tool_frame` of the result gives the actual pose.
+    The arm is redundant, so the joints also approach the rest position. For a pose out of reach, the result
+    is as near as possible. `tool_frame` of the result gives the actual pose.
     """
     joints = start
     for _ in range(steps):
@@ -102,7 +102,7 @@ def _chain(joints: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _rotation_between(first: Floats, second: Floats) -> Floats:
-    """Return the rotation vector (3,) between two rotations, exact enough for an iteration."""
+    """Return the rotation vector (3,) from the first rotation to the second; inexact near half a turn."""
     rotation = second @ first.T
     axis = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
@@ -191,7 +191,7 @@ class Engine:
         yaw: float,
         colour: tuple[float, float, float],
     ) -> None:
-        """Add a body with its z axis upwards; a mass of 0 fixes it."""
+        """Add a body with its z axis upwards; a mass of 0 kg fixes the body."""
         body_id = self._add(shape, mass, position, yaw, (*colour, 1.0))
         self._call("changeDynamics", body_id, -1, **_FRICTION)
         self._bodies[name] = body_id
@@ -203,23 +203,27 @@ class Engine:
         return Pose(np.array(position), rotation)
 
     def move(self, name: str, x: float, y: float) -> None:
-        """Move a fixed body without regard to collisions; its height and orientation do not change."""
+        """Move a fixed body regardless of collisions; the body's height and orientation do not change."""
         (*_, z), quaternion = self._call("getBasePositionAndOrientation", self._bodies[name])
         self._call("resetBasePositionAndOrientation", self._bodies[name], (x, y, z), quaternion)
 
     # -------------------------------------------------------------------------------------- the robot
 
     def set_joints(self, joints: Floats, width: float) -> None:
-        """Reset the arm's joints (7,) and the fingers, `width` metres apart, without motion."""
+        """Set the arm's joints (7,), and the fingers to a distance of `width` metres, without motion."""
         for joint_index, angle in enumerate(joints.tolist()):
             self._call("resetJointState", self._robot, joint_index, angle)
         for finger in FINGERS:
             self._call("resetJointState", self._robot, finger, width / 2)
 
     def drive(self, joints: Floats, velocities: Floats, width: float, force: float) -> None:
-        """Command the motors: joints (7,), their velocities, and the distance and force of the fingers.
+        """Command the motors for the next steps.
 
-        The force is in N.
+        Args:
+            joints: (7,), positions of the arm's joints, radians.
+            velocities: (7,), velocities of the arm's joints, rad/s.
+            width: distance of the fingers, metres.
+            force: force of the fingers, N.
         """
         bullet = self._bullet
         self._call(
@@ -243,7 +247,7 @@ class Engine:
         )
 
     def joints(self) -> Floats:
-        """Return the actual joints (7,) of the arm."""
+        """Return the actual positions (7,) of the arm's joints, radians."""
         states = self._call("getJointStates", self._robot, list(range(JOINTS)))
         return np.array([state[0] for state in states])
 
@@ -265,7 +269,7 @@ class Engine:
         eye: tuple[float, float, float],
         look_at: tuple[float, float, float],
     ) -> tuple[NDArray[np.uint8], Floats]:
-        """Return a camera's picture (height, width, 3) in red, green, blue, and distances along its axis.
+        """Return a camera's picture (height, width, 3) in RGB, and distances (height, width) along its axis.
 
         Args:
             size: width and height, pixels.
@@ -301,7 +305,7 @@ class Engine:
     # ---------------------------------------------------------------------------------------- private
 
     def _couple_fingers(self) -> None:
-        """Couple the fingers, as in the real hand, so that a held body stays in the middle."""
+        """Couple the fingers, as in the real hand: a held body stays in the middle."""
         left, right = FINGERS
         joint_type, axis, centre = self._bullet.JOINT_GEAR, (1, 0, 0), (0, 0, 0)
         gear = self._call(
@@ -333,7 +337,7 @@ class Engine:
         return body_id
 
     def _call(self, function: str, *arguments: Any, **named: Any) -> Any:
-        """Call a function of the simulator for this world, because a process may have several worlds."""
+        """Call a function of the simulator for this world; a process may have several worlds."""
         return getattr(self._bullet, function)(*arguments, physicsClientId=self._client, **named)
 
 
@@ -353,7 +357,7 @@ def _load() -> ModuleType:
 
 
 def _refuse_no_display() -> None:
-    """Check that there is a display for a window; without a display, the simulator would end the process.
+    """Check that there is a display for a window, because without a display the simulator ends the process.
 
     Raises:
         UsageError: there is no display.
@@ -377,7 +381,7 @@ def _refuse_no_display() -> None:
 @contextmanager
 def _without_greeting() -> Iterator[None]:
     """Suppress the build date that PyBullet writes to standard error on import."""
-    # C code writes it, so only the file descriptor can be redirected
+    # C code writes the date, so only the file descriptor can be redirected
     stderr = os.dup(2)
     try:
         with Path(os.devnull).open("wb") as null_file:

@@ -48,10 +48,10 @@ from spatial_replay.trace.trace import Sample
 # -------------------------------------------------------------------------------------------------- scenarios
 
 Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Outcome]]
-"""Motion that picks a body up, carries it along points and places it: `picking`, or a behaviour tree."""
+"""A function like `picking`: its motion picks a body up, carries it along points and places it."""
 
 Script = Callable[[Scene], Generator[None, None, Outcome]]
-"""The motion of the robot without a planner."""
+"""A function that returns the motion of the robot without a planner."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +116,8 @@ class Tabletop:
     """The world of a scenario, simulated step by step; lengths are in metres.
 
     The robot's base is at (0, 0); x points forward, y to its left, z up; the table is z = 0. Methods that
-    advance time (`step`, `push`, `place`) pass each due sample to the attached listener. They pass the sample
-    of time 0 when time starts to advance.
+    advance time (`step`, `push`, `place`) pass each due sample to the attached listener. The sample of time 0
+    is passed when time starts to advance.
 
     Raises:
         UsageError: the simulator is not installed, the noise is below 0, an injection is impossible, or a
@@ -134,7 +134,7 @@ class Tabletop:
         starts: Sequence[Start] = (),
         gui: bool = False,
     ) -> None:
-        """Create the world at time 0; for the arguments see `Conditions`."""
+        """Create the world at time 0; `Conditions` explains the arguments."""
         if noise_m < 0 or not math.isfinite(noise_m):
             raise UsageError(f"the noise is {noise_m} m; give 0 or more")
         for injection in injections:
@@ -194,7 +194,7 @@ class Tabletop:
     ) -> None:
         """Pass further samples to `listen`, and ticks of behaviour trees to `listen_to_tree`.
 
-        If `listen` returns a text, it stops the current motion with this reason.
+        A text that `listen` returns stops the current motion; the text is the reason.
         """
         self._listen, self._listen_to_tree = listen, listen_to_tree
 
@@ -206,7 +206,7 @@ class Tabletop:
         self._seed, self._ticks, self._last_sampled_tick = seed, 0, -1
         # a reset of PyBullet leaves internal state behind; only a new simulator repeats a run exactly
         self._engine = engine = Engine(gui=self._gui)
-        # another stream of random numbers than the detection noise has
+        # the detection noise has a random stream of its own, so start poses do not depend on it
         scenario, generator = self._scenario, np.random.default_rng([seed, 0])
         for placement in scenario.placements:
             dx, dy, turn = (generator.random(3) * 2 - 1).tolist()
@@ -227,7 +227,7 @@ class Tabletop:
             engine.step()
 
     def sample(self) -> Sample:
-        """Return the current sample of all bodies with detection noise; repeated calls give equal samples."""
+        """Return the current sample with detection noise; repeated calls give equal samples."""
         self._open_engine()
         sample_number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, sample_number, len(self._scene.bodies))
@@ -244,7 +244,7 @@ class Tabletop:
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
     def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Outcome:
-        """Push an object's centre along points (x, y), and turn the object at the end to `yaw` if given.
+        """Push an object's centre along points (x, y); turn the object to `yaw` at the end, if given.
 
         Raises:
             UsageError: no such object, or the robot does not push.
@@ -256,7 +256,9 @@ class Tabletop:
     def place(
         self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
     ) -> Outcome:
-        """Pick an object up, carry it along `via`, and place its centre at (x, y); None keeps its yaw.
+        """Pick an object up, carry it along `via`, and place its centre at (x, y).
+
+        A yaw of None keeps the yaw.
 
         Raises:
             UsageError: no such object, or the robot does not pick.
@@ -301,8 +303,8 @@ class Tabletop:
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
         """Run a motion for a time, and return its result; None if the motion does not end in that time.
 
-        After the motion the robot holds still until the time is over. Without a duration, the motion runs to
-        its end.
+        After an earlier end of the motion, the robot holds still until the time is over. Without a duration,
+        the motion runs to its end.
         """
         if duration_ns is None:
             return self.run(motion)
@@ -332,7 +334,7 @@ class Tabletop:
             self._engine = None
 
     def _emit(self) -> None:
-        """Pass the current sample to the listener if a sample is due and was not passed yet."""
+        """Pass the current sample to the listener, if a sample is due at this tick and was not passed yet."""
         if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled_tick:
             self._last_sampled_tick = self._ticks
             self._halt_reason = self._listen(self.sample()) or ""
@@ -380,10 +382,10 @@ class Tabletop:
 def _displacements(
     radius_m: float, seed: int, sample_number: int, body_count: int
 ) -> list[tuple[float, float]]:
-    """Return the detection error of each of `count` bodies in a sample, metres along x and y.
+    """Return the detection error of each body in a sample, metres along x and y.
 
-    Errors are uniform on a disc, so that no error exceeds the radius. They depend only on the arguments, so
-    that a repeated sample has equal errors.
+    Errors are uniform on a disc of `radius_m`. They depend only on the arguments, so a repeated sample has
+    equal errors.
     """
     if radius_m == 0:
         return [(0.0, 0.0)] * body_count
@@ -399,7 +401,7 @@ SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
 
 
 def make_world(name: str, **conditions: Unpack[Conditions]) -> Tabletop:
-    """Create the world of a scenario at time 0; for the arguments see `Conditions`.
+    """Create the world of a scenario at time 0; `Conditions` explains the arguments.
 
     Raises:
         UsageError: there is no such scenario, or an argument of `Tabletop` is invalid.

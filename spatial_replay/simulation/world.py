@@ -20,7 +20,7 @@ UPRIGHT = 1e-2
 """Lean below which a body counts as upright, radians."""
 
 _LEVEL = 0.1
-"""Lean up to which a body has a yaw, radians; enough for a knife with its handle on a mat."""
+"""Lean up to which a body has a yaw, radians; a knife with its handle on a mat leans less."""
 
 _RIM = 16
 """Number of corners of the polygon around the rim of a leaning cylinder."""
@@ -79,7 +79,7 @@ class Pose:
 
     @property
     def is_level(self) -> bool:
-        """Whether the body's axis z is nearly vertical, so that the body has a yaw."""
+        """Whether the body's axis z is nearly vertical. Only then does the body have a yaw."""
         return min(self.lean, math.pi - self.lean) < _LEVEL
 
 
@@ -107,7 +107,7 @@ def height(shape: Shape, pose: Pose) -> tuple[float, float]:
 
 
 def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
-    """Return a rectangle around a point, with its length along `yaw`."""
+    """Return a rectangle around a point, metres, whose length is along `yaw`."""
     a, b, cosine, sine = length / 2, width / 2, math.cos(yaw), math.sin(yaw)
     corners = ((a, b), (-a, b), (-a, -b), (a, -b))
     return Footprint.polygon([(x + u * cosine - v * sine, y + u * sine + v * cosine) for u, v in corners])
@@ -138,8 +138,8 @@ class Body:
         name, class_name: name and class in the samples.
         shape: shape, metres.
         movable: whether the robot can push it, or pick and place it.
-        support: whether other objects may be placed on it, as on a plate. A support is no obstacle to them,
-            and has no height in samples, so that objects on it count as inside.
+        support: whether other objects may be placed on the body, as on a plate. A support is no obstacle to
+            other objects. It has no height in samples, so that objects on it count as inside.
     """
 
     name: str
@@ -154,7 +154,7 @@ class Body:
 Kind = Literal["drop", "slip"]
 
 DURATION_NS = {"drop": 400 * 10**6, "slip": 4 * 10**9}
-"""Duration of an injection that has a start, ns."""
+"""Duration of an injected failure that has a start time, ns."""
 
 _WRITTEN = re.compile(r"(?P<kind>\w+)(?:@(?P<number>\d+(?:\.\d+)?)(?P<unit>ms|s))?")
 
@@ -164,7 +164,7 @@ class Injection:
     """A failure of the gripper.
 
     Attributes:
-        kind: `drop`, the gripper opens; or `slip`, the fingers are slippery, as if oiled.
+        kind: `drop` opens the gripper; `slip` makes the fingers slippery, as if oiled.
         at_ns: start of the failure; None for the whole run.
     """
 

@@ -24,7 +24,7 @@ def _thing(
 
 
 def _script(scene: Scene) -> Generator[None, None, Outcome]:
-    """Set the breakfast: bun on the plate, banana in front of it, mug and bottle behind, a box aside."""
+    """Set the breakfast: bun on the plate, banana in front, mug and bottle behind; put a box aside."""
     x, y = scene.place_of("plate")
     goals = {
         "kanelbulle": (x, y),

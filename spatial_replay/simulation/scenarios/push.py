@@ -17,7 +17,7 @@ def _block(name: str, x: float, y: float, yaw: float, colour: tuple[float, float
 
 
 def _script(scene: Scene) -> Generator[None, None, Outcome]:
-    """Push red above blue, then green to the right of both."""
+    """Push red above blue, then green to the right of red and blue."""
     blue_x, blue_y = scene.place_of("blue")
     red_x, _ = scene.place_of("red")
     red_outcome = yield from pushing(scene, "red", [(red_x, blue_y + 0.06)])

@@ -1,4 +1,4 @@
-"""A robot that sets a table: fork, knife and spoon next to a plate, a cup behind it.
+"""A robot that sets a table: fork, knife and spoon next to a plate, a cup behind the plate.
 
 A behaviour tree places bodies: detect, pick, carry, place, and recover from failures.
 """
@@ -43,7 +43,7 @@ _TURNED = 0.15
 def setting_by_tree(
     scene: Scene, goals: Mapping[str, Goal], via: Sequence[Point] = ()
 ) -> Generator[None, None, Outcome]:
-    """Place bodies one after the other, with up to `_ATTEMPTS` attempts each; carry each along `via`."""
+    """Place bodies in turn, with up to `_ATTEMPTS` attempts each; each body is carried along `via`."""
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
     tree = composites.Sequence("set", memory=True, children=tasks)
@@ -60,7 +60,7 @@ def setting_by_tree(
 
 
 class _Ticks:
-    """Runner of a tree, which reports each tick that changes the status of a node."""
+    """Runner of a tree, which reports only the ticks that change the status of a node."""
 
     def __init__(self, scene: Scene, tree: Behaviour) -> None:
         self._scene, self._tree, self._tick_count = scene, tree, 0
@@ -87,7 +87,7 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: Seq
     point, _ = goal
 
     def recover() -> Generator[None, None, str]:
-        """Open the gripper, and return a failure, so that the tree starts another attempt."""
+        """Open the gripper, and return a failure; the tree then starts another attempt."""
         yield from let_go(scene, _opening(blackboard, name))
         return "another attempt"
 
@@ -133,11 +133,9 @@ class _Moving(Behaviour):
         self._motion: Generator[None, None, str] | None = None
 
     def initialise(self) -> None:
-        """Start the motion from its beginning."""
         self._motion = self._begin()
 
     def update(self) -> Status:
-        """Advance the motion by one tick."""
         if self._motion is None:
             return Status.INVALID
         try:
@@ -157,7 +155,6 @@ class _Detecting(Behaviour):
         self._scene, self._body, self._goal, self._blackboard = scene, name, goal, blackboard
 
     def update(self) -> Status:
-        """Choose the grasp."""
         grasp = best_grasp(self._scene, self._body, *self._goal)
         if isinstance(grasp, Outcome):
             self._blackboard.failures.append(grasp)
