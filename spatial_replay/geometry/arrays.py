@@ -40,12 +40,12 @@ def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
     The system can write pages of a mapped file to disk, so that a long log needs disk instead of memory. For
     a million samples and 30 parts, memory fell from 0.64 to 0.25 GB.
     """
-    size = np.dtype(dtype).itemsize * math.prod(shape)
-    if size >= _LARGE_BYTES:
+    size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
+    if size_bytes >= _LARGE_BYTES:
         with suppress(OSError), tempfile.TemporaryFile() as file:
             # without reserved blocks, a later write to a full disk would end the process by SIGBUS
-            os.posix_fallocate(file.fileno(), 0, size)
-            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
+            return np.frombuffer(mmap.mmap(file.fileno(), size_bytes), dtype).reshape(shape)
     return np.empty(shape, dtype)
 
 
@@ -95,16 +95,16 @@ def flat_index(first: Integers, counts: Integers) -> Integers:
     if len(counts) and (counts == counts[0]).all():
         # the common case, such as boxes only
         return np.asarray((first[:, None] + np.arange(counts[0], dtype=np.int64)).reshape(-1))
-    begins = starts_from_counts(counts)
-    return np.asarray(np.repeat(first - begins[:-1], counts) + np.arange(begins[-1], dtype=np.int64))
+    row_starts = starts_from_counts(counts)
+    return np.asarray(np.repeat(first - row_starts[:-1], counts) + np.arange(row_starts[-1], dtype=np.int64))
 
 
 def count_in_rows(flags: Booleans, start: Integers) -> Integers:
     """Return how many flags are set in each row; rows may be empty."""
     if not flags.any():
         return np.zeros(len(start) - 1, np.int64)
-    total = starts_from_counts(flags.astype(np.int64))
-    return np.asarray(total[start[1:]] - total[start[:-1]])
+    running_counts = starts_from_counts(flags.astype(np.int64))
+    return np.asarray(running_counts[start[1:]] - running_counts[start[:-1]])
 
 
 _MOST: Final = 2**62
@@ -113,24 +113,24 @@ _MOST: Final = 2**62
 
 def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
     """Return codes (length,), equal exactly in rows whose numbers are equal in all columns of integers."""
-    code, most = np.zeros(length, np.int64), 1
+    code, code_count = np.zeros(length, np.int64), 1
     for column in columns:
         if not length or (column == column[0]).all():
             continue
-        least = int(column.min())
-        width = int(column.max()) - least + 1
-        places = column.astype(np.int64) - least
+        least_value = int(column.min())
+        width = int(column.max()) - least_value + 1
+        offsets = column.astype(np.int64) - least_value
         # ranks keep codes small, before their product would overflow
-        if most * width > _MOST:
-            (code, most), (places, width) = _ranks(code), _ranks(places)
-        code, most = code * width + places, most * width
+        if code_count * width > _MOST:
+            (code, code_count), (offsets, width) = _ranks(code), _ranks(offsets)
+        code, code_count = code * width + offsets, code_count * width
     return code
 
 
 def _ranks(column: Integers) -> tuple[Integers, int]:
     """Return dense ranks of numbers and the count of distinct numbers."""
-    kinds, ranks = np.unique(column, return_inverse=True)
-    return ranks.astype(np.int64), len(kinds)
+    distinct_values, ranks = np.unique(column, return_inverse=True)
+    return ranks.astype(np.int64), len(distinct_values)
 
 
 def equal_places(code: Integers) -> Iterator[Integers]:
@@ -138,9 +138,9 @@ def equal_places(code: Integers) -> Iterator[Integers]:
     if len(code) and (code == code[0]).all():
         yield np.arange(len(code))
         return
-    order = np.argsort(code, kind="stable")
-    edges = np.flatnonzero(np.diff(code[order])) + 1
-    yield from (places for places in np.split(order, edges) if len(places))
+    code_order = np.argsort(code, kind="stable")
+    group_starts = np.flatnonzero(np.diff(code[code_order])) + 1
+    yield from (indices for indices in np.split(code_order, group_starts) if len(indices))
 
 
 _Table = TypeVar("_Table")
@@ -174,8 +174,8 @@ def concatenate_tables(tables: Sequence[_Table]) -> _Table:
         columns = [getattr(table, name) for table in tables]
         if isinstance(columns[0], np.ndarray):
             return np.concatenate(columns)
-        kinds = [type(column) for column in columns if hasattr(column, "concatenate")]
-        return kinds[0].concatenate(columns) if kinds else list(chain.from_iterable(columns))
+        column_types = [type(column) for column in columns if hasattr(column, "concatenate")]
+        return column_types[0].concatenate(columns) if column_types else list(chain.from_iterable(columns))
 
     return _map_columns(tables[-1], joined_column)
 

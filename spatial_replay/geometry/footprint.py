@@ -88,8 +88,8 @@ class ConvexPart:
 
     @property
     def vertices(self) -> Floats:
-        count = len(self.packed) // _OF_VERTEX - 1
-        return np.ndarray((count, 2), np.float64, self.packed, _OF_VERTEX)
+        vertex_count = len(self.packed) // _OF_VERTEX - 1
+        return np.ndarray((vertex_count, 2), np.float64, self.packed, _OF_VERTEX)
 
     def __repr__(self) -> str:
         radius = f", radius={self.radius:.6g}" if self.radius else ""
@@ -129,13 +129,13 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     """
     outlines = normalise_polygons(start, vertices)
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
-        parts = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
+        part_ranges = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
         # one by one, so that the first faulty part raises its own error
-        return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in parts]
-    corners, ends = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
+        return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in part_ranges]
+    corners, byte_offsets = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
     return [
         _checked_part(corners[begin:end], rounding)
-        for (begin, end), rounding in zip(pairwise(ends), radius.tolist(), strict=True)
+        for (begin, end), rounding in zip(pairwise(byte_offsets), radius.tolist(), strict=True)
     ]
 
 
@@ -189,8 +189,8 @@ class Footprint(metaclass=_FootprintType):
             GeometryError: a coordinate is not finite, or a minimum is above its maximum.
         """
         if xmin > xmax or ymin > ymax:
-            what = f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest"
-            raise GeometryError(f"{what}; give xmin, ymin, xmax, ymax")
+            box_text = f"box({xmin}, {ymin}, {xmax}, {ymax}) has its least corner above its greatest"
+            raise GeometryError(f"{box_text}; give xmin, ymin, xmax, ymax")
         return cls.polygon([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
 
     @classmethod
@@ -311,20 +311,20 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
         raise GeometryError(f"vertices have the shape {corners.shape}; give one or more pairs (x, y)")
     corners, fault = normalise_polygon(corners)
     if fault == TOO_MANY_CORNERS:
-        most = f"{MOST_CONVEX_CORNERS:,}"
-        raise GeometryError(f"a polygon has {len(corners):,} corners; simplify it to at most {most}")
+        limit_text = f"{MOST_CONVEX_CORNERS:,}"
+        raise GeometryError(f"a polygon has {len(corners):,} corners; simplify it to at most {limit_text}")
     if fault not in (SOUND, NOT_CONVEX):
         raise GeometryError(f"vertices {_vertices_text(corners)} are not all finite numbers of at most 1e100")
     return corners, fault == SOUND
 
 
-def _finite(value: float, what: str) -> float:
+def _finite(value: float, noun: str) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise GeometryError(f"{what} is {value!r}; give a number") from error
+        raise GeometryError(f"{noun} is {value!r}; give a number") from error
     if not math.isfinite(number):
-        raise GeometryError(f"{what} is {number}; give a finite number")
+        raise GeometryError(f"{noun} is {number}; give a finite number")
     return number
 
 
@@ -347,8 +347,8 @@ def _vertices_text(vertices: Floats) -> str:
 def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
     """Return the vertices, starting at the least one, so that equal rings have one form."""
     corners = [(x, y) for x, y in vertices.tolist()]
-    first = corners.index(min(corners))
-    return tuple(corners[first:] + corners[:first])
+    first_index = corners.index(min(corners))
+    return tuple(corners[first_index:] + corners[:first_index])
 
 
 # -------------------------------------------------------------------------------------------- many footprints
@@ -393,10 +393,10 @@ class FootprintBatch:
             if getattr(self, name).shape != shape:
                 actual = getattr(self, name).shape
                 raise GeometryError(f"{name} is {actual}; {rows} rows of {parts} parts need {shape}")
-        for name, last in (("part_start", parts), ("vertex_start", vertices)):
+        for name, end in (("part_start", parts), ("vertex_start", vertices)):
             start = getattr(self, name)
-            if start[0] != 0 or start[-1] != last or (start[1:] < start[:-1]).any():
-                raise GeometryError(f"{name} must rise from 0 to {last}; it is {start}")
+            if start[0] != 0 or start[-1] != end or (start[1:] < start[:-1]).any():
+                raise GeometryError(f"{name} must rise from 0 to {end}; it is {start}")
 
     @classmethod
     def without_checks(cls, **columns: Floats | Integers) -> FootprintBatch:
@@ -445,16 +445,16 @@ class FootprintBatch:
         cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None
     ) -> FootprintBatch:
         """Build one row per footprint, with its height interval (bottom, top) if it has one."""
-        packed = [part.packed for footprint in footprints for part in footprint.parts]
+        packed_parts = [part.packed for footprint in footprints for part in footprint.parts]
         # the pair before a part's vertices is its header: number of vertices, radius
-        numbers = np.frombuffer(b"".join(packed)).reshape(-1, 2)
-        heads = starts_from_counts([len(part) for part in packed]) // numbers.strides[0]
+        number_pairs = np.frombuffer(b"".join(packed_parts)).reshape(-1, 2)
+        header_rows = starts_from_counts([len(part) for part in packed_parts]) // number_pairs.strides[0]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
         return cls(
             part_start=starts_from_counts([len(footprint.parts) for footprint in footprints]),
-            vertex_start=heads - np.arange(len(heads)),
-            vertices=np.delete(numbers, heads[:-1], axis=0),
-            radius=numbers[heads[:-1], 1],
+            vertex_start=header_rows - np.arange(len(header_rows)),
+            vertices=np.delete(number_pairs, header_rows[:-1], axis=0),
+            radius=number_pairs[header_rows[:-1], 1],
             bottom=np.array([bottom for bottom, _ in intervals], dtype=np.float64),
             top=np.array([top for _, top in intervals], dtype=np.float64),
         )
@@ -476,9 +476,9 @@ class FootprintBatch:
         """Join the rows of several batches, one after the other."""
         if len(batches) == 1:
             return batches[0]
-        none = np.empty(0, np.int64)
-        part_counts = np.concatenate([none, *(np.diff(batch.part_start) for batch in batches)])
-        vertex_counts = np.concatenate([none, *(np.diff(batch.vertex_start) for batch in batches)])
+        no_counts = np.empty(0, np.int64)
+        part_counts = np.concatenate([no_counts, *(np.diff(batch.part_start) for batch in batches)])
+        vertex_counts = np.concatenate([no_counts, *(np.diff(batch.vertex_start) for batch in batches)])
         return cls.without_checks(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
@@ -551,8 +551,8 @@ def centre_object(tracked: TrackedObject) -> TrackedObject:
 def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
     """Return the `packed` of `centre_object` in a fiftieth of its time, for control loops."""
     # rows are headers (number of vertices, radius) and vertices in turn; a bytearray is writable for kernels
-    numbers, centre = np.frombuffer(bytearray(b"".join(tracked.packed[1:]))).reshape(-1, 2), np.empty(2)
-    _fill_packed_centre(numbers, centre)
+    number_pairs, centre = np.frombuffer(bytearray(b"".join(tracked.packed[1:]))).reshape(-1, 2), np.empty(2)
+    _fill_packed_centre(number_pairs, centre)
     bottom, top = tracked.height or (math.nan, math.nan)
     middle = bottom + 0.5 * (top - bottom)
     yaw = math.nan if tracked.yaw is None else tracked.yaw
@@ -564,18 +564,18 @@ def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
 @kernel
 def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
     """Fill `centre` (2,) from packed parts, by the same steps as `_fill_centres`."""
-    total = sum_x = sum_y = mean_x = mean_y = 0.0
-    at, parts = 0, 0
-    while at < len(numbers):
-        end = at + 1 + int(numbers[at, 0])
-        area, x, y = weight_and_centre(numbers, at + 1, end, numbers[at, 1])
-        total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
+    total_area = sum_x = sum_y = mean_x = mean_y = 0.0
+    header, part_count = 0, 0
+    while header < len(numbers):
+        end = header + 1 + int(numbers[header, 0])
+        area, x, y = weight_and_centre(numbers, header + 1, end, numbers[header, 1])
+        total_area, sum_x, sum_y = total_area + area, sum_x + area * x, sum_y + area * y
         mean_x, mean_y = mean_x + x, mean_y + y
-        at, parts = end, parts + 1
+        header, part_count = end, part_count + 1
     # points and segments have no area, so that each counts equally
-    if total <= 0.0:
-        total, sum_x, sum_y = float(parts), mean_x, mean_y
-    centre[0], centre[1] = sum_x / total, sum_y / total
+    if total_area <= 0.0:
+        total_area, sum_x, sum_y = float(part_count), mean_x, mean_y
+    centre[0], centre[1] = sum_x / total_area, sum_y / total_area
 
 
 def centres_of(batch: FootprintBatch) -> FootprintBatch:
@@ -593,21 +593,23 @@ def _fill_centres(
 ) -> None:
     """Fill `centres` (R, 2)."""
     for row in range(len(part_start) - 1):
-        total = sum_x = sum_y = mean_x = mean_y = 0.0
-        for p in range(part_start[row], part_start[row + 1]):
-            area, x, y = weight_and_centre(vertices, vertex_start[p], vertex_start[p + 1], radius[p])
-            total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
+        total_area = sum_x = sum_y = mean_x = mean_y = 0.0
+        for part in range(part_start[row], part_start[row + 1]):
+            area, x, y = weight_and_centre(vertices, vertex_start[part], vertex_start[part + 1], radius[part])
+            total_area, sum_x, sum_y = total_area + area, sum_x + area * x, sum_y + area * y
             mean_x, mean_y = mean_x + x, mean_y + y
         # points and segments have no area, so that each counts equally
-        if total <= 0.0:
-            total, sum_x, sum_y = part_start[row + 1] - part_start[row], mean_x, mean_y
-        centres[row, 0], centres[row, 1] = sum_x / total, sum_y / total
+        if total_area <= 0.0:
+            total_area, sum_x, sum_y = part_start[row + 1] - part_start[row], mean_x, mean_y
+        centres[row, 0], centres[row, 1] = sum_x / total_area, sum_y / total_area
 
 
 def radius_of(tracked: TrackedObject) -> float:
     """Return the distance from an object's centre to its farthest point."""
     centre = np.array(centre_of(tracked.footprint))
-    return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
+    return max(
+        float(np.hypot(*(part.vertices - centre).T).max()) + part.radius for part in tracked.footprint.parts
+    )
 
 
 def shift_rows(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
@@ -637,31 +639,31 @@ def with_poses(
     """Return a batch with A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
     parts = tracked.footprint.parts
     centre = np.array(centre_of(tracked.footprint))
-    count = len(positions) * len(turns)
+    row_count = len(positions) * len(turns)
     outlines = [part.vertices for part in parts]
     corners = np.concatenate(outlines)
-    sizes = np.array([len(outline) for outline in outlines], np.int64)
+    vertex_counts = np.array([len(outline) for outline in outlines], np.int64)
     bottom, top = tracked.height or (math.nan, math.nan)
-    part_start = batch.part_start[-1] + np.arange(count + 1, dtype=np.int64) * len(sizes)
-    vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(sizes, count))
+    part_start = batch.part_start[-1] + np.arange(row_count + 1, dtype=np.int64) * len(vertex_counts)
+    vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(vertex_counts, row_count))
     # one array for old and new vertices, because copying the vertices of many cells again takes time
-    vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
+    vertices = np.empty((len(batch.vertices) + row_count * len(corners), 2))
     vertices[: len(batch.vertices)] = batch.vertices
-    placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
+    new_vertices = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
     # complex numbers add x and y in one operation; each operation runs over the many positions
-    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
-    filled = placed.view(np.complex128)[..., 0]
+    complex_positions = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
+    complex_vertices = new_vertices.view(np.complex128)[..., 0]
     x, y = (corners - centre).T
-    for number, turn in enumerate(turns.tolist()):
+    for turn_index, turn in enumerate(turns.tolist()):
         cosine, sine = (math.cos(turn), math.sin(turn)) if turn else (1.0, 0.0)
-        turned = zip((x * cosine - y * sine).tolist(), (x * sine + y * cosine).tolist(), strict=True)
-        for corner, local in enumerate(turned):
-            np.add(at, complex(*local), out=filled[number, :, corner])
+        turned_corners = zip((x * cosine - y * sine).tolist(), (x * sine + y * cosine).tolist(), strict=True)
+        for corner_index, corner_xy in enumerate(turned_corners):
+            np.add(complex_positions, complex(*corner_xy), out=complex_vertices[turn_index, :, corner_index])
     return FootprintBatch.without_checks(
         part_start=np.concatenate((batch.part_start[:-1], part_start)),
         vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
         vertices=vertices,
-        radius=np.concatenate((batch.radius, np.tile([part.radius for part in parts], count))),
-        bottom=np.concatenate((batch.bottom, np.full(count, bottom))),
-        top=np.concatenate((batch.top, np.full(count, top))),
+        radius=np.concatenate((batch.radius, np.tile([part.radius for part in parts], row_count))),
+        bottom=np.concatenate((batch.bottom, np.full(row_count, bottom))),
+        top=np.concatenate((batch.top, np.full(row_count, top))),
     )

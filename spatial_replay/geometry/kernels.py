@@ -81,35 +81,35 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
     """Compute outward normal and length of each edge of the part with the vertices `start` up to `stop`."""
     if stop - start < 2:
         return
-    for i in range(start, stop):
-        following = i + 1 if i + 1 < stop else start
-        dx = vertices[following, 0] - vertices[i, 0]
-        dy = vertices[following, 1] - vertices[i, 1]
+    for vertex in range(start, stop):
+        next_vertex = vertex + 1 if vertex + 1 < stop else start
+        dx = vertices[next_vertex, 0] - vertices[vertex, 0]
+        dy = vertices[next_vertex, 1] - vertices[vertex, 1]
         length = math.sqrt(dx * dx + dy * dy)
-        edges[i, 0] = dy / length
-        edges[i, 1] = -dx / length
-        edges[i, 2] = length
+        edges[vertex, 0] = dy / length
+        edges[vertex, 1] = -dx / length
+        edges[vertex, 2] = length
 
 
 @reference_free
 def fill_row(rows: Rows, row: int) -> None:
     """Compute the edges of a row, which `rows_distance` reads."""
     # with one part per row there are no far parts to skip: boxes with heights took 0.25 instead of 0.23 us
-    is_one_each = len(rows.radius) == len(rows.bottom)
-    for p in range(rows.part_start[row], rows.part_start[row + 1]):
-        start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
+    has_single_parts = len(rows.radius) == len(rows.bottom)
+    for part in range(rows.part_start[row], rows.part_start[row + 1]):
+        start, stop = rows.vertex_start[part], rows.vertex_start[part + 1]
         _fill_edges(rows.vertices, rows.edges, start, stop)
-        if is_one_each:
+        if has_single_parts:
             rows.edges[start, 3] = np.inf
             continue
-        squared = 0.0
-        for i in range(start + 1, stop):
+        greatest_squared = 0.0
+        for vertex in range(start + 1, stop):
             dx, dy = (
-                rows.vertices[i, 0] - rows.vertices[start, 0],
-                rows.vertices[i, 1] - rows.vertices[start, 1],
+                rows.vertices[vertex, 0] - rows.vertices[start, 0],
+                rows.vertices[vertex, 1] - rows.vertices[start, 1],
             )
-            squared = max(squared, dx * dx + dy * dy)
-        rows.edges[start, 3] = math.sqrt(squared)
+            greatest_squared = max(greatest_squared, dx * dx + dy * dy)
+        rows.edges[start, 3] = math.sqrt(greatest_squared)
 
 
 @reference_free
@@ -122,9 +122,12 @@ def _fill_if_not(rows: Rows, row: int, is_filled: NDArray[np.bool_]) -> None:
 @reference_free
 def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
     """Return True only if the distance of two parts, without their radii, is surely above `reach`."""
-    a, b = rows.vertex_start[p], rows.vertex_start[q]
-    reach += rows.edges[a, 3] + rows.edges[b, 3]
-    dx, dy = rows.vertices[a, 0] - rows.vertices[b, 0], rows.vertices[a, 1] - rows.vertices[b, 1]
+    a_vertex, b_vertex = rows.vertex_start[p], rows.vertex_start[q]
+    reach += rows.edges[a_vertex, 3] + rows.edges[b_vertex, 3]
+    dx, dy = (
+        rows.vertices[a_vertex, 0] - rows.vertices[b_vertex, 0],
+        rows.vertices[a_vertex, 1] - rows.vertices[b_vertex, 1],
+    )
     # 1e-9 covers the rounding of the squares
     return reach < 0.0 or dx * dx + dy * dy > (1.0 + 1e-9) * reach * reach
 
@@ -132,10 +135,10 @@ def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
 @reference_free
 def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float) -> float:
     """Return the least height of a part's vertices above the line through (x, y) with normal (nx, ny)."""
-    least = np.inf
-    for j in range(start, stop):
-        least = min(least, nx * (vertices[j, 0] - x) + ny * (vertices[j, 1] - y))
-    return least
+    least_height = np.inf
+    for vertex in range(start, stop):
+        least_height = min(least_height, nx * (vertices[vertex, 0] - x) + ny * (vertices[vertex, 1] - y))
+    return least_height
 
 
 @reference_free
@@ -151,23 +154,23 @@ def _separate(
     """
     separation = -np.inf
     nearest = np.inf
-    count = a_stop - a_start
-    if count < 2:
+    a_count = a_stop - a_start
+    if a_count < 2:
         return separation, nearest
-    for i in range(a_start, a_stop):
-        x, y = vertices[i, 0], vertices[i, 1]
-        nx, ny = edges[i, 0], edges[i, 1]
-        least = _least_height(vertices, b_start, b_stop, x, y, nx, ny)
-        separation = max(separation, least)
-        if least >= 0.0:
-            for j in range(b_start, b_stop):
-                dx, dy = vertices[j, 0] - x, vertices[j, 1] - y
-                if 0.0 <= nx * dy - ny * dx <= edges[i, 2]:
+    for edge in range(a_start, a_stop):
+        x, y = vertices[edge, 0], vertices[edge, 1]
+        nx, ny = edges[edge, 0], edges[edge, 1]
+        least_height = _least_height(vertices, b_start, b_stop, x, y, nx, ny)
+        separation = max(separation, least_height)
+        if least_height >= 0.0:
+            for vertex in range(b_start, b_stop):
+                dx, dy = vertices[vertex, 0] - x, vertices[vertex, 1] - y
+                if 0.0 <= nx * dy - ny * dx <= edges[edge, 2]:
                     nearest = min(nearest, nx * dx + ny * dy)
-        if count == 2:
+        if a_count == 2:
             # normals of a segment see no gap to a part beyond its ends, so its direction is tried, too
-            k = a_start + a_stop - 1 - i
-            x, y = vertices[k, 0], vertices[k, 1]
+            other_end = a_start + a_stop - 1 - edge
+            x, y = vertices[other_end, 0], vertices[other_end, 1]
             separation = max(separation, _least_height(vertices, b_start, b_stop, x, y, -ny, nx))
     return separation, nearest
 
@@ -191,9 +194,12 @@ def _distance_by_edges(
     if nearest <= separation:
         return nearest
     squared = np.inf
-    for i in range(a_start, a_stop):
-        for j in range(b_start, b_stop):
-            dx, dy = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1]
+    for a_vertex in range(a_start, a_stop):
+        for b_vertex in range(b_start, b_stop):
+            dx, dy = (
+                vertices[a_vertex, 0] - vertices[b_vertex, 0],
+                vertices[a_vertex, 1] - vertices[b_vertex, 1],
+            )
             squared = min(squared, dx * dx + dy * dy)
     return min(nearest, math.sqrt(squared))
 
@@ -215,12 +221,12 @@ def _convex_protrusion(
     """Return the greatest signed distance from a vertex of A to the polygon B (without their radii)."""
     greatest = -np.inf
     if a_stop - a_start == BOX and b_stop - b_start == BOX:
-        for i in range(a_start, a_start + BOX):
-            distance = _distance_by_edges(vertices, edges, i, i + 1, b_start, b_start + BOX)
+        for vertex in range(a_start, a_start + BOX):
+            distance = _distance_by_edges(vertices, edges, vertex, vertex + 1, b_start, b_start + BOX)
             greatest = max(greatest, distance)
         return greatest
-    for i in range(a_start, a_stop):
-        greatest = max(greatest, _distance_by_edges(vertices, edges, i, i + 1, b_start, b_stop))
+    for vertex in range(a_start, a_stop):
+        greatest = max(greatest, _distance_by_edges(vertices, edges, vertex, vertex + 1, b_start, b_stop))
     return greatest
 
 
@@ -229,19 +235,23 @@ def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) ->
     """Return a part's area, and the centroid (x, y) of its polygon before rounding."""
     # relative to the first vertex, so that products of coordinates far from the origin do not cancel
     x0, y0 = vertices[start, 0], vertices[start, 1]
-    doubled = sum_x = sum_y = mean_x = mean_y = length = 0.0
-    for i in range(start, stop):
-        following = i + 1 if i + 1 < stop else start
-        ax, ay = vertices[i, 0] - x0, vertices[i, 1] - y0
-        bx, by = vertices[following, 0] - x0, vertices[following, 1] - y0
+    doubled_area = sum_x = sum_y = mean_x = mean_y = perimeter = 0.0
+    for vertex in range(start, stop):
+        next_vertex = vertex + 1 if vertex + 1 < stop else start
+        ax, ay = vertices[vertex, 0] - x0, vertices[vertex, 1] - y0
+        bx, by = vertices[next_vertex, 0] - x0, vertices[next_vertex, 1] - y0
         cross = ax * by - bx * ay
-        doubled, sum_x, sum_y = doubled + cross, sum_x + cross * (ax + bx), sum_y + cross * (ay + by)
+        doubled_area, sum_x, sum_y = (
+            doubled_area + cross,
+            sum_x + cross * (ax + bx),
+            sum_y + cross * (ay + by),
+        )
         mean_x, mean_y = mean_x + ax, mean_y + ay
-        length += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
+        perimeter += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
     # Steiner's formula: the polygon, a strip along its sides, and sectors at its corners that make a disc
-    area = doubled / 2 + length * radius + math.pi * radius * radius
-    if stop - start > 2 and doubled > _FLAT * length * length:
-        return area, x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled)
+    area = doubled_area / 2 + perimeter * radius + math.pi * radius * radius
+    if stop - start > 2 and doubled_area > _FLAT * perimeter * perimeter:
+        return area, x0 + sum_x / (3.0 * doubled_area), y0 + sum_y / (3.0 * doubled_area)
     return area, x0 + mean_x / (stop - start), y0 + mean_y / (stop - start)
 
 
@@ -249,40 +259,47 @@ def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) ->
 def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
     """Return the signed distance of rows a and b: that of upright prisms if both have heights."""
     start = rows.vertex_start
-    least = np.inf
-    for p in range(rows.part_start[a], rows.part_start[a + 1]):
-        for q in range(rows.part_start[b], rows.part_start[b + 1]):
+    least_distance = np.inf
+    for part in range(rows.part_start[a], rows.part_start[a + 1]):
+        for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
             # the parentheses keep the sum equal bit for bit when p and q are swapped
-            grown = (rows.radius[p] + rows.radius[q]) + enlargement
-            if least < np.inf and _is_farther(rows, p, q, least + grown):
+            radii = (rows.radius[part] + rows.radius[other_part]) + enlargement
+            if least_distance < np.inf and _is_farther(rows, part, other_part, least_distance + radii):
                 continue
             distance = _convex_distance(
-                rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1]
+                rows.vertices,
+                rows.edges,
+                start[part],
+                start[part + 1],
+                start[other_part],
+                start[other_part + 1],
             )
-            least = min(least, distance - grown)
+            least_distance = min(least_distance, distance - radii)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
-        return least
+        return least_distance
     gap = max(rows.bottom[a] - rows.top[b], rows.bottom[b] - rows.top[a])
-    if least > 0.0 and gap > 0.0:
-        return math.sqrt(least * least + gap * gap)
-    return float(max(least, gap))
+    if least_distance > 0.0 and gap > 0.0:
+        return math.sqrt(least_distance * least_distance + gap * gap)
+    return float(max(least_distance, gap))
 
 
 @reference_free
-def _part_protrusion(rows: Rows, a: int, p: int, b: int, enlargement: float) -> float:
+def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) -> float:
     """Return the least protrusion of part p of row a from the parts of row b."""
     start, radius = rows.vertex_start, rows.radius
-    least = np.inf
-    for q in range(rows.part_start[b], rows.part_start[b + 1]):
+    least_protrusion = np.inf
+    for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
         # the protrusion from q is at least the distance from q, so that far parts cannot be the least
-        reach = least - (radius[p] - radius[q]) - enlargement
-        if least < np.inf and _is_farther(rows, p, q, reach):
+        reach = least_protrusion - (radius[part] - radius[other_part]) - enlargement
+        if least_protrusion < np.inf and _is_farther(rows, part, other_part, reach):
             continue
-        planar = _convex_protrusion(rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1])
-        least = min(least, planar + (radius[p] - radius[q]) + enlargement)
+        planar = _convex_protrusion(
+            rows.vertices, rows.edges, start[part], start[part + 1], start[other_part], start[other_part + 1]
+        )
+        least_protrusion = min(least_protrusion, planar + (radius[part] - radius[other_part]) + enlargement)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
-        return least
-    return float(max(least, max(rows.bottom[b] - rows.bottom[a], rows.top[a] - rows.top[b])))
+        return least_protrusion
+    return float(max(least_protrusion, max(rows.bottom[b] - rows.bottom[a], rows.top[a] - rows.top[b])))
 
 
 @reference_free
@@ -294,15 +311,17 @@ def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> flo
         return float(rows.top[row])
     sign = -1.0 if quantity % 2 == 0 else 1.0
     greatest = -np.inf
-    for p in range(rows.part_start[row], rows.part_start[row + 1]):
-        start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
+    for part in range(rows.part_start[row], rows.part_start[row + 1]):
+        start, stop = rows.vertex_start[part], rows.vertex_start[part + 1]
         if quantity >= CENTROID_MIN_X:
             _, x, y = weight_and_centre(rows.vertices, start, stop, 0.0)
             greatest = max(greatest, sign * (x if quantity <= CENTROID_MAX_X else y))
         else:
             axis = 0 if quantity <= MAX_X else 1
-            for i in range(start, stop):
-                greatest = max(greatest, sign * rows.vertices[i, axis] + (rows.radius[p] + enlargement))
+            for vertex in range(start, stop):
+                greatest = max(
+                    greatest, sign * rows.vertices[vertex, axis] + (rows.radius[part] + enlargement)
+                )
     return greatest
 
 
@@ -311,13 +330,13 @@ def _union_distance(
     rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
     """Return the signed distance of two unions of rows: the least over pairs of rows."""
-    least = np.inf
-    for i in range(first[0], first[1]):
-        for j in range(second[0], second[1]):
-            a, b = members[i], members[j]
+    least_distance = np.inf
+    for first_member in range(first[0], first[1]):
+        for second_member in range(second[0], second[1]):
+            a, b = members[first_member], members[second_member]
             if a >= 0 and b >= 0:
-                least = min(least, rows_distance(rows, a, b, enlargement))
-    return least
+                least_distance = min(least_distance, rows_distance(rows, a, b, enlargement))
+    return least_distance
 
 
 @reference_free
@@ -330,16 +349,18 @@ def _union_protrusion(
     greatest of these protrusions.
     """
     greatest = -np.inf
-    for i in range(first[0], first[1]):
-        a = members[i]
+    for first_member in range(first[0], first[1]):
+        a = members[first_member]
         if a < 0:
             continue
-        for p in range(rows.part_start[a], rows.part_start[a + 1]):
-            least = np.inf
-            for j in range(second[0], second[1]):
-                if members[j] >= 0:
-                    least = min(least, _part_protrusion(rows, a, p, members[j], enlargement))
-            greatest = max(greatest, least)
+        for part in range(rows.part_start[a], rows.part_start[a + 1]):
+            least_protrusion = np.inf
+            for second_member in range(second[0], second[1]):
+                if members[second_member] >= 0:
+                    least_protrusion = min(
+                        least_protrusion, _part_protrusion(rows, a, part, members[second_member], enlargement)
+                    )
+            greatest = max(greatest, least_protrusion)
     return greatest
 
 
@@ -349,10 +370,10 @@ def _union_extreme(
 ) -> float:
     """Return a projection of a union of rows; NaN along z if a row has no height."""
     greatest = -np.inf
-    for i in range(first[0], first[1]):
-        if members[i] < 0:
+    for member in range(first[0], first[1]):
+        if members[member] < 0:
             continue
-        extreme = _row_extreme(rows, quantity, members[i], enlargement)
+        extreme = _row_extreme(rows, quantity, members[member], enlargement)
         if math.isnan(extreme):
             return np.nan
         greatest = max(greatest, extreme)
@@ -393,30 +414,38 @@ def measure_rows(
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     for block in range(begin, end, BLOCK):
         block_end = min(block + BLOCK, end)
-        for k in range(len(quantity)):
-            if quantity[k] <= PROTRUSION:
+        for request in range(len(quantity)):
+            if quantity[request] <= PROTRUSION:
                 for side in range(2):
-                    operand = first[k] if side == 0 else second[k]
-                    of_first = member_start[operand]
-                    for m in range(of_first + block * width[operand], of_first + block_end * width[operand]):
-                        _fill_if_not(rows, members[m], is_filled)
-        for t in range(block, block_end):
-            for k in range(values.shape[0]):
-                a, b = first[k], second[k]
-                start = member_start[a] + t * width[a]
+                    operand = first[request] if side == 0 else second[request]
+                    operand_start = member_start[operand]
+                    for member in range(
+                        operand_start + block * width[operand], operand_start + block_end * width[operand]
+                    ):
+                        _fill_if_not(rows, members[member], is_filled)
+        for sample in range(block, block_end):
+            for request in range(values.shape[0]):
+                a, b = first[request], second[request]
+                start = member_start[a] + sample * width[a]
                 a_members = (start, start + width[a])
-                if quantity[k] >= MIN_X:
-                    values[k, t] = _union_extreme(rows, members, a_members, quantity[k], enlargement[a])
+                if quantity[request] >= MIN_X:
+                    values[request, sample] = _union_extreme(
+                        rows, members, a_members, quantity[request], enlargement[a]
+                    )
                     continue
-                start = member_start[b] + t * width[b]
+                start = member_start[b] + sample * width[b]
                 b_members = (start, start + width[b])
-                if quantity[k] == SIGNED_DISTANCE:
-                    grown = enlargement[a] + enlargement[b]
-                    values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
-                elif quantity[k] == PROTRUSION:
+                if quantity[request] == SIGNED_DISTANCE:
+                    enlargements = enlargement[a] + enlargement[b]
+                    values[request, sample] = _union_distance(
+                        rows, members, a_members, b_members, enlargements
+                    )
+                elif quantity[request] == PROTRUSION:
                     # an enlarged container reduces the protrusion
-                    grown = enlargement[a] - enlargement[b]
-                    values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)
+                    enlargements = enlargement[a] - enlargement[b]
+                    values[request, sample] = _union_protrusion(
+                        rows, members, a_members, b_members, enlargements
+                    )
 
 
 _Line = tuple[float, float, float, float, float]
@@ -438,32 +467,32 @@ def fill_contacts(
     result: Floats,
 ) -> None:
     """Fill `result` (T, 6) as in `contacts`; `first` and `second` are rows (T, M), negative for none."""
-    for t in range(result.shape[0]):
+    for sample in range(result.shape[0]):
         greatest = -np.inf
         least = np.inf
-        for i in range(first.shape[1]):
-            a = first[t, i]
+        for first_member in range(first.shape[1]):
+            a = first[sample, first_member]
             if a < 0:
                 continue
-            for p in range(part_start[a], part_start[a + 1]):
+            for part in range(part_start[a], part_start[a + 1]):
                 # a protrusion is a maximum of minima, one for each part of `first`; a distance is one minimum
                 if is_protrusion:
                     least = np.inf
                 px, py, dx, dy, distance = np.nan, np.nan, 1.0, 0.0, np.inf
                 upper = np.nan
-                for j in range(second.shape[1]):
-                    b = second[t, j]
+                for second_member in range(second.shape[1]):
+                    b = second[sample, second_member]
                     if b < 0:
                         continue
-                    for q in range(part_start[b], part_start[b + 1]):
+                    for other_part in range(part_start[b], part_start[b + 1]):
                         line = _of_parts(
-                            vertices, vertex_start[p], vertex_start[p + 1], vertex_start[q],
-                            vertex_start[q + 1], is_protrusion,
+                            vertices, vertex_start[part], vertex_start[part + 1], vertex_start[other_part],
+                            vertex_start[other_part + 1], is_protrusion,
                         )  # fmt: skip
-                        first_radius = radius[p] + first_enlargement
+                        first_radius = radius[part] + first_enlargement
                         # the point of a rounded part farthest outside lies beyond its vertex, not before it
                         first_radius = -first_radius if is_protrusion else first_radius
-                        second_radius = radius[q] + second_enlargement
+                        second_radius = radius[other_part] + second_enlargement
                         rounded = line[4] - first_radius - second_radius
                         if rounded < least:
                             least = rounded
@@ -473,9 +502,9 @@ def fill_contacts(
                 is_taken = distance > greatest if is_protrusion else distance < np.inf
                 if is_taken and not math.isnan(px):
                     greatest = distance
-                    result[t, 0], result[t, 1] = px, py
-                    result[t, 2], result[t, 3] = px + dx * distance, py + dy * distance
-                    result[t, 4], result[t, 5] = distance, upper
+                    result[sample, 0], result[sample, 1] = px, py
+                    result[sample, 2], result[sample, 3] = px + dx * distance, py + dy * distance
+                    result[sample, 4], result[sample, 5] = distance, upper
 
 
 @piece
@@ -486,8 +515,8 @@ def _of_parts(
     if not is_protrusion:
         return _line(vertices, a_start, a_stop, b_start, b_stop)
     farthest = _line(vertices, a_start, a_start + 1, b_start, b_stop)
-    for i in range(a_start + 1, a_stop):
-        line = _line(vertices, i, i + 1, b_start, b_stop)
+    for vertex in range(a_start + 1, a_stop):
+        line = _line(vertices, vertex, vertex + 1, b_start, b_stop)
         if line[4] > farthest[4]:
             farthest = line
     return farthest
@@ -517,27 +546,27 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 
     Its distance is -inf if A is a point.
     """
-    best = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, -np.inf)
+    best_line = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, -np.inf)
     if a_stop - a_start < 2:
-        return best
-    for i in range(a_start, a_stop):
-        following = i + 1 if i + 1 < a_stop else a_start
-        x, y = vertices[i, 0], vertices[i, 1]
-        ax, ay = vertices[following, 0] - x, vertices[following, 1] - y
+        return best_line
+    for edge in range(a_start, a_stop):
+        next_vertex = edge + 1 if edge + 1 < a_stop else a_start
+        x, y = vertices[edge, 0], vertices[edge, 1]
+        ax, ay = vertices[next_vertex, 0] - x, vertices[next_vertex, 1] - y
         length = math.sqrt(ax * ax + ay * ay)
         ax, ay = ax / length, ay / length
         height, low, high = _deepest(vertices, b_start, b_stop, x, y, ay, -ax)
-        if height > best[4]:
+        if height > best_line[4]:
             # the middle of the contact, as far as it lies on the edge
-            place = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
-            best = (x + ax * place, y + ay * place, ay, -ax, height)
+            along = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
+            best_line = (x + ax * along, y + ay * along, ay, -ax, height)
         if a_stop - a_start == 2:  # normals of a segment see no gap to a part beyond its ends
-            x, y = vertices[following, 0], vertices[following, 1]
+            x, y = vertices[next_vertex, 0], vertices[next_vertex, 1]
             height, low, high = _deepest(vertices, b_start, b_stop, x, y, ax, ay)
-            if height > best[4]:
-                place = 0.0 if low < high else low
-                best = (x - ay * place, y + ax * place, ax, ay, height)
-    return best
+            if height > best_line[4]:
+                along = 0.0 if low < high else low
+                best_line = (x - ay * along, y + ax * along, ax, ay, height)
+    return best_line
 
 
 @piece
@@ -546,12 +575,12 @@ def _deepest(
 ) -> tuple[float, float, float]:
     """Return a part's least height above a line, and the range (low, high) along the line that attains it."""
     height, low, high = np.inf, np.inf, -np.inf
-    for j in range(start, stop):
-        height = min(height, (vertices[j, 0] - x) * nx + (vertices[j, 1] - y) * ny)
+    for vertex in range(start, stop):
+        height = min(height, (vertices[vertex, 0] - x) * nx + (vertices[vertex, 1] - y) * ny)
     # both ends of an edge parallel to the line are deepest, within rounding
     slack = 1e-9 * (abs(height) + abs(x) + abs(y))
-    for j in range(start, stop):
-        dx, dy = vertices[j, 0] - x, vertices[j, 1] - y
+    for vertex in range(start, stop):
+        dx, dy = vertices[vertex, 0] - x, vertices[vertex, 1] - y
         if dx * nx + dy * ny <= height + slack:
             along = dy * nx - dx * ny
             low, high = min(low, along), max(high, along)
@@ -561,18 +590,18 @@ def _deepest(
 @piece
 def _nearest(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
     """Return the shortest line from A's boundary to a vertex of B."""
-    best = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, np.inf)
-    for i in range(a_start, a_stop):
-        following = i + 1 if i + 1 < a_stop else a_start
-        x, y = vertices[i, 0], vertices[i, 1]
-        ax, ay = vertices[following, 0] - x, vertices[following, 1] - y
+    best_line = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, np.inf)
+    for edge in range(a_start, a_stop):
+        next_vertex = edge + 1 if edge + 1 < a_stop else a_start
+        x, y = vertices[edge, 0], vertices[edge, 1]
+        ax, ay = vertices[next_vertex, 0] - x, vertices[next_vertex, 1] - y
         squared = ax * ax + ay * ay
-        for j in range(b_start, b_stop):
-            dx, dy = vertices[j, 0] - x, vertices[j, 1] - y
+        for vertex in range(b_start, b_stop):
+            dx, dy = vertices[vertex, 0] - x, vertices[vertex, 1] - y
             share = min(max((dx * ax + dy * ay) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
             gx, gy = dx - share * ax, dy - share * ay
             distance = math.sqrt(gx * gx + gy * gy)
-            if distance < best[4]:
+            if distance < best_line[4]:
                 nx, ny = (gx / distance, gy / distance) if distance > 0.0 else (1.0, 0.0)
-                best = (x + share * ax, y + share * ay, nx, ny, distance)
-    return best
+                best_line = (x + share * ax, y + share * ay, nx, ny, distance)
+    return best_line

@@ -89,13 +89,13 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     members = np.concatenate([np.ravel(operand.rows) for operand in operands] or [_NO_ROWS])
     if members.size and members.max() >= len(batch):
         raise GeometryError(f"an operand has row {members.max()}; the batch has {len(batch)} rows, from 0")
-    size = np.array([operand.rows.size for operand in operands], dtype=np.int64)
+    operand_sizes = np.array([operand.rows.size for operand in operands], dtype=np.int64)
     values = np.empty((len(requests), operands[0].rows.shape[0] if operands else 0))
     codes = np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64)
     arguments: Any = (
         *_arrays_of(batch),
         members,
-        np.concatenate([[0], np.cumsum(size)]),
+        np.concatenate([[0], np.cumsum(operand_sizes)]),
         np.array([operand.rows.shape[1] for operand in operands], dtype=np.int64),
         np.array([operand.enlargement for operand in operands], dtype=np.float64),
         codes,
@@ -104,8 +104,8 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         np.empty((len(batch.vertices), 4)),
         values,
     )
-    least = _SHARE // max(len(requests), 1) + 1
-    over_cores(measure_rows, lambda *share: measure_rows(*arguments, *share), values.shape[1], least)
+    least_samples = _SHARE // max(len(requests), 1) + 1
+    over_cores(measure_rows, lambda *share: measure_rows(*arguments, *share), values.shape[1], least_samples)
     return values
 
 
@@ -128,8 +128,8 @@ def misalignment(first: Floats, second: Floats) -> Floats:
 
 @kernel
 def _misalignment(first: Floats, second: Floats, result: Floats) -> None:
-    for k in range(len(first)):
-        result[k] = misalignment_of(first[k], second[k])
+    for index in range(len(first)):
+        result[index] = misalignment_of(first[index], second[index])
 
 
 @inlined
@@ -180,22 +180,26 @@ def candidate_pairs(
     footprints = batch.select(rows)
     first_vertex = footprints.vertex_start[footprints.part_start[:-1]]
     radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
-    least = np.minimum.reduceat(footprints.vertices - radius, first_vertex)
-    greatest = np.maximum.reduceat(footprints.vertices + radius, first_vertex)
-    high = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
-    size = max(np.abs(least).max(), np.abs(greatest).max())
+    lower_corners = np.minimum.reduceat(footprints.vertices - radius, first_vertex)
+    upper_corners = np.maximum.reduceat(footprints.vertices + radius, first_vertex)
+    closest_distance = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
+    greatest_coordinate = max(np.abs(lower_corners).max(), np.abs(upper_corners).max())
     # 1e-9 covers rounding, as in `closest_rows`
-    reach = high + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * size
+    reach = closest_distance + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * greatest_coordinate
     # a sweep from left to right, because a matrix of all pairs of some thousands would take gigabytes
-    order = np.argsort(least[:, 0], kind="stable")
-    least, greatest = least[order], greatest[order]
-    ends = np.searchsorted(least[:, 0], greatest[:, 0] + reach, side="right").tolist()
+    left_order = np.argsort(lower_corners[:, 0], kind="stable")
+    lower_corners, upper_corners = lower_corners[left_order], upper_corners[left_order]
+    end_positions = np.searchsorted(lower_corners[:, 0], upper_corners[:, 0] + reach, side="right").tolist()
     pairs = []
-    for at, end in enumerate(ends):
-        low, high = least[at + 1 : end, 1], greatest[at + 1 : end, 1]
-        near = (low <= greatest[at, 1] + reach) & (least[at, 1] <= high + reach)
-        others = order[at + 1 : end][near]
-        pairs.append(np.sort(np.column_stack([np.full_like(others, order[at]), others])))
+    for position, end in enumerate(end_positions):
+        lower_sides, upper_sides = lower_corners[position + 1 : end, 1], upper_corners[position + 1 : end, 1]
+        is_near = (lower_sides <= upper_corners[position, 1] + reach) & (
+            lower_corners[position, 1] <= upper_sides + reach
+        )
+        near_indices = left_order[position + 1 : end][is_near]
+        pairs.append(
+            np.sort(np.column_stack([np.full_like(near_indices, left_order[position]), near_indices]))
+        )
     joined_pairs = np.concatenate(pairs).astype(np.int64)
     return joined_pairs[np.lexsort(joined_pairs.T[::-1])]
 
@@ -218,60 +222,68 @@ def closest_rows(
     """Fill `result` (T, 3) as in `closest_pairs`; `edges` (V, 4) is scratch space."""
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
-    width = members.shape[1]
-    boxes = np.full((width, 4), np.inf)
+    member_count = members.shape[1]
+    boxes = np.full((member_count, 4), np.inf)
     # footprints from left to right, by insertion sort, because their order changes little between samples
-    order = np.arange(width)
-    for t in range(result.shape[0]):
-        present, size, widest = 0, 0.0, 0.0
-        for m in range(width):
-            row = members[t, m]
+    member_order = np.arange(member_count)
+    for sample in range(result.shape[0]):
+        present_count, greatest_coordinate, widest_uncertainty = 0, 0.0, 0.0
+        for member in range(member_count):
+            row = members[sample, member]
             # absent footprints have empty boxes, which sort last
             left, right, lower, upper = np.inf, -np.inf, np.inf, -np.inf
             if row >= 0:
-                present += 1
-                widest = max(widest, uncertainty[row])
+                present_count += 1
+                widest_uncertainty = max(widest_uncertainty, uncertainty[row])
                 if not is_filled[row]:
                     is_filled[row] = True
                     fill_row(rows, row)
-                for p in range(part_start[row], part_start[row + 1]):
-                    for v in range(vertex_start[p], vertex_start[p + 1]):
-                        left = min(left, vertices[v, 0] - radius[p])
-                        right = max(right, vertices[v, 0] + radius[p])
-                        lower = min(lower, vertices[v, 1] - radius[p])
-                        upper = max(upper, vertices[v, 1] + radius[p])
-                size = max(size, max(max(-left, right), max(-lower, upper)))
-            boxes[m, LEFT], boxes[m, RIGHT], boxes[m, LOWER], boxes[m, UPPER] = left, right, lower, upper
-        for i in range(1, width):
-            moving, at = order[i], i
-            while at > 0 and boxes[order[at - 1], LEFT] > boxes[moving, LEFT]:
-                order[at] = order[at - 1]
-                at -= 1
-            order[at] = moving
+                for part in range(part_start[row], part_start[row + 1]):
+                    for vertex in range(vertex_start[part], vertex_start[part + 1]):
+                        left = min(left, vertices[vertex, 0] - radius[part])
+                        right = max(right, vertices[vertex, 0] + radius[part])
+                        lower = min(lower, vertices[vertex, 1] - radius[part])
+                        upper = max(upper, vertices[vertex, 1] + radius[part])
+                greatest_coordinate = max(greatest_coordinate, max(max(-left, right), max(-lower, upper)))
+            boxes[member, LEFT], boxes[member, RIGHT], boxes[member, LOWER], boxes[member, UPPER] = (
+                left,
+                right,
+                lower,
+                upper,
+            )
+        for position in range(1, member_count):
+            moved_member, slot = member_order[position], position
+            while slot > 0 and boxes[member_order[slot - 1], LEFT] > boxes[moved_member, LEFT]:
+                member_order[slot] = member_order[slot - 1]
+                slot -= 1
+            member_order[slot] = moved_member
         # enlargement and uncertainty make distances less than gaps of boxes; 1e-9 covers rounding of both
-        slack = enlargement + 2.0 * widest + 1e-9 * size
-        least, low, high = np.inf, np.inf, np.inf
-        for i in range(present):
-            a = order[i]
-            for j in range(i + 1, present):
-                b = order[j]
-                reach = high + slack
-                gap_x = boxes[b, LEFT] - boxes[a, RIGHT]
+        slack = enlargement + 2.0 * widest_uncertainty + 1e-9 * greatest_coordinate
+        least_distance, least_low, least_high = np.inf, np.inf, np.inf
+        for position in range(present_count):
+            first_member = member_order[position]
+            for other_position in range(position + 1, present_count):
+                second_member = member_order[other_position]
+                reach = least_high + slack
+                gap_x = boxes[second_member, LEFT] - boxes[first_member, RIGHT]
                 if gap_x > reach:
                     # boxes are sorted by their left sides, so that all further ones are farther away
                     break
-                gap_y = max(boxes[b, LOWER] - boxes[a, UPPER], boxes[a, LOWER] - boxes[b, UPPER])
+                gap_y = max(
+                    boxes[second_member, LOWER] - boxes[first_member, UPPER],
+                    boxes[first_member, LOWER] - boxes[second_member, UPPER],
+                )
                 if gap_y > reach:
                     continue
                 if gap_x > 0.0 and gap_y > 0.0 and gap_x * gap_x + gap_y * gap_y > reach * reach:
                     continue
-                first, second = members[t, a], members[t, b]
-                distance = rows_distance(rows, first, second, enlargement)
-                spread = uncertainty[first] + uncertainty[second]
-                least = min(least, distance)
-                low = min(low, distance - spread)
-                high = min(high, distance + spread)
-        result[t, 0], result[t, 1], result[t, 2] = least, low, high
+                first_row, second_row = members[sample, first_member], members[sample, second_member]
+                distance = rows_distance(rows, first_row, second_row, enlargement)
+                spread = uncertainty[first_row] + uncertainty[second_row]
+                least_distance = min(least_distance, distance)
+                least_low = min(least_low, distance - spread)
+                least_high = min(least_high, distance + spread)
+        result[sample, 0], result[sample, 1], result[sample, 2] = least_distance, least_low, least_high
 
 
 Point = tuple[float, float]

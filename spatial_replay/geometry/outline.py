@@ -62,17 +62,19 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
         vertex_start: (P + 1,) int64; outline p is vertices[vertex_start[p] : vertex_start[p + 1]].
         vertices: (V, 2) float64, in footprint units.
     """
-    tidy = np.array(vertices, dtype=np.float64, order="C")
+    tidy_vertices = np.array(vertices, dtype=np.float64, order="C")
     counts = np.empty(len(vertex_start) - 1, dtype=np.int64)
-    if len(counts) <= _FEW_OUTLINES and _are_normal(np.diff(vertex_start), tidy):
-        return Outlines(np.array(vertex_start, dtype=np.int64), tidy, np.full(len(counts), SOUND, np.int8))
+    if len(counts) <= _FEW_OUTLINES and _are_normal(np.diff(vertex_start), tidy_vertices):
+        return Outlines(
+            np.array(vertex_start, dtype=np.int64), tidy_vertices, np.full(len(counts), SOUND, np.int8)
+        )
     fault = np.empty(len(counts), dtype=np.int8)
     raw_start = np.array(vertex_start, dtype=np.int64)
-    used = _normalise_all(raw_start, tidy, counts, fault)
+    vertex_count = _normalise_all(raw_start, tidy_vertices, counts, fault)
     _limit_corners(counts, fault)
-    start = np.zeros(len(counts) + 1, dtype=np.int64)
-    np.cumsum(counts, out=start[1:])
-    return Outlines(start, tidy[:used], fault)
+    tidy_start = np.zeros(len(counts) + 1, dtype=np.int64)
+    np.cumsum(counts, out=tidy_start[1:])
+    return Outlines(tidy_start, tidy_vertices[:vertex_count], fault)
 
 
 def _are_normal(counts: Integers, vertices: Floats) -> bool:
@@ -80,25 +82,25 @@ def _are_normal(counts: Integers, vertices: Floats) -> bool:
 
     For a few outlines, NumPy is much faster than a loop over vertices in the interpreter.
     """
-    most = int(counts.max(initial=0))
+    corner_count = int(counts.max(initial=0))
     is_point = counts == 1
-    if most > _MOST_TESTED_CORNERS or not (is_point | (counts == most)).all():
+    if corner_count > _MOST_TESTED_CORNERS or not (is_point | (counts == corner_count)).all():
         return False
     if not (np.abs(vertices) <= LARGEST_COORDINATE).all():
         return False
-    if most <= 1:
+    if corner_count <= 1:
         return True
     corners = vertices if not is_point.any() else vertices[np.repeat(~is_point, counts)]
-    x, y = corners.reshape(-1, most, 2).transpose(2, 1, 0)
+    x, y = corners.reshape(-1, corner_count, 2).transpose(2, 1, 0)
     extent = np.maximum(np.ptp(x, axis=0), np.ptp(y, axis=0))
     magnitude = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
     tolerance = np.maximum(_FLATNESS * extent, np.maximum(_ROUNDING * magnitude, _SMALLEST))
     # the test of `_winding` for all corners at once
     next_x, next_y = np.roll(x, -1, axis=0), np.roll(y, -1, axis=0)
-    along_x, along_y = next_x - x, next_y - y
-    before_x, before_y = np.roll(along_x, 1, axis=0), np.roll(along_y, 1, axis=0)
+    edge_x, edge_y = next_x - x, next_y - y
+    previous_x, previous_y = np.roll(edge_x, 1, axis=0), np.roll(edge_y, 1, axis=0)
     chord_x, chord_y = next_x - np.roll(x, 1, axis=0), next_y - np.roll(y, 1, axis=0)
-    cross = before_x * along_y - before_y * along_x
+    cross = previous_x * edge_y - previous_y * edge_x
     is_left = (cross > 0.0) & (cross * cross > tolerance * tolerance * (chord_x**2 + chord_y**2))
     if not is_left.all():
         return False
@@ -109,9 +111,9 @@ def _are_normal(counts: Integers, vertices: Floats) -> bool:
 def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
     """Normalise one outline (n, 2), in place; return its vertices and its fault (see `Outlines`)."""
     counts, fault = np.empty(1, np.int64), np.empty(1, np.int8)
-    used = _normalise_all(np.array([0, len(vertices)]), vertices, counts, fault)
+    vertex_count = _normalise_all(np.array([0, len(vertices)]), vertices, counts, fault)
     _limit_corners(counts, fault)
-    return vertices[:used], fault.item(0)
+    return vertices[:vertex_count], fault.item(0)
 
 
 def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
@@ -128,42 +130,42 @@ _MOST_TESTED_CORNERS = 16
 @kernel
 def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
     """Normalise every outline in place and close the gaps; return the number of vertices left."""
-    used = 0
+    used_count = 0
     scratch = np.empty_like(vertices)
-    for p in range(len(counts)):
-        first, stop = start[p], start[p + 1]
-        counts[p] = stop - first
-        fault[p] = SOUND
+    for outline in range(len(counts)):
+        first, stop = start[outline], start[outline + 1]
+        counts[outline] = stop - first
+        fault[outline] = SOUND
         tolerance = _tolerance(vertices, first, stop)
         if tolerance < 0.0:
-            fault[p] = EMPTY if first == stop else NOT_FINITE
-        elif counts[p] > 1:
+            fault[outline] = EMPTY if first == stop else NOT_FINITE
+        elif counts[outline] > 1:
             winding = _winding(vertices, first, stop, tolerance)
             # an outline that is already convex is not tidied, so that it keeps its bits
             if winding == 0:
-                _copy(vertices, first, scratch, 0, counts[p])
-                left = _tidy(scratch, counts[p], tolerance)
+                _copy(vertices, first, scratch, 0, counts[outline])
+                count_left = _tidy(scratch, counts[outline], tolerance)
                 # strict, because nearly collinear vertices have been dropped
-                winding = _winding(scratch, 0, left, 0.0) if left > 2 else 1
+                winding = _winding(scratch, 0, count_left, 0.0) if count_left > 2 else 1
                 if winding == 0:
-                    fault[p] = NOT_CONVEX
+                    fault[outline] = NOT_CONVEX
                 else:
-                    _copy(scratch, 0, vertices, first, left)
-                    counts[p] = left
+                    _copy(scratch, 0, vertices, first, count_left)
+                    counts[outline] = count_left
             if winding == -1:
                 # the first vertex stays the first
-                _reverse(vertices, first + 1, first + counts[p])
-        _copy(vertices, first, vertices, used, counts[p])
-        used += counts[p]
-    return used
+                _reverse(vertices, first + 1, first + counts[outline])
+        _copy(vertices, first, vertices, used_count, counts[outline])
+        used_count += counts[outline]
+    return used_count
 
 
 @inlined
 def _copy(source: Floats, source_start: int, target: Floats, target_start: int, count: int) -> None:
     """Copy vertices in ascending order, so that the target may overlap a source that begins behind it."""
-    for i in range(count):
-        target[target_start + i, 0] = source[source_start + i, 0]
-        target[target_start + i, 1] = source[source_start + i, 1]
+    for offset in range(count):
+        target[target_start + offset, 0] = source[source_start + offset, 0]
+        target[target_start + offset, 1] = source[source_start + offset, 1]
 
 
 @inlined
@@ -180,8 +182,8 @@ def _tolerance(vertices: Floats, first: int, stop: int) -> float:
     """Return the distance within which a vertex counts as on a line; -1 for an unusable outline."""
     least_x = least_y = np.inf
     most_x = most_y = -np.inf
-    for i in range(first, stop):
-        x, y = vertices[i, 0], vertices[i, 1]
+    for vertex in range(first, stop):
+        x, y = vertices[vertex, 0], vertices[vertex, 1]
         if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE):
             return -1.0
         least_x, most_x = min(least_x, x), max(most_x, x)
@@ -199,27 +201,27 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
 
     A turn whose vertex lies within `tolerance` of its neighbours' line is neither left nor right.
     """
-    left = right = rounds = 0
-    count = stop - first
+    left_turns = right_turns = vertical_changes = 0
+    corner_count = stop - first
     ax, ay = vertices[stop - 1, 0], vertices[stop - 1, 1]
     bx, by = vertices[first, 0], vertices[first, 1]
     was_upper = by > ay or (by == ay and bx > ax)
-    for i in range(count):
-        following = first if i + 1 == count else first + i + 1
-        cx, cy = vertices[following, 0], vertices[following, 1]
+    for offset in range(corner_count):
+        next_vertex = first if offset + 1 == corner_count else first + offset + 1
+        cx, cy = vertices[next_vertex, 0], vertices[next_vertex, 1]
         cross = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
         chord = (cx - ax) * (cx - ax) + (cy - ay) * (cy - ay)
         if cross * cross > tolerance * tolerance * chord:
-            left += cross > 0.0
-            right += cross < 0.0
+            left_turns += cross > 0.0
+            right_turns += cross < 0.0
         is_upper = cy > by or (cy == by and cx > bx)
         # a convex outline rises once and falls once; a star, which also turns left only, more often
-        rounds += is_upper != was_upper
+        vertical_changes += is_upper != was_upper
         was_upper = is_upper
         ax, ay, bx, by = bx, by, cx, cy
-    if rounds != 2:
+    if vertical_changes != 2:
         return 0
-    return 1 if left == count else (-1 if right == count else 0)
+    return 1 if left_turns == corner_count else (-1 if right_turns == corner_count else 0)
 
 
 @inlined
@@ -229,28 +231,28 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
     head = _farthest(vertices, count, 0)
     tail = _farthest(vertices, count, head)
     is_flat = True
-    for i in range(count):
-        is_flat = is_flat and _strays(vertices, i, head, tail) <= tolerance
+    for vertex in range(count):
+        is_flat = is_flat and _strays(vertices, vertex, head, tail) <= tolerance
     if is_flat:
         first, second = min(head, tail), max(head, tail)
         _copy(vertices, first, vertices, 0, 1)
         _copy(vertices, second, vertices, 1, 1)
         return 1 if _distance(vertices, 0, 1) <= tolerance else 2
     # dropping a vertex can make its neighbours collinear, so repeat until nothing changes
-    changed = True
-    while changed and count > 2:
-        changed = False
-        remaining, length = count, 0
-        for i in range(count):
-            before = length - 1 if length else count - 1
-            after = i + 1 if i + 1 < count else 0
-            if remaining > 2 and _strays(vertices, i, before, after) <= tolerance:
-                remaining -= 1
-                changed = True
+    has_changed = True
+    while has_changed and count > 2:
+        has_changed = False
+        remaining_count, kept_count = count, 0
+        for vertex in range(count):
+            previous = kept_count - 1 if kept_count else count - 1
+            following = vertex + 1 if vertex + 1 < count else 0
+            if remaining_count > 2 and _strays(vertices, vertex, previous, following) <= tolerance:
+                remaining_count -= 1
+                has_changed = True
             else:
-                _copy(vertices, i, vertices, length, 1)
-                length += 1
-        count = remaining
+                _copy(vertices, vertex, vertices, kept_count, 1)
+                kept_count += 1
+        count = remaining_count
     return count
 
 
@@ -263,24 +265,24 @@ def _distance(vertices: Floats, i: int, j: int) -> float:
 @inlined
 def _farthest(vertices: Floats, count: int, origin: int) -> int:
     """Return the vertex farthest from vertex `origin`."""
-    greatest, index = -1.0, origin
-    for i in range(count):
-        distance = _distance(vertices, i, origin)
-        if distance > greatest:
-            greatest, index = distance, i
-    return index
+    greatest_distance, farthest = -1.0, origin
+    for vertex in range(count):
+        distance = _distance(vertices, vertex, origin)
+        if distance > greatest_distance:
+            greatest_distance, farthest = distance, vertex
+    return farthest
 
 
 @inlined
 def _strays(vertices: Floats, i: int, head: int, tail: int) -> float:
     """Return the distance of vertex i from the segment between vertices `head` and `tail`."""
-    length = _distance(vertices, head, tail)
-    if length == 0.0:
+    segment_length = _distance(vertices, head, tail)
+    if segment_length == 0.0:
         return _distance(vertices, i, head)
     dx, dy = vertices[tail, 0] - vertices[head, 0], vertices[tail, 1] - vertices[head, 1]
     px, py = vertices[i, 0] - vertices[head, 0], vertices[i, 1] - vertices[head, 1]
-    along = min(max((px * dx + py * dy) / length, 0.0), length) / length
-    ox, oy = px - along * dx, py - along * dy
+    share = min(max((px * dx + py * dy) / segment_length, 0.0), segment_length) / segment_length
+    ox, oy = px - share * dx, py - share * dy
     return math.sqrt(ox * ox + oy * oy)
 
 
@@ -316,20 +318,22 @@ def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats
     if not polygon.is_valid:
         raise GeometryError(_describe_crossing(polygon))
     corners = [(x, y) for x, y in vertices.tolist()]
-    number = {corner: i for i, corner in enumerate(corners)}
-    closed = get_coordinates(constrained_delaunay_triangles(polygon)).reshape(-1, 4, 2)
-    triangles = [tuple([number[x, y] for x, y in triangle]) for triangle in closed[:, :3].tolist()]
-    pieces = _merge((ring if _turn(corners, *ring) > 0 else ring[::-1] for ring in triangles), corners)
-    return [vertices[list(ring)] for ring in pieces]
+    corner_numbers = {corner: i for i, corner in enumerate(corners)}
+    closed_triangles = get_coordinates(constrained_delaunay_triangles(polygon)).reshape(-1, 4, 2)
+    triangles = [
+        tuple([corner_numbers[x, y] for x, y in triangle]) for triangle in closed_triangles[:, :3].tolist()
+    ]
+    piece_rings = _merge((ring if _turn(corners, *ring) > 0 else ring[::-1] for ring in triangles), corners)
+    return [vertices[list(ring)] for ring in piece_rings]
 
 
 def _describe_crossing(polygon: object) -> str:
     from shapely import is_valid_reason
 
-    reason, _, place = str(is_valid_reason(polygon)).partition("[")
-    where = f" at ({', '.join(place.rstrip(']').split())})" if place else f" ({reason})"
+    reason, _, position = str(is_valid_reason(polygon)).partition("[")
+    position_text = f" at ({', '.join(position.rstrip(']').split())})" if position else f" ({reason})"
     return (
-        f"the polygon's boundary crosses or touches itself{where}; "
+        f"the polygon's boundary crosses or touches itself{position_text}; "
         "list its corners in order around it, or split it, or take its hull (concave='hull')"
     )
 
@@ -343,22 +347,22 @@ def _turn(corners: Sequence[_Corner], a: int, b: int, c: int) -> float:
 def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring]:
     """Join counter-clockwise triangles across shared edges while the result is convex."""
     rings = dict(enumerate(triangles))
-    ring_of_edge = {edge: name for name, ring in rings.items() for edge in _edges(ring)}
-    shared = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
-    for i, j in sorted(shared, key=lambda edge: (-_squared_length(corners, *edge), edge)):
-        left, right = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
+    ring_of_edge = {edge: name for name, merged_ring in rings.items() for edge in _edges(merged_ring)}
+    shared_edges = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
+    for i, j in sorted(shared_edges, key=lambda edge: (-_squared_length(corners, *edge), edge)):
+        left_ring, right_ring = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
         # left runs j … i, right runs i … j
-        from_j, from_i = _rotate(left, j), _rotate(right, i)
-        ring = from_j + from_i[1:-1]
-        at_i = _turn(corners, from_j[-2], i, from_i[1])
-        at_j = _turn(corners, from_i[-2], j, from_j[1])
+        from_j, from_i = _rotate(left_ring, j), _rotate(right_ring, i)
+        merged_ring = from_j + from_i[1:-1]
+        turn_at_i = _turn(corners, from_j[-2], i, from_i[1])
+        turn_at_j = _turn(corners, from_i[-2], j, from_j[1])
         # straight corners are allowed: normalising the piece drops them
-        if at_i < 0 or at_j < 0:
+        if turn_at_i < 0 or turn_at_j < 0:
             continue
-        merged, removed = ring_of_edge[i, j], ring_of_edge[j, i]
-        rings[merged] = ring
-        del rings[removed]
-        ring_of_edge.update((edge, merged) for edge in _edges(ring))
+        merged_name, removed_name = ring_of_edge[i, j], ring_of_edge[j, i]
+        rings[merged_name] = merged_ring
+        del rings[removed_name]
+        ring_of_edge.update((edge, merged_name) for edge in _edges(merged_ring))
     return list(rings.values())
 
 
@@ -368,8 +372,8 @@ def _edges(ring: _Ring) -> Iterable[tuple[int, int]]:
 
 def _rotate(ring: _Ring, first: int) -> _Ring:
     """Return the same ring, starting at corner `first`."""
-    place = ring.index(first)
-    return ring[place:] + ring[:place]
+    index = ring.index(first)
+    return ring[index:] + ring[:index]
 
 
 def _squared_length(corners: Sequence[_Corner], i: int, j: int) -> float:

@@ -89,10 +89,10 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         return _open_messages(path, "ROS 2 bag", options)
     if isinstance(path, Path) and path.suffix == ".json":
         _refuse_description(path)
-    kind = format_of(path)
-    if kind is not None:
-        options.refuse_except(FORMATS[kind].options, kind, path.name)
-        return FORMATS[kind].open(path, kind, options)
+    format_name = format_of(path)
+    if format_name is not None:
+        options.refuse_except(FORMATS[format_name].options, format_name, path.name)
+        return FORMATS[format_name].open(path, format_name, options)
     if not _head(path):
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
     if isinstance(path, Path) and path.name.endswith((".db3.zstd", ".mcap.zstd")):
@@ -135,9 +135,9 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         *counted_from(trace.remarks, first_ns),
     )
     if faults and not allow_damage:
-        others = count_of(trace.faults) - 1
-        more = f"\n… and {others} more" if others else ""
-        raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
+        other_count = count_of(trace.faults) - 1
+        more_text = f"\n… and {other_count} more" if other_count else ""
+        raise LogError(f"{faults[0]}{more_text}; allow_damage=True reads the rest")
     return replace(trace, remarks=remarks, doubts=doubts, faults=faults, units=source.axes.units)
 
 
@@ -161,17 +161,21 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the metadata file stands for its bag
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
-            names = sorted(entry.name for entry in file.iterdir())
+            entry_names = sorted(entry.name for entry in file.iterdir())
             _refuse_data_set(file)
-            if {"format.json", "rows"}.issubset(names):
+            if {"format.json", "rows"}.issubset(entry_names):
                 remedy = "`results` shows them, and compares two such folders"
                 raise MissingFileError(f"{path}: this folder has results of a batch; {remedy}")
-            logs = [name for name in names if name.lower().endswith(LOG_ENDINGS)]
-            what = "no file of a ROS 2 bag (.db3, .mcap)" if names else "nothing"
-            such = f", such as {printable(str(file / logs[0]))}; batch takes a folder" if logs else ""
-            if inside := _data_set_in(file):
-                such = f"; {printable(str(inside))} is a data set of episodes"
-            raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log{such}")
+            log_names = [name for name in entry_names if name.lower().endswith(LOG_ENDINGS)]
+            content = "no file of a ROS 2 bag (.db3, .mcap)" if entry_names else "nothing"
+            example = (
+                f", such as {printable(str(file / log_names[0]))}; batch takes a folder" if log_names else ""
+            )
+            if data_set_path := _data_set_in(file):
+                example = f"; {printable(str(data_set_path))} is a data set of episodes"
+            raise MissingFileError(
+                f"{path}: there is {content} in this folder; give the path of a log{example}"
+            )
         return file
     if not file.version.has_ranges:
         return download(file, "its server does not give parts of files")
@@ -193,10 +197,10 @@ def _refuse_data_set(path: Path) -> None:
     """
     data_set = open_data_set(path)
     if data_set is not None and data_set.episodes:
-        first = printable(f"{path}#{data_set.episodes[0].number}")
+        first_episode = printable(f"{path}#{data_set.episodes[0].number}")
         raise UsageError(
             f"{path} is a {data_set.kind} data set of {plural(len(data_set.episodes), 'episode')}; give one,"
-            f" such as {first}, or all of them to `batch` or `judge`"
+            f" such as {first_episode}, or all of them to `batch` or `judge`"
         )
 
 
@@ -283,10 +287,10 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
         _ = file.version
     except MissingFileError:
         # the address of a folder without the slash at its end
-        inside = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
+        metadata = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
         with suppress(MissingFileError, RemoteError):
-            _ = inside.version
-            return inside
+            _ = metadata.version
+            return metadata
         raise
     return None
 
@@ -367,8 +371,8 @@ def _is_scenario(head: bytes) -> bool:
 
 
 def _is_csv(head: bytes) -> bool:
-    first = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
-    return any(name.encode() in first.split(b",") for name in CSV_COLUMNS)
+    first_line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
+    return any(name.encode() in first_line.split(b",") for name in CSV_COLUMNS)
 
 
 class Format(NamedTuple):
@@ -386,10 +390,10 @@ class Format(NamedTuple):
 
 
 def _track_source(
-    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, usual: Axes = OUR_AXES
+    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, usual_axes: Axes = OUR_AXES
 ) -> Source:
     """Return the source of a track file; option `y_down` overrides the usual axes of its format."""
-    axes = usual if options.y_down is None else replace(usual, y="down" if options.y_down else "up")
+    axes = usual_axes if options.y_down is None else replace(usual_axes, y="down" if options.y_down else "up")
     return TrackSource(path, kind, options, iter_traces=iter_traces, axes=axes)
 
 
@@ -409,10 +413,10 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open an external log of messages."""
     if options.mapping is None:
         if isinstance(path, Path) and path.is_dir() and not (path / BAG_METADATA).exists():
-            first = min(entry.name for entry in path.iterdir() if _BAG_FILE.search(entry.name))
+            first_name = min(entry.name for entry in path.iterdir() if _BAG_FILE.search(entry.name))
             raise UsageError(
                 f"{path.name} is a folder without {BAG_METADATA}; give one of its logs, such as "
-                f"{printable(str(path / first))}, or all of them to `spatial-replay batch`; "
+                f"{printable(str(path / first_name))}, or all of them to `spatial-replay batch`; "
                 "a ROS 2 bag needs a mapping file, too: --mapping FILE or mapping=FILE"
             )
         raise UsageError(

@@ -122,13 +122,13 @@ def survey(
     """
     topics = reader.topics()
     counter = _Counter(reader, topics)
-    for count, message in enumerate(reader.iter_messages({topic.name for topic in topics}), 1):
+    for message_count, message in enumerate(reader.iter_messages({topic.name for topic in topics}), 1):
         counter.add(message)
-        if count % _STEP == 0:
+        if message_count % _STEP == 0:
             advance(_STEP)
         if not whole and not counter.missing:
             break
-    mappable = suggest_topics(topics, counter.examples, counter.times_ns)
+    suggestions = suggest_topics(topics, counter.examples, counter.times_ns)
     faults = FaultList()
     reader.move_faults(faults)
     return Survey(
@@ -136,7 +136,10 @@ def survey(
         kind=reader.kind,
         start_ns=counter.start_ns,
         end_ns=counter.end_ns,
-        topics=tuple(TopicSurvey(e.topic, counter.counts[e.topic.name], e.entry) for e in mappable),
+        topics=tuple(
+            TopicSurvey(suggestion.topic, counter.counts[suggestion.topic.name], suggestion.entry)
+            for suggestion in suggestions
+        ),
         mapping=suggest_mapping(reader.name, topics, counter.examples, counter.times_ns),
         faults=faults.take(last=True),
         remarks=(*reader.take_remarks(), *counter.take_remarks()),
@@ -160,19 +163,19 @@ class Regularity:
 
     @classmethod
     def of(cls, times_ns: Integers, start_ns: int, end_ns: int) -> Regularity:
-        gaps = np.diff(times_ns, prepend=start_ns, append=end_ns)
-        seconds = max(end_ns - start_ns, 1) / 1e9
+        gaps_ns = np.diff(times_ns, prepend=start_ns, append=end_ns)
+        duration_s = max(end_ns - start_ns, 1) / 1e9
         # rounded against the log, so that a printed figure never meets a limit that the log misses
         return cls(
             len(times_ns),
-            math.floor(100.0 * (len(times_ns) - 1) / seconds) / 100.0,
-            math.ceil(int(gaps.max()) / 1e6) / 1e3,
+            math.floor(100.0 * (len(times_ns) - 1) / duration_s) / 100.0,
+            math.ceil(int(gaps_ns.max()) / 1e6) / 1e3,
         )
 
     def lacks(self, wanted: Mapping[str, Any], what: str) -> Iterator[str]:
         """Yield a sentence for each limit in `wanted` that is missed; its subject is `what`."""
-        if self.rate < (rate := wanted.get("rate", 0.0)):
-            yield f"{what} have {self.rate:g} a second, at least {rate:g} are required"
+        if self.rate < (least_rate := wanted.get("rate", 0.0)):
+            yield f"{what} have {self.rate:g} a second, at least {least_rate:g} are required"
         if self.max_gap > (gap_ns(wanted.get("max_gap")) or math.inf) / 1e9:
             yield f"{what} pause for {self.max_gap:g} s, at most {wanted['max_gap']} is allowed"
 
@@ -210,28 +213,30 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
     Raises:
         LogError: nothing can be read.
     """
-    tally, none = _Tally(), np.empty(0, np.int64)
-    times = [none]
+    tally, no_times = _Tally(), np.empty(0, np.int64)
+    trace_times_ns = [no_times]
     for block in read_blocks(source.keeping()):
         tally.add(block.trace)
-        times.append(block.trace.times_ns)
-    samples = np.concatenate(times)
-    if not len(samples):
+        trace_times_ns.append(block.trace.times_ns)
+    sample_times_ns = np.concatenate(trace_times_ns)
+    if not len(sample_times_ns):
         raise LogError(f"{source.name} has no sample")
-    of_topics: dict[str, list[Integers]] = defaultdict(list)
+    times_by_topic: dict[str, list[Integers]] = defaultdict(list)
     reader = None
     # an episode of a data set has no messages
     with suppress(LogError):
         reader = None if data_set_address(path) is not None else open_messages(readable_file(path))
     for columns in reader.iter_columns({topic.name for topic in reader.topics()}) if reader else ():
-        for name, rows in columns.by_topic():
-            of_topics[name].append(columns.log_time_ns[rows])
-    topics = {name: np.concatenate(pieces) for name, pieces in sorted(of_topics.items())}
-    start_ns = min((int(times_ns[0]) for times_ns in topics.values()), default=0)
-    end_ns = max((int(times_ns[-1]) for times_ns in topics.values()), default=0)
+        for name, row_indices in columns.by_topic():
+            times_by_topic[name].append(columns.log_time_ns[row_indices])
+    topic_times_ns = {
+        name: np.concatenate(time_arrays) for name, time_arrays in sorted(times_by_topic.items())
+    }
+    start_ns = min((int(times_ns[0]) for times_ns in topic_times_ns.values()), default=0)
+    end_ns = max((int(times_ns[-1]) for times_ns in topic_times_ns.values()), default=0)
     return Fitness(
-        Regularity.of(samples, int(samples[0]), int(samples[-1])),
-        {name: Regularity.of(times_ns, start_ns, end_ns) for name, times_ns in topics.items()},
+        Regularity.of(sample_times_ns, int(sample_times_ns[0]), int(sample_times_ns[-1])),
+        {name: Regularity.of(times_ns, start_ns, end_ns) for name, times_ns in topic_times_ns.items()},
         {
             tracked.name: math.floor(1000.0 * (tracked.samples - tracked.unreadable) / tally.samples) / 1000.0
             for tracked in tally.objects()
@@ -264,8 +269,8 @@ class _Counter:
                 self.examples[topic.name], self.times_ns[topic.name] = [], []
             except LogError as error:
                 self._remarks.append(str(error))
-        self._declared = {topic.name: topic.count for topic in topics}
-        self._bytes = dict.fromkeys(self._declared, 0)
+        self._declared_counts = {topic.name: topic.count for topic in topics}
+        self._example_bytes = dict.fromkeys(self._declared_counts, 0)
 
     def add(self, message: Message) -> None:
         time_ns, topic = message.log_time_ns, message.topic
@@ -274,29 +279,32 @@ class _Counter:
         self.counts[topic] += 1
         if self.counts[topic] in _LOOKED_AT and topic in self.examples:
             self._look(message)
-        if self.counts[topic] >= _ENOUGH or self.counts[topic] == self._declared[topic]:
+        if self.counts[topic] >= _ENOUGH or self.counts[topic] == self._declared_counts[topic]:
             self.missing.discard(topic)
 
     def _look(self, message: Message) -> None:
         topic = message.topic
-        self._bytes[topic] += len(message.payload)
-        if self.counts[topic] > 1 and self._bytes[topic] > _EXAMPLE_BYTES:
+        self._example_bytes[topic] += len(message.payload)
+        if self.counts[topic] > 1 and self._example_bytes[topic] > _EXAMPLE_BYTES:
             return
         try:
             self.examples[topic].append(self._decoders[topic](message.payload))
             self.times_ns[topic].append(message.log_time_ns)
         except LogError as error:
-            start = f"topic {topic!r}: "
-            what = f"{start}{str(error).removeprefix(start)}, at "
-            fault = Sentence(what, Instant(message.log_time_ns, 0))
-            count, first = self._undecodable.get(topic, (0, fault))
-            self._undecodable[topic] = count + 1, first
+            prefix = f"topic {topic!r}: "
+            fault_start = f"{prefix}{str(error).removeprefix(prefix)}, at "
+            fault = Sentence(fault_start, Instant(message.log_time_ns, 0))
+            fault_count, first_fault = self._undecodable.get(topic, (0, fault))
+            self._undecodable[topic] = fault_count + 1, first_fault
 
     def take_remarks(self) -> list[str]:
         """Return remarks on topics and on examples that cannot be decoded."""
         return self._remarks + [
-            Sentence(first, f" ({count} of {count + len(self.examples[topic])} messages looked at)")
-            for topic, (count, first) in self._undecodable.items()
+            Sentence(
+                first_fault,
+                f" ({fault_count} of {fault_count + len(self.examples[topic])} messages looked at)",
+            )
+            for topic, (fault_count, first_fault) in self._undecodable.items()
         ]
 
 
@@ -365,8 +373,8 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     if container is None or container.has_objects:
         try:
             # a local log is read whole, to find all of its damage; of a remote one, only the samples are read
-            read = source.keeping() if isinstance(source.path, RemoteFile) else source
-            for block in read.iter_blocks():
+            read_source = source.keeping() if isinstance(source.path, RemoteFile) else source
+            for block in read_source.iter_blocks():
                 tally.add(block.trace)
                 remarks += block.remarks
                 doubts |= dict.fromkeys(block.doubts)
@@ -427,14 +435,16 @@ class _Tally:
         self.start_ns = int(trace.times_ns[0]) if self.start_ns is None else self.start_ns
         self.end_ns = int(trace.times_ns[-1])
         self.signals.update(trace.signals)
-        for column, name in enumerate(trace.names):
-            rows = trace.rows[:, column]
-            readable, unreadable = rows[rows >= 0], -2 - rows[rows <= -2]
-            self.samples_with[name] += len(readable) + len(unreadable)
-            self.unreadable[name] += len(unreadable)
-            codes = np.unique(trace.class_code[np.concatenate([readable, unreadable])]).tolist()
+        for object_index, name in enumerate(trace.names):
+            rows = trace.rows[:, object_index]
+            readable_rows, unreadable_rows = rows[rows >= 0], -2 - rows[rows <= -2]
+            self.samples_with[name] += len(readable_rows) + len(unreadable_rows)
+            self.unreadable[name] += len(unreadable_rows)
+            class_codes = np.unique(
+                trace.class_code[np.concatenate([readable_rows, unreadable_rows])]
+            ).tolist()
             self.classes[name].update(
-                class_name for code in codes if (class_name := trace.classes[code]) is not None
+                class_name for code in class_codes if (class_name := trace.classes[code]) is not None
             )
 
     def objects(self) -> tuple[ObjectOverview, ...]:

@@ -87,12 +87,12 @@ class Recovery:
     @property
     def losses(self) -> str:
         """The missing parts, in a clause."""
-        samples = sum(gap.last - gap.first + 1 for gap in self.samples)
-        messages = sum(self.missing.values())
-        if messages and samples:
-            return f"{_missing(messages, 'message')}, {plural(samples, 'sample')} among them"
-        if messages or samples:
-            return _missing(messages or samples, "message" if messages else "sample")
+        sample_count = sum(gap.last - gap.first + 1 for gap in self.samples)
+        message_count = sum(self.missing.values())
+        if message_count and sample_count:
+            return f"{_missing(message_count, 'message')}, {plural(sample_count, 'sample')} among them"
+        if message_count or sample_count:
+            return _missing(message_count or sample_count, "message" if message_count else "sample")
         return "how much is missing is not known"
 
     def metadata(self) -> dict[str, str]:
@@ -154,10 +154,10 @@ def _write(
         topics = reader.topics()
     except LogError as error:
         raise LogError(f"nothing of {reader.name} can be recovered: {error}") from None
-    names = {topic.name for topic in topics}
-    channels, metadata = reader.channels(names), reader.metadata()
-    saved, start_ns, end_ns, is_ordered = Counter[str](), FOREVER, -1, True
-    samples = _Samples(reader.name, channels, dict(metadata), faults)
+    topic_names = {topic.name for topic in topics}
+    channels, metadata = reader.channels(topic_names), reader.metadata()
+    saved_counts, start_ns, end_ns, is_ordered = Counter[str](), FOREVER, -1, True
+    sample_filter = _Samples(reader.name, channels, dict(metadata), faults)
     with (
         replacing(output, inputs) as stream,
         LogWriter(stream, profile=reader.profile, chunk_ns=WHOLE_CHUNK_NS) as writer,
@@ -166,17 +166,22 @@ def _write(
             if name != RECOVERY:
                 writer.add_metadata(name, data)
         for attachment in reader.attachments():
-            at = {"log_time_ns": attachment.log_time_ns, "create_time_ns": attachment.create_time_ns}
-            writer.add_attachment(attachment.name, attachment.media_type, attachment.data, **at)
-        for columns in reader.iter_columns(names):
-            messages = samples.usable(columns)
+            attachment_times = {
+                "log_time_ns": attachment.log_time_ns,
+                "create_time_ns": attachment.create_time_ns,
+            }
+            writer.add_attachment(attachment.name, attachment.media_type, attachment.data, **attachment_times)
+        for columns in reader.iter_columns(topic_names):
+            messages = sample_filter.usable(columns)
             writer.write_messages(messages)
-            for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
-                saved[channels[int(number)].topic] += int(count)
+            for channel_number, message_count in zip(
+                *np.unique(messages.channel, return_counts=True), strict=True
+            ):
+                saved_counts[channels[int(channel_number)].topic] += int(message_count)
             if len(messages):
-                times = messages.log_time_ns
-                is_ordered &= bool(times[0] >= end_ns and (times[1:] >= times[:-1]).all())
-                start_ns, end_ns = min(start_ns, int(times.min())), max(end_ns, int(times.max()))
+                times_ns = messages.log_time_ns
+                is_ordered &= bool(times_ns[0] >= end_ns and (times_ns[1:] >= times_ns[:-1]).all())
+                start_ns, end_ns = min(start_ns, int(times_ns.min())), max(end_ns, int(times_ns.max()))
             advance(len(columns))
         reader.move_faults(faults)
         if end_ns < 0:
@@ -186,11 +191,11 @@ def _write(
             reader.name,
             start_ns,
             end_ns,
-            saved={name: saved[name] for name in sorted(names)},
+            saved={name: saved_counts[name] for name in sorted(topic_names)},
             missing={
-                topic.name: topic.count - saved[topic.name]
+                topic.name: topic.count - saved_counts[topic.name]
                 for topic in topics
-                if topic.count is not None and topic.count > saved[topic.name]
+                if topic.count is not None and topic.count > saved_counts[topic.name]
             },
             spans=(),
             samples=(),
@@ -198,10 +203,10 @@ def _write(
             remarks=counted_from(reader.take_remarks(), start_ns),
         )
         if not recovery.is_whole:
-            recovery = replace(recovery, spans=_spans(recovery.faults), samples=samples.gaps())
+            recovery = replace(recovery, spans=_spans(recovery.faults), samples=sample_filter.gaps())
         # records of earlier recoveries stay, because their losses are still missing
-        earlier = [data for name, data in metadata if name == RECOVERY]
-        for record in [*earlier, *([] if recovery.is_whole else [recovery.metadata()])]:
+        earlier_records = [data for name, data in metadata if name == RECOVERY]
+        for record in [*earlier_records, *([] if recovery.is_whole else [recovery.metadata()])]:
             writer.add_metadata(RECOVERY, record)
     return recovery, is_ordered
 
@@ -211,14 +216,14 @@ def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
     faults = FaultList()
     if isinstance(file, Path) and is_bag_folder(file):
         return open_messages(file), faults
-    kind = format_of(file)
-    if kind is not None and not kind.endswith(("MCAP", "bag")):
+    format_name = format_of(file)
+    if format_name is not None and not format_name.endswith(("MCAP", "bag")):
         raise UsageError(
-            f"{file.name} is a {kind}, a text file without an index; `spatial-replay record tracks` writes"
-            " its readable part as a log"
+            f"{file.name} is a {format_name}, a text file without an index; `spatial-replay record tracks`"
+            " writes its readable part as a log"
         )
     reader = _BY_ENDING.get(Path(file.name).suffix.lower())
-    if kind is None and reader is not None:
+    if format_name is None and reader is not None:
         faults.add(f"{file.name}: at byte 0: its first bytes are not those of a {reader.kind} log")
         return reader(file), faults
     return open_messages(file), faults
@@ -250,43 +255,47 @@ class _Samples:
     ) -> None:
         self._name = name
         self._faults = faults
-        self._own = [number for number, channel in channels.items() if is_samples(channel)]
+        self._sample_channels = [number for number, channel in channels.items() if is_samples(channel)]
         # only recordings number samples from 0; a replay of a part of a log keeps the numbers of that log
         is_recording = metadata.get(METADATA, {}).get("written_by") == "record"
-        self._last = -1 if is_recording else None
-        self._declared = metadata.get(ENDING, {}).get("samples", "") if is_recording else ""
+        self._last_number = -1 if is_recording else None
+        self._declared_count = metadata.get(ENDING, {}).get("samples", "") if is_recording else ""
         self._last_ns = -1
         self._gaps: list[SampleGap] = []
 
     def usable(self, messages: Messages) -> Messages:
         """Return the messages without samples of ours that cannot be decoded or repeat a time."""
-        sampled = np.flatnonzero(np.isin(messages.channel, self._own))
-        if not len(sampled):
+        sample_indices = np.flatnonzero(np.isin(messages.channel, self._sample_channels))
+        if not len(sample_indices):
             return messages
-        _, sound = decode_samples(messages, sampled, self._last_ns, self._fault)
-        self._find_gaps(messages.sequence[sound], messages.log_time_ns[sound])
-        return select(messages, without(messages, sampled, sound)) if len(sound) < len(sampled) else messages
+        _, readable_indices = decode_samples(messages, sample_indices, self._last_ns, self._fault)
+        self._find_gaps(messages.sequence[readable_indices], messages.log_time_ns[readable_indices])
+        return (
+            select(messages, without(messages, sample_indices, readable_indices))
+            if len(readable_indices) < len(sample_indices)
+            else messages
+        )
 
     def gaps(self) -> tuple[SampleGap, ...]:
         """Return all gaps, also the one between the last sample and the declared number of samples."""
-        if self._declared.isdecimal() and self._last is not None:
-            self._gap(self._last + 1, int(self._declared) - 1, None)
+        if self._declared_count.isdecimal() and self._last_number is not None:
+            self._gap(self._last_number + 1, int(self._declared_count) - 1, None)
         return tuple(self._gaps)
 
-    def _find_gaps(self, numbers: Integers, times_ns: Integers) -> None:
-        for number, time_ns in zip(numbers.tolist(), times_ns.tolist(), strict=True):
-            if self._last is not None:
-                self._gap(self._last + 1, number - 1, time_ns)
-            self._last, self._last_ns = number, time_ns
+    def _find_gaps(self, sample_numbers: Integers, times_ns: Integers) -> None:
+        for sample_number, time_ns in zip(sample_numbers.tolist(), times_ns.tolist(), strict=True):
+            if self._last_number is not None:
+                self._gap(self._last_number + 1, sample_number - 1, time_ns)
+            self._last_number, self._last_ns = sample_number, time_ns
 
-    def _gap(self, first: int, last: int, before_ns: int | None) -> None:
-        if first > last:
+    def _gap(self, first_missing: int, last_missing: int, before_ns: int | None) -> None:
+        if first_missing > last_missing:
             return
         after_ns = None if self._last_ns < 0 else self._last_ns
         if len(self._gaps) < _MOST_GAPS:
-            self._gaps.append(SampleGap(first, last, after_ns, before_ns))
+            self._gaps.append(SampleGap(first_missing, last_missing, after_ns, before_ns))
         else:
-            self._gaps[-1] = replace(self._gaps[-1], last=last, before_ns=before_ns)
+            self._gaps[-1] = replace(self._gaps[-1], last=last_missing, before_ns=before_ns)
 
-    def _fault(self, what: Sentence) -> None:
-        self._faults.add(Sentence(f"{self._name}: ", what))
+    def _fault(self, fault_text: Sentence) -> None:
+        self._faults.add(Sentence(f"{self._name}: ", fault_text))
