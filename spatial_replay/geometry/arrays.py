@@ -25,32 +25,32 @@ Flags: TypeAlias = NDArray[np.int8]
 Booleans: TypeAlias = NDArray[np.bool_]
 
 Empty: TypeAlias = Callable[[tuple[int, ...]], Floats]
-"""Allocator of arrays by shape, like `numpy.empty`; the numbers are not set."""
+"""Allocator of arrays of a shape, like `numpy.empty`; the numbers are not set."""
 
 
 _Number = TypeVar("_Number", np.float64, np.int64)
 
 _LARGE_BYTES: Final = 2**24
-"""Size from which arrays lie in a temporary file, bytes; a full disk leaves them in memory."""
+"""Least size of arrays in a temporary file, bytes. With a full disk, they stay in memory."""
 
 
 def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
-    """Return an array whose numbers are not set; a large one is mapped from a temporary file.
+    """Return an array whose numbers are not set; a large array is mapped from a temporary file.
 
-    The system can write pages of a mapped file to disk, so that a long log needs disk instead of memory. For
-    a million samples and 30 parts, memory fell from 0.64 to 0.25 GB.
+    The system can write pages of a mapped file to disk. So a long log needs disk instead of memory. For a
+    million samples and 30 parts, memory fell from 0.64 to 0.25 GB.
     """
     size_bytes = np.dtype(dtype).itemsize * math.prod(shape)
     if size_bytes >= _LARGE_BYTES:
         with suppress(OSError), tempfile.TemporaryFile() as file:
-            # without reserved blocks, a later write to a full disk would end the process by SIGBUS
+            # without reserved blocks, a later write to a full disk would end the process with SIGBUS
             os.posix_fallocate(file.fileno(), 0, size_bytes)
             return np.frombuffer(mmap.mmap(file.fileno(), size_bytes), dtype).reshape(shape)
     return np.empty(shape, dtype)
 
 
 def join_arrays(parts: Sequence[NDArray[_Number]], axis: int = 0) -> NDArray[_Number]:
-    """Concatenate arrays of one type into a `roomy` one."""
+    """Concatenate arrays of one type into a `roomy` array."""
     shape = list(parts[0].shape)
     shape[axis] = sum(part.shape[axis] for part in parts)
     return np.concatenate(parts, axis=axis, out=roomy(tuple(shape), parts[0].dtype.type))
@@ -73,7 +73,7 @@ def read_only_integers(values: ArrayLike) -> Integers:
 def writable(values: NDArray[_Number]) -> NDArray[_Number]:
     """Return a contiguous, writable view, or a copy where a view is not possible.
 
-    Read-only arrays have another type in Numba, so that a kernel would be compiled once more for them.
+    Numba gives read-only arrays another type, for which it would compile a kernel again.
     """
     view = np.ascontiguousarray(values).view()
     try:
@@ -84,7 +84,7 @@ def writable(values: NDArray[_Number]) -> NDArray[_Number]:
 
 
 def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
-    """Return the starts of n rows of the given lengths, then the end of the last one, (n + 1,)."""
+    """Return the starts of n rows of the given lengths, then the end of the last row, (n + 1,)."""
     start = np.zeros(len(counts) + 1, np.int64)
     np.add.accumulate(np.asarray(counts, np.int64), out=start[1:])
     return start
@@ -93,14 +93,14 @@ def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
 def flat_index(first: Integers, counts: Integers) -> Integers:
     """Return the flat indices of the elements of rows starting at `first` (n,) with lengths `counts` (n,)."""
     if len(counts) and (counts == counts[0]).all():
-        # the common case, such as boxes only
+        # the common case, such as only boxes
         return np.asarray((first[:, None] + np.arange(counts[0], dtype=np.int64)).reshape(-1))
     row_starts = starts_from_counts(counts)
     return np.asarray(np.repeat(first - row_starts[:-1], counts) + np.arange(row_starts[-1], dtype=np.int64))
 
 
 def count_in_rows(flags: Booleans, start: Integers) -> Integers:
-    """Return how many flags are set in each row; rows may be empty."""
+    """Return the number of set flags in each row; rows may be empty."""
     if not flags.any():
         return np.zeros(len(start) - 1, np.int64)
     running_counts = starts_from_counts(flags.astype(np.int64))
@@ -108,11 +108,11 @@ def count_in_rows(flags: Booleans, start: Integers) -> Integers:
 
 
 _MOST: Final = 2**62
-"""Largest product of column widths, which keeps combined codes within int64."""
+"""Largest product of column widths, so that combined codes fit into int64."""
 
 
 def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
-    """Return codes (length,), equal exactly in rows whose numbers are equal in all columns of integers."""
+    """Return a code per row (length,). Codes are equal exactly if all columns of integers are equal."""
     code, code_count = np.zeros(length, np.int64), 1
     for column in columns:
         if not length or (column == column[0]).all():
@@ -120,7 +120,7 @@ def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
         least_value = int(column.min())
         width = int(column.max()) - least_value + 1
         offsets = column.astype(np.int64) - least_value
-        # ranks keep codes small, before their product would overflow
+        # ranks keep codes small before the product would overflow
         if code_count * width > _MOST:
             (code, code_count), (offsets, width) = _ranks(code), _ranks(offsets)
         code, code_count = code * width + offsets, code_count * width
@@ -134,7 +134,7 @@ def _ranks(column: Integers) -> tuple[Integers, int]:
 
 
 def equal_places(code: Integers) -> Iterator[Integers]:
-    """Yield the indices (K,) of each distinct code, in ascending order of codes."""
+    """Yield for each distinct code the indices (K,) of its elements, in ascending order of codes."""
     if len(code) and (code == code[0]).all():
         yield np.arange(len(code))
         return
@@ -147,13 +147,13 @@ _Table = TypeVar("_Table")
 
 
 def select(table: _Table, rows: Integers | slice) -> _Table:
-    """Return the given rows of a dataclass of columns, in the order given.
+    """Return the given rows of a dataclass of columns, in the given order.
 
     Arrays and sequences are columns with one element per row. Mappings are shared by all rows.
     """
     if isinstance(rows, slice):
         return _map_columns(table, lambda name: getattr(table, name)[rows])
-    # converted once, and only if some column is not an array
+    # converted once, and only if a column is not an array
     row_numbers = cache(rows.tolist)
 
     def selected_column(name: str) -> Any:
@@ -166,7 +166,7 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
 
 
 def concatenate_tables(tables: Sequence[_Table]) -> _Table:
-    """Join one or more dataclasses of columns by rows; mappings come from the last (see `select`)."""
+    """Join one or more dataclasses of columns by rows; mappings come from the last table (see `select`)."""
     if len(tables) == 1:
         return tables[0]
 

@@ -1,6 +1,6 @@
 """Footprints: the areas that objects and regions cover in the plane, singly or as ragged rows.
 
-The module also computes centres, and moves and turns footprints.
+The module also computes centres of footprints, and moves and turns footprints.
 """
 
 from __future__ import annotations
@@ -40,35 +40,34 @@ from spatial_replay.geometry.outline import (
 from spatial_replay.text import is_encodable, named_arguments
 
 Concave: TypeAlias = Literal["decompose", "hull"]
-"""How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
+"""Treatment of a non-convex polygon: split into convex parts, or replacement by its convex hull."""
 
 _pack_part: Final = Struct("=2d").pack
 _OF_VERTEX: Final = 16
-"""Size of a packed vertex, and of the header (vertex count, radius) before the first one, bytes."""
+"""Size of a packed vertex, and of the header (vertex count, radius) before the first vertex, bytes."""
 _pack_object: Final = Struct("=5d").pack
 PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(5)
 """Indices of the numbers of a packed object; heights and yaw are NaN if missing."""
 _PLAIN: Final = _pack_object(1.0, math.nan, math.nan, math.nan, 0.0)
-"""Packed object of one part without height, yaw and uncertainty, as most objects are."""
+"""Packed numbers of an object with one part, and without height, yaw and uncertainty, like most objects."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
 class ConvexPart:
     """A rounded convex polygon: the Minkowski sum of a convex polygon and a disc.
 
-    Two parts are equal if their radii and their rings of vertices are equal. The ring's first vertex does
-    not matter.
+    Two parts are equal if their radii and their rings of vertices are equal, for any first vertex.
 
     Attributes:
-        vertices: (n, 2) float64, read-only, counter-clockwise, none repeated or collinear. One vertex is a
-            point (with a radius: a disc), two are a segment (a capsule).
+        vertices: (n, 2) float64, read-only, counter-clockwise, without repeated or collinear vertices. One
+            vertex is a point (with a radius: a disc), two vertices are a segment (a capsule).
         radius: rounding radius in footprint units, at least 0.
         packed: number of vertices, radius, and x and y of each vertex, as bytes of doubles. A monitor copies
-            them to its kernel. `vertices` is a view of these bytes, made on demand.
+            the bytes to its kernel. `vertices` is a view of the bytes.
 
     Raises:
-        GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
-            negative radius. Clockwise order, repeated and collinear vertices are accepted and corrected.
+        GeometryError: there is no vertex, a coordinate is not finite, the vertices are not convex, or the
+            radius is negative. Clockwise order, repeated and collinear vertices are corrected.
     """
 
     radius: float
@@ -120,7 +119,7 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     """Return P parts, checked and corrected together.
 
     Args:
-        start: (P + 1,), starts of the parts in `vertices`, then the end of the last.
+        start: (P + 1,), start of each part in `vertices`, then the end of the last part.
         vertices: (V, 2), in footprint units.
         radius: (P,), rounding radius of each part.
 
@@ -130,7 +129,7 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     outlines = normalise_polygons(start, vertices)
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
         part_ranges = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
-        # one by one, so that the first faulty part raises its own error
+        # one by one, so that the first faulty part raises its error
         return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in part_ranges]
     corners, byte_offsets = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
     return [
@@ -142,7 +141,7 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
 _SHAPES: Final[Mapping[str, str]] = MappingProxyType(
     {"circle": "disc(x, y, radius)", **dict.fromkeys(("rectangle", "rect"), "box(xmin, ymin, xmax, ymax)")}
 )
-"""Constructors of footprints by names of shapes in other libraries and in the specification language."""
+"""Constructors of footprints, by names of shapes in other libraries and in the specification language."""
 
 
 class _FootprintType(type):
@@ -183,7 +182,7 @@ class Footprint(metaclass=_FootprintType):
     @classmethod
     @named_arguments
     def box(cls, xmin: float, ymin: float, xmax: float, ymax: float) -> Footprint:
-        """Return an axis-aligned box, or a segment or a point if limits are equal.
+        """Return an axis-aligned box; a segment or a point if limits are equal.
 
         Raises:
             GeometryError: a coordinate is not finite, or a minimum is above its maximum.
@@ -199,7 +198,7 @@ class Footprint(metaclass=_FootprintType):
         """Return the disc around (x, y), which is a point if the radius is 0.
 
         Raises:
-            GeometryError: a value that is not finite, a negative radius.
+            GeometryError: a value is not finite, or the radius is negative.
         """
         return cls((ConvexPart(np.array([(x, y)]), radius),))
 
@@ -209,7 +208,7 @@ class Footprint(metaclass=_FootprintType):
         """Return all points within `radius` of the segment between two points (x, y).
 
         Raises:
-            GeometryError: a value that is not finite, a negative radius.
+            GeometryError: a value is not finite, or the radius is negative.
         """
         return cls((ConvexPart(np.array([start, end]), radius),))
 
@@ -220,8 +219,8 @@ class Footprint(metaclass=_FootprintType):
 
         Raises:
             GeometryError: there is no corner, a coordinate is not finite, or a convex polygon has more than
-                10,000 corners. Unless `concave="hull"`, also a boundary that crosses itself, and a polygon of
-                more than 2,000 corners that is not convex.
+                10,000 corners. Unless `concave="hull"`, also if the boundary crosses itself, or a polygon of
+                more than 2,000 corners is not convex.
         """
         if concave not in ("decompose", "hull"):
             raise GeometryError(f"concave={concave!r}; choose 'decompose' or 'hull'")
@@ -231,7 +230,8 @@ class Footprint(metaclass=_FootprintType):
         if concave == "hull":
             return cls((ConvexPart(convex_hull(corners)),))
         pieces = [ConvexPart(piece) for piece in convex_pieces(corners)]
-        # a piece narrower than the resolution of coordinates has become a segment, which neighbours cover
+        # a piece narrower than the resolution of coordinates is now a segment, which neighbouring pieces
+        # cover
         return cls(tuple(piece for piece in pieces if len(piece.vertices) > 2))
 
     @classmethod
@@ -251,15 +251,16 @@ class TrackedObject:
     """An object at one time: its footprint and other reported properties.
 
     Attributes:
-        footprint: the area it covers.
-        class_name: its class, or None.
-        yaw: its orientation in radians, counter-clockwise from the x axis, or None.
+        footprint: covered area.
+        class_name: class, or None.
+        yaw: orientation in radians, counter-clockwise from the x axis, or None.
         height: (bottom, top) in footprint units, or None.
-        uncertainty: radius in footprint units within which its true outline lies.
-        packed: part count, bottom, top, yaw and uncertainty as bytes of doubles, then each part's `packed`.
+        uncertainty: greatest distance of the true outline from the footprint's outline, footprint units.
+        packed: number of parts, bottom, top, yaw and uncertainty as bytes of doubles, then each part's
+            `packed`.
 
     Raises:
-        GeometryError: a value that is not finite, bottom above top, a negative uncertainty.
+        GeometryError: a value is not finite, bottom is above top, or the uncertainty is negative.
     """
 
     footprint: Footprint
@@ -301,7 +302,8 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
     """Return normalised vertices, and whether they are convex.
 
     Raises:
-        GeometryError: the vertices are not one or more finite points, or a convex polygon has too many.
+        GeometryError: the vertices are not one or more finite points, or a convex polygon has too many
+            vertices.
     """
     try:
         corners = np.array(vertices, dtype=np.float64, order="C")
@@ -345,7 +347,7 @@ def _vertices_text(vertices: Floats) -> str:
 
 
 def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
-    """Return the vertices, starting at the least one, so that equal rings have one form."""
+    """Return the vertices, starting at the least vertex, so that equal rings have one form."""
     corners = [(x, y) for x, y in vertices.tolist()]
     first_index = corners.index(min(corners))
     return tuple(corners[first_index:] + corners[:first_index])
@@ -360,16 +362,16 @@ class FootprintBatch:
 
     Footprint r has the slice part_start[r] : part_start[r + 1] of parts. Part p has the slice
     vertex_start[p] : vertex_start[p + 1] of vertices. Vertices of a part are in counter-clockwise order,
-    without repeated or collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw
-    outlines have to pass `normalise_polygons` first.
+    without repeated or collinear vertices. One vertex is a point or disc, two vertices are a segment or
+    capsule. Raw outlines must pass `normalise_polygons` first.
 
     Attributes:
         part_start: (R + 1,) int64.
         vertex_start: (P + 1,) int64.
         vertices: (V, 2) float64, in footprint units.
         radius: (P,) float64, rounding radius of each part, at least 0.
-        bottom, top: (R,) float64, height interval; NaN where a footprint has none.
-        All are contiguous and read-only.
+        bottom, top: (R,) float64, height interval; NaN for footprints without a height.
+        All arrays are contiguous and read-only.
 
     Raises:
         GeometryError: the lengths of the arrays do not fit together.
@@ -402,7 +404,7 @@ class FootprintBatch:
     def without_checks(cls, **columns: Floats | Integers) -> FootprintBatch:
         """Build a batch of new, contiguous arrays that fit together.
 
-        For a few rows, checking takes longer than building them.
+        For a few rows, the checks take longer than building the batch.
         """
         batch = object.__new__(cls)
         for name, array in columns.items():
@@ -436,7 +438,7 @@ class FootprintBatch:
 
     @property
     def nbytes(self) -> int:
-        """The size of its arrays in bytes."""
+        """The size of the batch's arrays in bytes."""
         numbers = (self.vertices, self.radius, self.bottom, self.top)
         return self.part_start.nbytes + self.vertex_start.nbytes + sum(array.nbytes for array in numbers)
 
@@ -444,9 +446,9 @@ class FootprintBatch:
     def from_footprints(
         cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None
     ) -> FootprintBatch:
-        """Build one row per footprint, with its height interval (bottom, top) if it has one."""
+        """Build one row per footprint, with its height interval (bottom, top) or None."""
         packed_parts = [part.packed for footprint in footprints for part in footprint.parts]
-        # the pair before a part's vertices is its header: number of vertices, radius
+        # the pair before a part's vertices is the part's header: number of vertices, radius
         number_pairs = np.frombuffer(b"".join(packed_parts)).reshape(-1, 2)
         header_rows = starts_from_counts([len(part) for part in packed_parts]) // number_pairs.strides[0]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
@@ -473,7 +475,7 @@ class FootprintBatch:
 
     @classmethod
     def concatenate(cls, batches: Sequence[FootprintBatch]) -> FootprintBatch:
-        """Join the rows of several batches, one after the other."""
+        """Join the rows of several batches in order."""
         if len(batches) == 1:
             return batches[0]
         no_counts = np.empty(0, np.int64)
@@ -489,7 +491,7 @@ class FootprintBatch:
         )
 
     def select(self, rows: Integers) -> FootprintBatch:
-        """Return the given rows (K,), in the order given; a row may be repeated."""
+        """Return the given rows (K,), in the given order; a row may be repeated."""
         if len(rows) == len(self) and (rows == np.arange(len(self))).all():
             return self
         first_part = self.part_start[rows]
@@ -515,7 +517,7 @@ class FootprintBatch:
         """Return the footprints of some rows.
 
         Raises:
-            GeometryError: the vertices of a part are not those of a convex polygon.
+            GeometryError: the vertices of a part do not form a convex polygon.
         """
         is_all = len(rows) == len(self) and list(rows) == list(range(len(self)))
         batch = self if is_all else self.select(np.array(rows, np.int64))
@@ -523,7 +525,7 @@ class FootprintBatch:
         return [Footprint(tuple(parts[begin:end])) for begin, end in pairwise(batch.part_start.tolist())]
 
     def height(self, row: int) -> tuple[float, float] | None:
-        """Return the height interval (bottom, top) of one row, or None."""
+        """Return the height interval (bottom, top) of one row; None without a height."""
         bottom = float(self.bottom[row])
         return None if math.isnan(bottom) else (bottom, float(self.top[row]))
 
@@ -534,23 +536,24 @@ class FootprintBatch:
 def centre_of(footprint: Footprint) -> tuple[float, float]:
     """Return the centre (x, y) of a footprint: the mean of its parts' centroids, weighted by area.
 
-    The centroid of a part is that of its unrounded polygon, or the mean of its vertices if that polygon has
-    no area. Areas of overlap count twice.
+    The centroid of a part is the centroid of its unrounded polygon, or the mean of its vertices for a polygon
+    without area. Overlapping areas count twice.
     """
     ((x, y),) = centres_of(FootprintBatch.from_footprints([footprint])).vertices.tolist()
     return x, y
 
 
 def centre_object(tracked: TrackedObject) -> TrackedObject:
-    """Return an object as the point at its centre, halfway up."""
+    """Return an object shrunk to the point at its centre, halfway up."""
     point = centres_of(FootprintBatch.from_footprints([tracked.footprint], [tracked.height]))
     x, y = point.vertices[0]
     return replace(tracked, footprint=Footprint.disc(x, y, 0.0), height=point.height(0))
 
 
 def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
-    """Return the `packed` of `centre_object` in a fiftieth of its time, for control loops."""
-    # rows are headers (number of vertices, radius) and vertices in turn; a bytearray is writable for kernels
+    """Return the attribute `packed` of `centre_object`'s result, 50 times as fast, for control loops."""
+    # rows are headers (number of vertices, radius) and vertices in turn; a bytearray, because kernels need
+    # writable arrays
     number_pairs, centre = np.frombuffer(bytearray(b"".join(tracked.packed[1:]))).reshape(-1, 2), np.empty(2)
     _fill_packed_centre(number_pairs, centre)
     bottom, top = tracked.height or (math.nan, math.nan)
@@ -563,7 +566,7 @@ def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
 @elementwise
 @kernel
 def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
-    """Fill `centre` (2,) from packed parts, by the same steps as `_fill_centres`."""
+    """Fill `centre` (2,) from packed parts, with the same steps as `_fill_centres`."""
     total_area = sum_x = sum_y = mean_x = mean_y = 0.0
     header, part_count = 0, 0
     while header < len(numbers):
@@ -579,7 +582,7 @@ def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
 
 
 def centres_of(batch: FootprintBatch) -> FootprintBatch:
-    """Return the centre of each row (see `centre_of`) as a point, halfway up."""
+    """Return each row's centre (see `centre_of`) as a point, halfway up."""
     centres, points = np.empty((len(batch), 2)), np.arange(len(batch) + 1, dtype=np.int64)
     _fill_centres(batch.part_start, batch.vertex_start, batch.vertices, batch.radius, centres)
     middle = batch.bottom + 0.5 * (batch.top - batch.bottom)
@@ -619,13 +622,13 @@ def shift_rows(batch: FootprintBatch, shifts: Floats) -> FootprintBatch:
 
 
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
-    """Return the object turned by an angle in radians, with its centre at (x, y) and the same height."""
+    """Return the object turned by an angle in radians and moved to the centre (x, y), at the same height."""
     (moved,) = moved_copies(tracked, np.array([[x, y]]), turn)
     return moved
 
 
 def moved_copies(tracked: TrackedObject, places: Floats, turn: float = 0.0) -> list[TrackedObject]:
-    """Return copies of an object, turned by an angle in radians, with their centres at `places` (M, 2)."""
+    """Return copies of an object, turned by an angle in radians, with centres at `places` (M, 2)."""
     batch = with_poses(FootprintBatch.unknown(0), tracked, places, np.array([turn]))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
     return [
@@ -636,7 +639,7 @@ def moved_copies(tracked: TrackedObject, places: Floats, turn: float = 0.0) -> l
 def with_poses(
     batch: FootprintBatch, tracked: TrackedObject, positions: Floats, turns: Floats
 ) -> FootprintBatch:
-    """Return a batch with A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
+    """Return a batch with A * M more rows: an object at each angle (A,), radians, and position (M, 2)."""
     parts = tracked.footprint.parts
     centre = np.array(centre_of(tracked.footprint))
     row_count = len(positions) * len(turns)
@@ -646,11 +649,11 @@ def with_poses(
     bottom, top = tracked.height or (math.nan, math.nan)
     part_start = batch.part_start[-1] + np.arange(row_count + 1, dtype=np.int64) * len(vertex_counts)
     vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(vertex_counts, row_count))
-    # one array for old and new vertices, because copying the vertices of many cells again takes time
+    # one array for old and new vertices avoids copying the vertices of many cells twice
     vertices = np.empty((len(batch.vertices) + row_count * len(corners), 2))
     vertices[: len(batch.vertices)] = batch.vertices
     new_vertices = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
-    # complex numbers add x and y in one operation; each operation runs over the many positions
+    # complex numbers add x and y in one operation, which runs over all positions
     complex_positions = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
     complex_vertices = new_vertices.view(np.complex128)[..., 0]
     x, y = (corners - centre).T

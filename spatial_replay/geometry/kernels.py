@@ -2,8 +2,8 @@
 
 All kernels read the ragged rows of a `FootprintBatch`.
 
-The result for a pair of parts does not depend on the rest of the call. Loops are symmetric in the two parts.
-So equal footprints give equal bits, in either order and in any batch.
+The result for a pair of parts does not depend on other rows of the call. Loops are symmetric in the two
+parts. So equal footprints give equal bits, in either order and in any batch.
 """
 
 from __future__ import annotations
@@ -38,14 +38,15 @@ QUANTITY_CODES: Final[Mapping[str, int]] = MappingProxyType(
         "centroid_max_y": CENTROID_MAX_Y,
     }
 )
-"""Codes of quantities in kernels: below 100 for two operands; even for a least coordinate."""
+"""Codes of quantities in kernels. Codes of quantities of two operands are below 100. Codes of least
+coordinates are even."""
 
 _FLAT: Final = 1e-12
-"""Least ratio of twice the area to the squared perimeter for a centroid by area."""
+"""Least ratio of twice the area to the squared perimeter of polygons with an area centroid."""
 BOX = 4
-"""Corners of the commonest parts; a constant length lets the compiler unroll their loops."""
+"""Number of corners of a box. A constant number lets the compiler unroll loops over the most common parts."""
 BLOCK = 64
-"""Samples per block, few enough to keep their edges in the processor's cache until distances read them."""
+"""Samples per block, few enough that their edges stay in the processor's cache until distances read them."""
 
 
 _Arguments = ParamSpec("_Arguments")
@@ -53,18 +54,18 @@ _Result = TypeVar("_Result")
 
 
 def reference_free(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return an inlined piece that counts no references to arrays.
+    """Return an inlined function that does not count references to arrays.
 
-    Counting took 390 of the 470 ns of a distance of two boxes. `_nrt` is a private option of Numba, which
-    versions without it ignore. It is for pieces of this module that neither make nor return arrays.
+    Counting took 390 of 470 ns for the distance of two boxes. `_nrt` is a private option of Numba; versions
+    without this option ignore it. Use it only for functions of this module that do not make or return arrays.
     """
     return inlined(function, _nrt=False)
 
 
 class Rows(NamedTuple):
-    """The arrays of a `FootprintBatch`, and the `edges` (V, 4) of its parts: outward normal and length.
+    """The arrays of a `FootprintBatch`, and `edges` (V, 4) of its parts: outward normal (x, y) and length.
 
-    The fourth number of a part's first edge is the greatest distance from its first vertex to another one.
+    The fourth number of a part's first edge is the greatest distance from its first vertex to another vertex.
     """
 
     part_start: Integers
@@ -78,7 +79,7 @@ class Rows(NamedTuple):
 
 @reference_free
 def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
-    """Compute outward normal and length of each edge of the part with the vertices `start` up to `stop`."""
+    """Compute outward normal and length of each edge of the part with vertices `start` to before `stop`."""
     if stop - start < 2:
         return
     for vertex in range(start, stop):
@@ -93,8 +94,8 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 
 @reference_free
 def fill_row(rows: Rows, row: int) -> None:
-    """Compute the edges of a row, which `rows_distance` reads."""
-    # with one part per row there are no far parts to skip: boxes with heights took 0.25 instead of 0.23 us
+    """Compute the edges of a row for `rows_distance`."""
+    # with one part per row there are no far parts to skip; the test would take 0.25 instead of 0.23 us
     has_single_parts = len(rows.radius) == len(rows.bottom)
     for part in range(rows.part_start[row], rows.part_start[row + 1]):
         start, stop = rows.vertex_start[part], rows.vertex_start[part + 1]
@@ -121,7 +122,7 @@ def _fill_if_not(rows: Rows, row: int, is_filled: NDArray[np.bool_]) -> None:
 
 @reference_free
 def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
-    """Return True only if the distance of two parts, without their radii, is surely above `reach`."""
+    """Return True only if the distance of parts p and q, without their radii, is surely above `reach`."""
     a_vertex, b_vertex = rows.vertex_start[p], rows.vertex_start[q]
     reach += rows.edges[a_vertex, 3] + rows.edges[b_vertex, 3]
     dx, dy = (
@@ -145,12 +146,12 @@ def _least_height(vertices: Floats, start: int, stop: int, x: float, y: float, n
 def _separate(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 ) -> tuple[float, float]:
-    """Return two bounds of the distance of A and B, both from the edges of A.
+    """Return two bounds of the distance of parts A and B, both from the edges of A.
 
     Returns:
-        (separation, nearest). separation: the greatest, over A's edges, of the least height of B above the
-        edge's line (-inf for a point). nearest: the least height of a vertex of B above an edge of A into
-        which it projects (+inf without one).
+        (separation, nearest). For each edge of A, B has a least height above the edge's line. Separation is
+        the greatest of these heights, or -inf if A is a point. Nearest is the least height of a vertex of B
+        above an edge of A onto which the vertex projects, or +inf without such a vertex.
     """
     separation = -np.inf
     nearest = np.inf
@@ -168,7 +169,7 @@ def _separate(
                 if 0.0 <= nx * dy - ny * dx <= edges[edge, 2]:
                     nearest = min(nearest, nx * dx + ny * dy)
         if a_count == 2:
-            # normals of a segment see no gap to a part beyond its ends, so its direction is tried, too
+            # normals of a segment show no gap to a part beyond its ends, so its direction is tried, too
             other_end = a_start + a_stop - 1 - edge
             x, y = vertices[other_end, 0], vertices[other_end, 1]
             separation = max(separation, _least_height(vertices, b_start, b_stop, x, y, -ny, nx))
@@ -181,9 +182,9 @@ def _distance_by_edges(
 ) -> float:
     """Return the signed distance of two parts (without their radii) from all edges and vertices.
 
-    The penetration depth is attained along the normal of an edge. The distance of disjoint polygons is
-    attained between two vertices, or between a vertex and a point inside an edge. In the second case it
-    equals the separation along the normal of that edge.
+    The penetration depth is along the normal of an edge. The distance of disjoint polygons is between two
+    vertices, or between a vertex and a point of an edge. In the second case it equals the separation along
+    the edge's normal.
     """
     a_separation, a_nearest = _separate(vertices, edges, a_start, a_stop, b_start, b_stop)
     b_separation, b_nearest = _separate(vertices, edges, b_start, b_stop, a_start, a_stop)
@@ -232,8 +233,8 @@ def _convex_protrusion(
 
 @reference_free
 def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) -> tuple[float, float, float]:
-    """Return a part's area, and the centroid (x, y) of its polygon before rounding."""
-    # relative to the first vertex, so that products of coordinates far from the origin do not cancel
+    """Return the area of a rounded part, and the centroid (x, y) of its unrounded polygon."""
+    # relative to the first vertex (x0, y0), so that products of coordinates far from the origin do not cancel
     x0, y0 = vertices[start, 0], vertices[start, 1]
     doubled_area = sum_x = sum_y = mean_x = mean_y = perimeter = 0.0
     for vertex in range(start, stop):
@@ -248,7 +249,7 @@ def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) ->
         )
         mean_x, mean_y = mean_x + ax, mean_y + ay
         perimeter += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
-    # Steiner's formula: the polygon, a strip along its sides, and sectors at its corners that make a disc
+    # Steiner's formula: the polygon, a strip along its sides, and sectors at its corners that form a disc
     area = doubled_area / 2 + perimeter * radius + math.pi * radius * radius
     if stop - start > 2 and doubled_area > _FLAT * perimeter * perimeter:
         return area, x0 + sum_x / (3.0 * doubled_area), y0 + sum_y / (3.0 * doubled_area)
@@ -257,12 +258,12 @@ def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) ->
 
 @reference_free
 def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
-    """Return the signed distance of rows a and b: that of upright prisms if both have heights."""
+    """Return the signed distance of rows a and b; rows that both have heights are upright prisms."""
     start = rows.vertex_start
     least_distance = np.inf
     for part in range(rows.part_start[a], rows.part_start[a + 1]):
         for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
-            # the parentheses keep the sum equal bit for bit when p and q are swapped
+            # the parentheses keep the sum equal, bit for bit, if the parts are swapped
             radii = (rows.radius[part] + rows.radius[other_part]) + enlargement
             if least_distance < np.inf and _is_farther(rows, part, other_part, least_distance + radii):
                 continue
@@ -285,11 +286,11 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
 
 @reference_free
 def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) -> float:
-    """Return the least protrusion of part p of row a from the parts of row b."""
+    """Return the least protrusion of a part of row a from the parts of row b."""
     start, radius = rows.vertex_start, rows.radius
     least_protrusion = np.inf
     for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
-        # the protrusion from q is at least the distance from q, so that far parts cannot be the least
+        # the protrusion from a part is at least the distance from it, so far parts cannot give the least
         reach = least_protrusion - (radius[part] - radius[other_part]) - enlargement
         if least_protrusion < np.inf and _is_farther(rows, part, other_part, reach):
             continue
@@ -304,7 +305,7 @@ def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) 
 
 @reference_free
 def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> float:
-    """Return a row's greatest coordinate for a MAX_ quantity, its negative least one for a MIN_ quantity."""
+    """Return a row's greatest coordinate for MAX_ quantities, minus its least for MIN_ quantities."""
     if quantity == MIN_Z:
         return float(-rows.bottom[row])
     if quantity == MAX_Z:
@@ -329,7 +330,7 @@ def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> flo
 def _union_distance(
     rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
-    """Return the signed distance of two unions of rows: the least over pairs of rows."""
+    """Return the signed distance of two unions of rows: the least distance over pairs of rows."""
     least_distance = np.inf
     for first_member in range(first[0], first[1]):
         for second_member in range(second[0], second[1]):
@@ -343,10 +344,10 @@ def _union_distance(
 def _union_protrusion(
     rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
-    """Return the protrusion of a union of rows from another.
+    """Return the protrusion of one union of rows from another union.
 
-    Each part of the first union protrudes by the least over the parts of the second. The result is the
-    greatest of these protrusions.
+    A part of the first union has a least protrusion over the parts of the second union. The result is the
+    greatest of these least protrusions.
     """
     greatest = -np.inf
     for first_member in range(first[0], first[1]):
@@ -406,10 +407,10 @@ def measure_rows(
     In sample t, the rows of operand o are the `width[o]` elements of `members` from
     `member_start[o] + t * width[o]` on. `member_start` (O + 1,) ends with the total.
 
-    `edges` (V, 4) is scratch space, one row per vertex. Calls for other samples may share it at the same
-    time, because all of them write the same numbers.
+    `edges` (V, 4) is scratch space, one row per vertex. Parallel calls for other samples may share it,
+    because all calls write the same numbers.
     """
-    # edges are computed on demand: a log has many more rows that are only projected, or unused
+    # edges are computed on demand, because many rows of a log are only projected, or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     for block in range(begin, end, BLOCK):
@@ -466,7 +467,7 @@ def fill_contacts(
     is_protrusion: bool,
     result: Floats,
 ) -> None:
-    """Fill `result` (T, 6) as in `contacts`; `first` and `second` are rows (T, M), negative for none."""
+    """Fill `result` (T, 6) as in `contacts`; `first` and `second` are row numbers (T, M), or negative."""
     for sample in range(result.shape[0]):
         greatest = -np.inf
         least = np.inf
@@ -475,7 +476,7 @@ def fill_contacts(
             if a < 0:
                 continue
             for part in range(part_start[a], part_start[a + 1]):
-                # a protrusion is a maximum of minima, one for each part of `first`; a distance is one minimum
+                # a protrusion is the maximum of one minimum per part of `first`; a distance is one minimum
                 if is_protrusion:
                     least = np.inf
                 px, py, dx, dy, distance = np.nan, np.nan, 1.0, 0.0, np.inf
@@ -490,7 +491,7 @@ def fill_contacts(
                             vertex_start[other_part + 1], is_protrusion,
                         )  # fmt: skip
                         first_radius = radius[part] + first_enlargement
-                        # the point of a rounded part farthest outside lies beyond its vertex, not before it
+                        # the point of a rounded part farthest outside is beyond its vertex
                         first_radius = -first_radius if is_protrusion else first_radius
                         second_radius = radius[other_part] + second_enlargement
                         rounded = line[4] - first_radius - second_radius
@@ -511,7 +512,7 @@ def fill_contacts(
 def _of_parts(
     vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int, is_protrusion: bool
 ) -> _Line:
-    """Return the line from part A to B or, for a protrusion, from A's vertex farthest outside B."""
+    """Return the line from part A to part B; for a protrusion, from A's vertex farthest outside B."""
     if not is_protrusion:
         return _line(vertices, a_start, a_stop, b_start, b_stop)
     farthest = _line(vertices, a_start, a_start + 1, b_start, b_stop)
@@ -524,7 +525,7 @@ def _of_parts(
 
 @piece
 def _line(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
-    """Return the line along which two convex polygons, segments or points attain their signed distance."""
+    """Return the line of the signed distance of two convex polygons, segments or points."""
     from_a = _push(vertices, a_start, a_stop, b_start, b_stop)
     from_b = _push(vertices, b_start, b_stop, a_start, a_stop)
     if from_b[4] > from_a[4]:
@@ -544,7 +545,7 @@ def _line(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
     """Return the line from A's most separating edge to the deepest point of B.
 
-    Its distance is -inf if A is a point.
+    The line's distance is -inf if A is a point.
     """
     best_line = (vertices[a_start, 0], vertices[a_start, 1], 1.0, 0.0, -np.inf)
     if a_stop - a_start < 2:
@@ -557,7 +558,7 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
         ax, ay = ax / length, ay / length
         height, low, high = _deepest(vertices, b_start, b_stop, x, y, ay, -ax)
         if height > best_line[4]:
-            # the middle of the contact, as far as it lies on the edge
+            # the middle of the contact on the edge
             along = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
             best_line = (x + ax * along, y + ay * along, ay, -ax, height)
         if a_stop - a_start == 2:  # normals of a segment see no gap to a part beyond its ends
@@ -573,11 +574,11 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 def _deepest(
     vertices: Floats, start: int, stop: int, x: float, y: float, nx: float, ny: float
 ) -> tuple[float, float, float]:
-    """Return a part's least height above a line, and the range (low, high) along the line that attains it."""
+    """Return a part's least height above a line, and its range (low, high) along the line."""
     height, low, high = np.inf, np.inf, -np.inf
     for vertex in range(start, stop):
         height = min(height, (vertices[vertex, 0] - x) * nx + (vertices[vertex, 1] - y) * ny)
-    # both ends of an edge parallel to the line are deepest, within rounding
+    # both ends of an edge parallel to the line have the least height, within rounding
     slack = 1e-9 * (abs(height) + abs(x) + abs(y))
     for vertex in range(start, stop):
         dx, dy = vertices[vertex, 0] - x, vertices[vertex, 1] - y

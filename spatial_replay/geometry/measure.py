@@ -1,12 +1,12 @@
-"""Measurements of footprints and orientations over many samples in one kernel call, and points of contact.
+"""Measure footprints and orientations over many samples in one kernel call; find points of contact.
 
 The closest pair of many footprints is found by a sweep over bounding boxes. The sweep skips pairs whose boxes
-are farther apart than the closest pair so far. This is exact: the signed distance of two footprints is at
-least the gap between their boxes along either axis, even a negative gap. The result equals that of all pairs,
-bit for bit.
+are farther apart than the closest pair so far. The sweep is exact: the signed distance of two footprints is
+at least the gap between their boxes along either axis, also for a negative gap. The result equals the result
+of testing all pairs, bit for bit.
 
-A contact is the place where two footprints are nearest, overlap deepest, or where one protrudes farthest.
-Contacts are for pictures and explanations only.
+A contact is the place where two footprints are nearest, overlap deepest, or where one footprint protrudes
+farthest. Contacts are for pictures and explanations only.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from spatial_replay.geometry.kernels import (
 )
 
 _SHARE = 16_384
-"""Least number of quantities per thread; fewer do not pay for starting a thread."""
+"""Least number of quantities per thread, so that starting a thread pays."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Operand:
-    """A footprint over T samples: the union of some rows in each sample.
+    """A footprint over T samples: in each sample, the union of some rows.
 
     Attributes:
-        rows: (T, M) int64, row numbers of a `FootprintBatch`; negative for an absent member. M is 1 for a
-            single object, and the number of members for a group.
+        rows: (T, M) int64, row numbers of a `FootprintBatch`; negative for an absent member. M is the number
+            of members of a group, or 1 for a single object.
         enlargement: radius of the disc added (Minkowski sum), in footprint units.
     """
 
@@ -52,11 +52,11 @@ class Operand:
 
 @dataclass(frozen=True, slots=True)
 class MeasureRequest:
-    """One quantity of one operand, or of two.
+    """A quantity of one operand, or of two operands.
 
     Attributes:
         quantity: key of `QUANTITY_CODES`.
-        first, second: indices of operands; -1 without a second one.
+        first, second: indices of operands; -1 without a second operand.
     """
 
     quantity: str
@@ -68,17 +68,17 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     """Compute each requested quantity in each sample.
 
     signed_distance(A, B) is the minimum over pairs of parts. For two parts it is the distance of their
-    polygons, or minus the penetration depth if they overlap (Def. 2-4 of the paper), minus both radii. If
-    both footprints have heights, it is that of upright prisms.
+    polygons minus both radii (Def. 2-4 of the paper). Overlapping polygons have minus the penetration depth
+    as their distance. If both footprints have heights, they are upright prisms.
 
-    protrusion(A, B) is a maximum over parts of A of a minimum over parts of B. For two parts it is the
-    maximum over vertices p of A of sd(p, B's polygon) + r_A - r_B. For prisms it is the greatest of that,
-    B.bottom - A.bottom and A.top - B.top.
+    protrusion(A, B) is the maximum, over parts of A, of the minimum over parts of B. For two parts it is the
+    maximum, over vertices p of A, of sd(p, B's polygon) + r_A - r_B. For prisms it is the greatest of this
+    planar protrusion, B.bottom - A.bottom and A.top - B.top.
 
-    Projections run over all parts and include radius and enlargement. Projections of centroids use the area
-    centroids of the unrounded polygons. Along z, a footprint without a height gives NaN.
+    Projections cover all parts and include radius and enlargement. Projections of centroids use the area
+    centroids of the unrounded polygons. Along z, the projection of a footprint without a height is NaN.
 
-    Over an empty union, a minimum is +inf and a maximum -inf.
+    The minimum over an empty union is +inf, the maximum is -inf.
 
     Returns:
         (K, T) float64 for K requests.
@@ -116,10 +116,10 @@ def _arrays_of(batch: FootprintBatch) -> Any:
 
 
 def misalignment(first: Floats, second: Floats) -> Floats:
-    """Return half the squared distance of unit vectors at two angles (Def. 10, 11): 1 - cos(difference).
+    """Return half the squared distance of the unit vectors at two angles: 1 - cos(difference) (Def. 10, 11).
 
     Args:
-        first, second: (T,) radians; NaN for a missing orientation, which makes the result NaN.
+        first, second: (T,) radians; NaN for a missing orientation makes the result NaN.
     """
     result = np.empty(len(first))
     _misalignment(first, second, result)
@@ -150,13 +150,13 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
     """Compute the signed distance of the closest pair of footprints in each sample.
 
     Args:
-        rows: (T, M), the rows of M footprints in each of T samples; negative for an absent footprint.
-        uncertainty: radius for each row of the batch, at least 0, in footprint units.
+        rows: (T, M), row numbers of M footprints in each of T samples; negative for an absent footprint.
+        uncertainty: radius of each row of the batch, at least 0, in footprint units.
         enlargement: length subtracted from each distance, in footprint units.
 
     Returns:
         (T, 3), three minima over pairs: distance, distance minus both uncertainties, distance plus both
-        uncertainties. All are +inf in samples with fewer than two footprints.
+        uncertainties. They are +inf in samples with fewer than two footprints.
     """
     result = np.empty((len(rows), 3))
     members = np.ascontiguousarray(rows), writable(uncertainty), float(enlargement)
@@ -168,14 +168,14 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
 def candidate_pairs(
     batch: FootprintBatch, rows: Integers, uncertainty: Floats, enlargement: float
 ) -> Integers:
-    """Return the pairs that may be the closest pair of one sample, with or without uncertainty.
+    """Return all pairs that may be a sample's closest pair, with or without uncertainty.
 
     Args:
-        rows: (M,), the rows of M footprints.
+        rows: (M,), row numbers of M footprints.
         uncertainty, enlargement: as for `closest_pairs`.
 
     Returns:
-        (P, 2), indices into `rows`: the lesser of each pair first, pairs in ascending order.
+        (P, 2), indices into `rows`, in ascending order; the lesser index of each pair comes first.
     """
     footprints = batch.select(rows)
     first_vertex = footprints.vertex_start[footprints.part_start[:-1]]
@@ -186,7 +186,7 @@ def candidate_pairs(
     greatest_coordinate = max(np.abs(lower_corners).max(), np.abs(upper_corners).max())
     # 1e-9 covers rounding, as in `closest_rows`
     reach = closest_distance + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * greatest_coordinate
-    # a sweep from left to right, because a matrix of all pairs of some thousands would take gigabytes
+    # a sweep from left to right, because a matrix of all pairs of thousands of footprints takes gigabytes
     left_order = np.argsort(lower_corners[:, 0], kind="stable")
     lower_corners, upper_corners = lower_corners[left_order], upper_corners[left_order]
     end_positions = np.searchsorted(lower_corners[:, 0], upper_corners[:, 0] + reach, side="right").tolist()
@@ -224,13 +224,14 @@ def closest_rows(
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     member_count = members.shape[1]
     boxes = np.full((member_count, 4), np.inf)
-    # footprints from left to right, by insertion sort, because their order changes little between samples
+    # footprints are sorted from left to right by insertion, because their order changes little between
+    # samples
     member_order = np.arange(member_count)
     for sample in range(result.shape[0]):
         present_count, greatest_coordinate, widest_uncertainty = 0, 0.0, 0.0
         for member in range(member_count):
             row = members[sample, member]
-            # absent footprints have empty boxes, which sort last
+            # absent footprints have empty boxes, which come last
             left, right, lower, upper = np.inf, -np.inf, np.inf, -np.inf
             if row >= 0:
                 present_count += 1
@@ -257,7 +258,8 @@ def closest_rows(
                 member_order[slot] = member_order[slot - 1]
                 slot -= 1
             member_order[slot] = moved_member
-        # enlargement and uncertainty make distances less than gaps of boxes; 1e-9 covers rounding of both
+        # enlargement and uncertainty make distances less than gaps of boxes. 1e-9 covers rounding of
+        # distances and gaps.
         slack = enlargement + 2.0 * widest_uncertainty + 1e-9 * greatest_coordinate
         least_distance, least_low, least_high = np.inf, np.inf, np.inf
         for position in range(present_count):
@@ -267,7 +269,7 @@ def closest_rows(
                 reach = least_high + slack
                 gap_x = boxes[second_member, LEFT] - boxes[first_member, RIGHT]
                 if gap_x > reach:
-                    # boxes are sorted by their left sides, so that all further ones are farther away
+                    # boxes are sorted by their left sides, so all further boxes are farther away
                     break
                 gap_y = max(
                     boxes[second_member, LOWER] - boxes[first_member, UPPER],
@@ -294,8 +296,8 @@ class Contact:
     """A pair of points, one on each of two footprints.
 
     Attributes:
-        first, second: nearest points of disjoint footprints; for overlapping ones, the ends of the shortest
-            translation that separates them.
+        first, second: nearest points of disjoint footprints. For overlapping footprints, the ends of the
+            shortest translation that separates them.
         distance: distance of the two points, negative for overlap.
     """
 
@@ -312,8 +314,9 @@ def contact(a: Footprint, b: Footprint) -> Contact:
 def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
     """Return the points that attain the protrusion of `inner` from `outer` (Prop. 2).
 
-    The first is the point of `inner` farthest outside `outer`, or the least deep one inside. The second is
-    the nearest point of the boundary of `outer`. The distance is the protrusion, positive outside.
+    The first point is the point of `inner` farthest outside `outer`, or the least deep point inside. The
+    second point is the nearest point of the boundary of `outer`. The distance is the protrusion, positive
+    outside.
     """
     return _contact(inner, outer, is_protrusion=True)
 
@@ -337,8 +340,8 @@ def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protr
 
     Returns:
         (T, 6): x and y of a point of `first`, x and y of a point of `second`, their signed distance (or
-        protrusion), and the top of the higher footprint. The top is NaN if neither has a height. The whole
-        row is NaN if an operand is empty.
+        protrusion), and the top of the higher footprint. The top is NaN if both have no height. The whole row
+        is NaN if an operand is empty.
     """
     result = np.full((len(first.rows), 6), np.nan)
     fill_contacts(

@@ -16,23 +16,24 @@ from spatial_replay.geometry.arrays import Floats, Integers
 SOUND, EMPTY, NOT_FINITE, NOT_CONVEX, TOO_MANY_CORNERS = 0, 1, 2, 3, 4
 
 LARGEST_COORDINATE = 1e100
-"""Larger coordinates are rejected: products of a few of them must stay finite."""
+"""Limit of absolute coordinates, so that products of a few coordinates stay finite."""
 
 MOST_CORNERS = 2_000
-"""Corner limit of polygons to be split, because each sample measures every part."""
+"""Corner limit of polygons that are split, because each sample measures every part."""
 
 MOST_CONVEX_CORNERS = 10_000
 """Corner limit of convex polygons, because each sample measures all corners for every pair of objects."""
 
-# Factors of the tolerance within which a vertex counts as on a line: of the outline's extent, and of its
-# greatest coordinate (4 units in the last place). The floor keeps the squared tolerance above zero.
+# A vertex within a tolerance of a line counts as on the line. Factors of the tolerance: for the outline's
+# extent, and for its greatest coordinate (4 units in the last place). The floor keeps the squared tolerance
+# above zero.
 _FLATNESS = 1e-9
 _ROUNDING = 4 * 2.0**-52
 _SMALLEST = 1e-100
 
 _Corner: TypeAlias = tuple[float, float]
 _Ring: TypeAlias = tuple[int, ...]
-"""A polygon, as indices of its corners."""
+"""A polygon as indices of its corners."""
 
 
 class Outlines(NamedTuple):
@@ -42,8 +43,8 @@ class Outlines(NamedTuple):
         vertex_start: (P + 1,) int64.
         vertices: (V, 2) float64.
         fault: (P,) int8: `SOUND`, `EMPTY` (no vertex), `NOT_FINITE` (or beyond `LARGEST_COORDINATE`),
-            `NOT_CONVEX` (or a boundary that crosses itself) or `TOO_MANY_CORNERS`. A faulty outline keeps
-            its vertices; one with too many corners is normalised.
+            `NOT_CONVEX` (or a boundary that crosses itself) or `TOO_MANY_CORNERS`. A faulty outline keeps its
+            vertices, but an outline with too many corners is normalised.
     """
 
     vertex_start: Integers
@@ -54,9 +55,9 @@ class Outlines(NamedTuple):
 def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     """Order each outline counter-clockwise and drop repeated or collinear vertices.
 
-    A vertex is superfluous if it lies within a tolerance of the segment between its neighbours: a billionth
-    of the outline's extent, or the resolution of its coordinates. A narrower outline becomes a segment or a
-    point. Convex counter-clockwise input is returned bit for bit.
+    A vertex is dropped if it is within a tolerance of the segment between its neighbours. The tolerance is a
+    billionth of the outline's extent, or the resolution of its coordinates. A narrower outline becomes a
+    segment or a point. Convex counter-clockwise input is returned bit for bit.
 
     Args:
         vertex_start: (P + 1,) int64; outline p is vertices[vertex_start[p] : vertex_start[p + 1]].
@@ -78,9 +79,9 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
 
 
 def _are_normal(counts: Integers, vertices: Floats) -> bool:
-    """Return whether all outlines are points, or convex and counter-clockwise with equal numbers of corners.
+    """Return whether each outline is a point, or convex and counter-clockwise, with equal corner counts.
 
-    For a few outlines, NumPy is much faster than a loop over vertices in the interpreter.
+    For few outlines, NumPy is much faster than an interpreted loop over vertices.
     """
     corner_count = int(counts.max(initial=0))
     is_point = counts == 1
@@ -109,7 +110,7 @@ def _are_normal(counts: Integers, vertices: Floats) -> bool:
 
 
 def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
-    """Normalise one outline (n, 2), in place; return its vertices and its fault (see `Outlines`)."""
+    """Normalise one outline (n, 2) in place; return its vertices and its fault (see `Outlines`)."""
     counts, fault = np.empty(1, np.int64), np.empty(1, np.int8)
     vertex_count = _normalise_all(np.array([0, len(vertices)]), vertices, counts, fault)
     _limit_corners(counts, fault)
@@ -121,9 +122,9 @@ def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
 
 
 _FEW_OUTLINES = 4_096
-"""Limit of outlines tested by NumPy first, because the kernel is interpreted for so few."""
+"""Limit of outlines that NumPy tests first, because the kernel is interpreted for few outlines."""
 _MOST_TESTED_CORNERS = 16
-"""Limit of an outline's corners tested by NumPy."""
+"""Limit of corners of an outline that NumPy tests."""
 
 
 @elementwise
@@ -141,11 +142,11 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
             fault[outline] = EMPTY if first == stop else NOT_FINITE
         elif counts[outline] > 1:
             winding = _winding(vertices, first, stop, tolerance)
-            # an outline that is already convex is not tidied, so that it keeps its bits
+            # a convex outline is not tidied, so that it keeps its bits
             if winding == 0:
                 _copy(vertices, first, scratch, 0, counts[outline])
                 count_left = _tidy(scratch, counts[outline], tolerance)
-                # strict, because nearly collinear vertices have been dropped
+                # without a tolerance, because nearly collinear vertices have been dropped
                 winding = _winding(scratch, 0, count_left, 0.0) if count_left > 2 else 1
                 if winding == 0:
                     fault[outline] = NOT_CONVEX
@@ -153,7 +154,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
                     _copy(scratch, 0, vertices, first, count_left)
                     counts[outline] = count_left
             if winding == -1:
-                # the first vertex stays the first
+                # the first vertex stays first
                 _reverse(vertices, first + 1, first + counts[outline])
         _copy(vertices, first, vertices, used_count, counts[outline])
         used_count += counts[outline]
@@ -162,7 +163,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
 
 @inlined
 def _copy(source: Floats, source_start: int, target: Floats, target_start: int, count: int) -> None:
-    """Copy vertices in ascending order, so that the target may overlap a source that begins behind it."""
+    """Copy vertices in ascending order; a target may overlap a source that begins after the target."""
     for offset in range(count):
         target[target_start + offset, 0] = source[source_start + offset, 0]
         target[target_start + offset, 1] = source[source_start + offset, 1]
@@ -179,7 +180,7 @@ def _reverse(vertices: Floats, start: int, stop: int) -> None:
 
 @inlined
 def _tolerance(vertices: Floats, first: int, stop: int) -> float:
-    """Return the distance within which a vertex counts as on a line; -1 for an unusable outline."""
+    """Return the distance from a line within which a vertex is on it; -1 for an unusable outline."""
     least_x = least_y = np.inf
     most_x = most_y = -np.inf
     for vertex in range(first, stop):
@@ -199,7 +200,8 @@ def _tolerance(vertices: Floats, first: int, stop: int) -> float:
 def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
     """Return 1 for one round of left turns, -1 for one round of right turns, else 0.
 
-    A turn whose vertex lies within `tolerance` of its neighbours' line is neither left nor right.
+    A turn is neither left nor right if its vertex is within `tolerance` of its neighbours' line. a, b and c
+    are the previous, the current and the next vertex.
     """
     left_turns = right_turns = vertical_changes = 0
     corner_count = stop - first
@@ -215,7 +217,8 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
             left_turns += cross > 0.0
             right_turns += cross < 0.0
         is_upper = cy > by or (cy == by and cx > bx)
-        # a convex outline rises once and falls once; a star, which also turns left only, more often
+        # a convex outline rises once and falls once; a star, which also has only left turns, does so more
+        # often
         vertical_changes += is_upper != was_upper
         was_upper = is_upper
         ax, ay, bx, by = bx, by, cx, cy
@@ -226,7 +229,7 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
 
 @inlined
 def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
-    """Drop superfluous vertices among the first `count`, in place; return the number left."""
+    """Drop superfluous vertices among the first `count`, in place; return the remaining number."""
     # the line between two far vertices decides whether the outline is flat
     head = _farthest(vertices, count, 0)
     tail = _farthest(vertices, count, head)
@@ -238,7 +241,7 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
         _copy(vertices, first, vertices, 0, 1)
         _copy(vertices, second, vertices, 1, 1)
         return 1 if _distance(vertices, 0, 1) <= tolerance else 2
-    # dropping a vertex can make its neighbours collinear, so repeat until nothing changes
+    # dropping a vertex can make its neighbours collinear, so the loop repeats until nothing changes
     has_changed = True
     while has_changed and count > 2:
         has_changed = False
@@ -296,11 +299,11 @@ def convex_hull(vertices: Floats) -> Floats:
 def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats]:
     """Split a polygon into few convex polygons with disjoint interiors.
 
-    A Delaunay triangulation is merged across shared edges, the longest first, while the result stays convex.
-    There are at most four times as many pieces as necessary (Hertel and Mehlhorn, 1983).
+    Triangles of a Delaunay triangulation are merged across shared edges, longest edges first, while pieces
+    stay convex. There are at most four times as many pieces as necessary (Hertel and Mehlhorn, 1983).
 
     Args:
-        vertices: (n, 2) float64, corners in either order; neighbours differ.
+        vertices: (n, 2) float64, corners in either order, without equal neighbours.
         holes: corners of each hole, in the same form.
 
     Raises:
@@ -351,12 +354,12 @@ def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring
     shared_edges = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
     for i, j in sorted(shared_edges, key=lambda edge: (-_squared_length(corners, *edge), edge)):
         left_ring, right_ring = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
-        # left runs j … i, right runs i … j
+        # the left ring runs from j to i, the right ring from i to j
         from_j, from_i = _rotate(left_ring, j), _rotate(right_ring, i)
         merged_ring = from_j + from_i[1:-1]
         turn_at_i = _turn(corners, from_j[-2], i, from_i[1])
         turn_at_j = _turn(corners, from_i[-2], j, from_j[1])
-        # straight corners are allowed: normalising the piece drops them
+        # straight corners are allowed, because normalising a piece drops them
         if turn_at_i < 0 or turn_at_j < 0:
             continue
         merged_name, removed_name = ring_of_edge[i, j], ring_of_edge[j, i]
@@ -371,7 +374,7 @@ def _edges(ring: _Ring) -> Iterable[tuple[int, int]]:
 
 
 def _rotate(ring: _Ring, first: int) -> _Ring:
-    """Return the same ring, starting at corner `first`."""
+    """Return a ring that starts at corner `first`."""
     index = ring.index(first)
     return ring[index:] + ring[:index]
 

@@ -1,6 +1,6 @@
-"""Open any log: the content of a file decides its format, and `FORMATS` lists the reader of each format.
+"""Open any log. A file's content decides its format; `FORMATS` lists the reader of each format.
 
-Readers with slow imports are imported when the first log needs them.
+Readers with slow imports are imported when a log first needs them.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from spatial_replay.trace.doubts import distinct_doubts
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
-# rosbag2 adds .zstd to the names of files that it compresses as a whole
+# rosbag2 adds .zstd to the name of a file that it compresses as a whole
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
 LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
@@ -56,24 +56,23 @@ LOG_ENDINGS = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
 _MOST_LOOKED_AT = 20
 """Limit of folder entries searched for a data set."""
 _HEAD = 4096
-"""Size of the beginning that identifies a file's format, bytes."""
+"""Number of first bytes that identify a file's format."""
 
 
 def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source:
-    """Open a log in any format; the content of the file decides, not its name.
+    """Open a log in any format. The file's content decides the format, but not its name.
 
-    From an MCAP log at an address, only the needed parts are read. A log of another format is downloaded
-    once.
+    Only the needed parts of an MCAP log at an address are read. A log of another format is downloaded once.
 
     Args:
-        path: a local path, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://…. An
-            episode of a data set is the set's path with a number: push_v3#17.
+        path: a local path, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://…. The path
+            of a data set's episode is the set's path with a number: push_v3#17.
         reading: options; see `ReadOptions`.
 
     Raises:
-        UsageError: there is no path, an option does not apply to the format, or the format is unknown.
+        UsageError: `path` is not a path, an option does not apply to the format, or the format is unknown.
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: the file has the ending of a log, but is not one.
+        LogError: the file has the ending of a log, but not its content.
         RemoteError: an address does not answer.
     """
     argument: object = path
@@ -120,7 +119,7 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         reading: options; see `ReadOptions`.
 
     Raises:
-        UsageError: there is no path, or an option does not apply to the format.
+        UsageError: `path` is not a path, or an option does not apply to the format.
         MissingFileError: there is no such file.
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
@@ -142,7 +141,7 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
 
 
 def readable_file(path: str | PathLike[str]) -> LogFile:
-    """Return the file of a log, after a download if a remote file cannot be read in parts.
+    """Return the file of a log. Download a remote file first if it cannot be read in parts.
 
     Raises:
         UsageError: the address has no file name, or obstore is not installed.
@@ -190,7 +189,7 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
 
 
 def _refuse_data_set(path: Path) -> None:
-    """Refuse a data set of episodes, because each of its episodes is a log.
+    """Refuse a data set of episodes, because only each episode is a log.
 
     Raises:
         UsageError: the path is a data set.
@@ -205,10 +204,10 @@ def _refuse_data_set(path: Path) -> None:
 
 
 def _refuse_description(path: Path) -> None:
-    """Refuse the JSON file next to the trajectories of ManiSkill.
+    """Refuse the JSON file next to ManiSkill's trajectories.
 
     Raises:
-        UsageError: the path is such a file.
+        UsageError: the path is such a JSON file.
     """
     trajectories = path.with_suffix(".h5")
     data_set = open_data_set(trajectories)
@@ -217,7 +216,7 @@ def _refuse_description(path: Path) -> None:
 
 
 def _data_set_in(folder: Path) -> Path | None:
-    """Return the first data set in a folder, such as a namespace folder of Minari; None without one."""
+    """Return the first data set in a folder, such as a namespace folder of Minari, or None."""
     for path in sorted(folder.iterdir())[:_MOST_LOOKED_AT]:
         with suppress(SpatialReplayError):
             if open_data_set(path) is not None:
@@ -229,7 +228,7 @@ def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
     """Open an episode of a data set.
 
     Raises:
-        UsageError: there is no such episode, the data set needs a mapping, or the mapping is one for topics.
+        UsageError: there is no such episode, the data set needs a mapping, or the mapping is for topics.
     """
     data_set = open_data_set(path)
     if data_set is None:
@@ -259,10 +258,10 @@ def _open_episode(path: str, number: int, options: ReadOptions) -> Source:
 
 
 def _refuse_endless(path: Path) -> None:
-    """Refuse pipes, sockets and devices, because reading one may never end.
+    """Refuse pipes, sockets and devices, because reading them may never end.
 
     Raises:
-        LogError: the path is one, or the folder of a bag holds one.
+        LogError: the path is a pipe, a socket or a device, or the folder of a bag holds one.
         OSError: there is no such file.
     """
     mode = path.stat().st_mode
@@ -275,7 +274,7 @@ def _refuse_endless(path: Path) -> None:
 
 
 def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
-    """Return the metadata of the ROS 2 bag whose folder is at an address; None if the address is a file.
+    """Return the metadata file of the ROS 2 bag at an address; None if the address is another file.
 
     Raises:
         MissingFileError, RemoteError: the address is neither a bag nor a file.
@@ -283,10 +282,10 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
     if file.name == BAG_METADATA:
         return file
     try:
-        # the version is read from the server, so that this fails if there is no such file
+        # the server gives the version, so that this fails if there is no such file
         _ = file.version
     except MissingFileError:
-        # the address of a folder without the slash at its end
+        # a folder's address without the slash at its end
         metadata = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
         with suppress(MissingFileError, RemoteError):
             _ = metadata.version
@@ -296,7 +295,7 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
 
 
 def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
-    """Return the files of a ROS 2 bag at an address: its metadata, and the files that the metadata lists.
+    """Return the files of a ROS 2 bag at an address: its metadata file, and the files that it lists.
 
     Raises:
         LogError: the metadata cannot be used.
@@ -329,7 +328,7 @@ def downloaded_bag(metadata: RemoteFile) -> Path:
 
 
 def format_of(path: LogFile) -> str | None:
-    """Return the name of a file's format; None if it is unknown.
+    """Return the name of a file's format; None for an unknown format.
 
     Raises:
         MissingFileError: the file cannot be opened.
@@ -349,7 +348,7 @@ def is_bag_folder(path: Path) -> bool:
 def _head(path: LogFile) -> bytes:
     """Return the first bytes of a file, decompressed.
 
-    A damaged gzip file counts as track JSONL, whose reader reports the damage with its place.
+    A damaged gzip file counts as track JSONL, because that reader reports the damage with its place.
     """
     try:
         with open_text(path) if isinstance(path, Path) else path.open() as stream:
@@ -379,9 +378,9 @@ class Format(NamedTuple):
     """A format of logs.
 
     Attributes:
-        recognise: returns whether a file with the given first bytes has this format.
-        open: opens a file, given the name of the format and options.
-        options: names of the `ReadOptions` that apply to it; `concave` always does.
+        recognise: function that returns whether a file with the given first bytes has this format.
+        open: function that opens a file, given the name of the format and options.
+        options: names of the `ReadOptions` that apply to the format, besides `concave`, which always applies.
     """
 
     recognise: Callable[[bytes], bool]
@@ -432,7 +431,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
-    """Open an MCAP log: our own, which names its objects, or an external one with a mapping."""
+    """Open an MCAP log: our own log, which names its objects, or an external log with a mapping."""
     from spatial_replay.logs.mcap.read import McapSource
 
     source = McapSource(path, kind, options)

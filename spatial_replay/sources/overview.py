@@ -1,4 +1,4 @@
-"""Overview of a log: its objects and signals, or the topics of an external log that a mapping could read."""
+"""Overview of a log: its objects and signals, or an external log's topics that a mapping could read."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ from spatial_replay.trace.units import OUR_AXES, Axes
 _STEP = 10_000
 """Messages between two progress reports."""
 _ENOUGH = 1024
-"""Messages of a topic that are enough for a survey."""
+"""Number of messages per topic that is enough for a survey."""
 _LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
-"""Numbers of the decoded messages of a topic: the first ones, then powers of two."""
+"""Numbers of each topic's decoded messages: the first messages, then powers of two."""
 _EXAMPLE_BYTES = 2**22
-"""Decoding limit of a topic after its first message, bytes; images and point clouds are large."""
+"""Size limit of a topic's decoded messages after the first, bytes, because images and point clouds are
+large."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class Survey:
     Attributes:
         start_ns, end_ns: log times of the first and the last message; None without messages.
         mapping: text of a suggested mapping file.
-        faults: damage, each with its place.
+        faults: sentences on damage, each with its place.
         remarks: notes that do not concern losses.
     """
 
@@ -83,9 +84,9 @@ class Survey:
 
 
 def messages_in(path: str | PathLike[str]) -> MessageReader | None:
-    """Return a reader of a log of messages that needs a mapping.
+    """Return a reader of a log of messages that needs a mapping; None for other logs.
 
-    Return None for a log that names its objects, and for an episode of a data set.
+    Other logs name their objects, or are episodes of data sets.
 
     Raises:
         MissingFileError: there is no such file.
@@ -113,8 +114,8 @@ def survey(
     """Survey an external log.
 
     Args:
-        advance: called repeatedly with the number of messages read since the last call.
-        whole: whether to read the whole log and find all damage; otherwise reading ends when there are enough
+        advance: function that is called repeatedly with the number of messages read since the last call.
+        whole: whether to read the whole log and find all damage. Otherwise reading ends when there are enough
             messages of every topic.
 
     Raises:
@@ -153,8 +154,8 @@ class Regularity:
     Attributes:
         count: number of samples or messages.
         rate: rate in hertz with two decimals, rounded down.
-        max_gap: longest pause in seconds with three decimals, rounded up. The pauses before the first and
-            after the last one count.
+        max_gap: longest pause in seconds with three decimals, rounded up. Pauses before the first and after
+            the last sample or message count.
     """
 
     count: int
@@ -165,7 +166,7 @@ class Regularity:
     def of(cls, times_ns: Integers, start_ns: int, end_ns: int) -> Regularity:
         gaps_ns = np.diff(times_ns, prepend=start_ns, append=end_ns)
         duration_s = max(end_ns - start_ns, 1) / 1e9
-        # rounded against the log, so that a printed figure never meets a limit that the log misses
+        # rounded to the log's disadvantage, so that a printed figure never meets a limit that the log misses
         return cls(
             len(times_ns),
             math.floor(100.0 * (len(times_ns) - 1) / duration_s) / 100.0,
@@ -173,7 +174,7 @@ class Regularity:
         )
 
     def lacks(self, wanted: Mapping[str, Any], what: str) -> Iterator[str]:
-        """Yield a sentence for each limit in `wanted` that is missed; its subject is `what`."""
+        """Yield a sentence with the subject `what` for each missed limit in `wanted`."""
         if self.rate < (least_rate := wanted.get("rate", 0.0)):
             yield f"{what} have {self.rate:g} a second, at least {least_rate:g} are required"
         if self.max_gap > (gap_ns(wanted.get("max_gap")) or math.inf) / 1e9:
@@ -182,12 +183,13 @@ class Regularity:
 
 @dataclass(frozen=True, slots=True)
 class Fitness:
-    """Fitness of a log to be judged.
+    """Fitness of a log for judging.
 
     Attributes:
         samples: regularity of the samples.
-        topics: regularity of messages by topic; empty for other logs.
-        objects: share of samples in which an object is known, by name, with three decimals, rounded down.
+        topics: regularity of messages, by topic; empty for logs without messages.
+        objects: share of samples with a known state of the object, by name, with three decimals, rounded
+            down.
     """
 
     samples: Regularity
@@ -195,7 +197,7 @@ class Fitness:
     objects: Mapping[str, float]
 
     def lacks(self, required: Mapping[str, Any]) -> Iterator[str]:
-        """Yield a sentence for each requirement in the `requires` of a suite that the log misses."""
+        """Yield a sentence for each requirement that the log misses; `required` is a suite's `requires`."""
         yield from self.samples.lacks(required.get("samples", {}), "samples")
         for name, requirement in required.get("topics", {}).items():
             if name in self.topics:
@@ -208,7 +210,7 @@ class Fitness:
 
 
 def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
-    """Read the samples of a log and the times of all of its messages, and return its fitness.
+    """Return the fitness of a log, after reading its samples and the times of all its messages.
 
     Raises:
         LogError: nothing can be read.
@@ -245,10 +247,10 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
 
 
 class _Counter:
-    """Counter of messages, which also decodes examples of each topic.
+    """Counter of messages that also decodes examples of each topic.
 
     Attributes:
-        missing: topics without enough messages so far.
+        missing: topics that still lack messages for a survey.
     """
 
     def __init__(self, reader: MessageReader, topics: Sequence[Topic]) -> None:
@@ -298,7 +300,7 @@ class _Counter:
             self._undecodable[topic] = fault_count + 1, first_fault
 
     def take_remarks(self) -> list[str]:
-        """Return remarks on topics and on examples that cannot be decoded."""
+        """Return remarks on topics, and on examples, that cannot be decoded."""
         return self._remarks + [
             Sentence(
                 first_fault,
@@ -313,9 +315,9 @@ class ObjectOverview:
     """One object over a log.
 
     Attributes:
-        classes: its class names, in order of code points.
-        samples: number of samples in which it was observed.
-        unreadable: number of these samples in which a coordinate was not finite.
+        classes: class names of the object, in order of code points.
+        samples: number of samples in which the object was observed.
+        unreadable: number of samples in which a coordinate of the object was not finite.
     """
 
     name: str
@@ -331,10 +333,10 @@ class Overview:
     Attributes:
         start_ns, end_ns: times of the first and the last sample; None without samples.
         period_ns: usual time between samples; 0 with fewer than two samples.
-        faults: data that was lost or left out.
+        faults: sentences on data that was lost or left out.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
         remarks: notes that do not concern losses.
-        axes: axes of the source; its samples are already converted to ours.
+        axes: axes of the source. Its samples already have our axes.
         doubts: assumptions that the log contradicts.
         facts: facts of each mapped topic.
     """
@@ -359,7 +361,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     """Read a log once and return its overview.
 
     Args:
-        advance: called repeatedly with the number of samples read since the last call.
+        advance: function that is called repeatedly with the number of samples read since the last call.
 
     Raises:
         LogError: the log has no readable sample.
@@ -369,10 +371,10 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     doubts: dict[Doubt, None] = {}
     facts: tuple[TopicFacts, ...] = ()
     container = summarise_mcap(source) if isinstance(source, McapSource) else None
-    # an external log has no samples; only its container is listed
+    # an MCAP log without objects has no samples; only its container is listed
     if container is None or container.has_objects:
         try:
-            # a local log is read whole, to find all of its damage; of a remote one, only the samples are read
+            # a local log is read whole, to find all damage; only the samples of a remote log are read
             read_source = source.keeping() if isinstance(source.path, RemoteFile) else source
             for block in read_source.iter_blocks():
                 tally.add(block.trace)
@@ -381,7 +383,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
                 facts += block.facts
                 advance(len(block.trace))
         except UsageError as error:
-            # a scenario without objects is sound; a mapping that does not fit is the user's mistake
+            # a scenario without objects is not an error; a mapping that does not fit is one
             if not isinstance(source, TrackSource):
                 raise
             remarks.append(str(error))
@@ -395,7 +397,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         period_ns=tally.pauses.usual_ns,
         objects=tally.objects(),
         signals=tuple(sorted(tally.signals)),
-        # reading the samples and listing the container report the same damage
+        # reading of samples and listing of the container report the same damage
         faults=tuple(dict.fromkeys(faults)),
         container=container,
         remarks=(*(doubt.remark(source.name) for doubt in doubts), *remarks),
@@ -406,7 +408,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
 
 
 def overview_of_survey(path: str | PathLike[str], survey: Survey) -> Overview:
-    """Return the overview of an external log without a mapping, which has no samples yet."""
+    """Return the overview of an external log without a mapping, and so without samples."""
     container = summarise_mcap(McapSource(readable_file(path))) if survey.kind == McapSource.kind else None
     faults = container.faults if container is not None else ()
     return Overview(survey.name, survey.kind, 0, None, None, 0, (), (), faults, container)

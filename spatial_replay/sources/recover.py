@@ -39,7 +39,8 @@ class SampleGap:
 
     Attributes:
         first, last: numbers of the first and the last missing sample, from 0.
-        after_ns, before_ns: times of the samples before and after the gap; None without one.
+        after_ns: time of the sample before the gap; None without such a sample.
+        before_ns: time of the sample after the gap; None without such a sample.
     """
 
     first: int
@@ -55,12 +56,12 @@ class Recovery:
     Attributes:
         name: name of the damaged log.
         start_ns, end_ns: log times of the first and the last saved message.
-        saved: number of saved messages by topic.
-        missing: number of missing messages by topic, from the counts that the log declares. A log without an
-            index declares none.
+        saved: numbers of saved messages, by topic.
+        missing: numbers of missing messages, by topic, from the counts that the log declares. A log without
+            an index declares no counts.
         spans: known (start, end) times of losses, in nanoseconds.
-        samples: gaps among the samples of a recording of ours; empty for other logs.
-        faults: damage, each with its place; times count from the first message.
+        samples: gaps among the samples of our own recordings; empty for other logs.
+        faults: sentences on damage with its place, with times from the first message.
         remarks: notes that do not concern losses.
     """
 
@@ -115,16 +116,16 @@ def recover_log(
     """Write all readable messages of a log to an MCAP log with an index.
 
     Messages are copied byte for byte in order of time, with their topics, types, sequence numbers and times.
-    Metadata and attachments are copied, too. Samples of ours are left out if they cannot be decoded or repeat
+    Metadata and attachments are copied, too. Our own samples are left out if they cannot be decoded or repeat
     a time.
 
-    The result and a metadata record of the output list the losses. Without losses there is no record, and
-    recovering the output again gives the same bytes.
+    The result, and a metadata record of the output, list the losses. Without losses there is no record.
+    Recovering such an output again gives the same bytes.
 
     Args:
-        log: MCAP, ours or external; a ROS 1 bag; a file or a folder of a ROS 2 bag.
+        log: our own or an external MCAP log, a ROS 1 bag, or a file or folder of a ROS 2 bag.
         output: path of the output, which replaces an existing file once it is complete.
-        advance: called with the number of messages of each step.
+        advance: function that is called with the number of messages of each step.
 
     Raises:
         UsageError: the log is a text file, or the output is an input.
@@ -137,7 +138,8 @@ def recover_log(
     reader, faults = _open_log(readable_file(log))
     recovery, is_ordered = _write(reader, faults, output, inputs, advance)
     if not is_ordered:
-        # messages with damaged times were read at their chunk's place; reading the output sorts them by time
+        # messages with damaged times were written in their chunk's place; reading the output sorts them by
+        # time
         _write(McapLog(output), FaultList(), output, (), advance)
     return recovery
 
@@ -149,7 +151,7 @@ def _write(
     inputs: Sequence[Path],
     advance: Callable[[int], object],
 ) -> tuple[Recovery, bool]:
-    """Write all messages of a reader; return the recovery, and whether messages came in order of time."""
+    """Write all messages of a reader; return the recovery, and whether messages are in order of time."""
     try:
         topics = reader.topics()
     except LogError as error:
@@ -204,7 +206,7 @@ def _write(
         )
         if not recovery.is_whole:
             recovery = replace(recovery, spans=_spans(recovery.faults), samples=sample_filter.gaps())
-        # records of earlier recoveries stay, because their losses are still missing
+        # records of earlier recoveries stay, because the losses in them are still missing
         earlier_records = [data for name, data in metadata if name == RECOVERY]
         for record in [*earlier_records, *([] if recovery.is_whole else [recovery.metadata()])]:
             writer.add_metadata(RECOVERY, record)
@@ -212,7 +214,7 @@ def _write(
 
 
 def _open_log(file: LogFile) -> tuple[MessageReader, FaultList]:
-    """Return a reader of a log, even one with damaged first bytes, and the faults so far."""
+    """Return a reader of a log, also if its first bytes are damaged, and the faults so far."""
     faults = FaultList()
     if isinstance(file, Path) and is_bag_folder(file):
         return open_messages(file), faults
@@ -234,7 +236,7 @@ def _missing(count: int, noun: str) -> str:
 
 
 def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Return the (start, end) times in nanoseconds of faults that contain times, in order."""
+    """Return the (start, end) of each fault with times, in nanoseconds and in order."""
     times_of_faults = [
         [part.time_ns for part in fault.parts if isinstance(part, Instant)]
         for fault in faults
@@ -244,7 +246,7 @@ def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 class _Samples:
-    """Filter of our own samples, which also finds gaps in their numbers."""
+    """Filter of our own samples that also finds gaps in the sample numbers."""
 
     def __init__(
         self,
@@ -256,7 +258,7 @@ class _Samples:
         self._name = name
         self._faults = faults
         self._sample_channels = [number for number, channel in channels.items() if is_samples(channel)]
-        # only recordings number samples from 0; a replay of a part of a log keeps the numbers of that log
+        # only recordings number samples from 0; a replay of a part of a log keeps the log's numbers
         is_recording = metadata.get(METADATA, {}).get("written_by") == "record"
         self._last_number = -1 if is_recording else None
         self._declared_count = metadata.get(ENDING, {}).get("samples", "") if is_recording else ""
@@ -264,7 +266,7 @@ class _Samples:
         self._gaps: list[SampleGap] = []
 
     def usable(self, messages: Messages) -> Messages:
-        """Return the messages without samples of ours that cannot be decoded or repeat a time."""
+        """Return the messages, except our own samples that cannot be decoded or repeat a time."""
         sample_indices = np.flatnonzero(np.isin(messages.channel, self._sample_channels))
         if not len(sample_indices):
             return messages
@@ -277,7 +279,7 @@ class _Samples:
         )
 
     def gaps(self) -> tuple[SampleGap, ...]:
-        """Return all gaps, also the one between the last sample and the declared number of samples."""
+        """Return all gaps, also a gap between the last sample and the declared number of samples."""
         if self._declared_count.isdecimal() and self._last_number is not None:
             self._gap(self._last_number + 1, int(self._declared_count) - 1, None)
         return tuple(self._gaps)
