@@ -72,12 +72,12 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     """
     observed = _sort_observations(observed)
     faults = _duplicates(observed)
-    readable, shapes, wrong = check_observations(observed, concave=concave)
+    is_readable, shapes, observation_faults = check_observations(observed, concave=concave)
     # of several faults of a sample, the duplicate is reported
-    faults = wrong | faults
+    faults = observation_faults | faults
     rows = np.full((len(observed.times_ns), len(observed.names)), ABSENT, np.int64)
-    number = np.arange(len(observed.name), dtype=np.int64)
-    rows[observed.sample, observed.name] = np.where(readable, number, -2 - number)
+    row_numbers = np.arange(len(observed.name), dtype=np.int64)
+    rows[observed.sample, observed.name] = np.where(is_readable, row_numbers, -2 - row_numbers)
     reported_ns = None
     if observed.reported_ns is not None:
         reported_ns = np.repeat(observed.times_ns[:, None], len(observed.names), axis=1)
@@ -97,9 +97,9 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
         lasting=observed.lasting,
     )
     if faults:
-        is_sound = np.ones(len(trace), np.bool_)
-        is_sound[list(faults)] = False
-        trace = trace.take(np.flatnonzero(is_sound))
+        is_valid = np.ones(len(trace), np.bool_)
+        is_valid[list(faults)] = False
+        trace = trace.take(np.flatnonzero(is_valid))
     return trace, faults
 
 
@@ -112,129 +112,135 @@ def check_observations(
         whether each observation (R,) has only finite numbers; the footprints; and the fault of each sample
         with an impossible observation, by its index.
     """
-    readable = _finite(observed) & ~observed.invalid
-    faults = _wrong_numbers(observed, readable)
-    shapes, misshapen = _normalise_shapes(observed, readable, concave)
-    return readable, shapes, misshapen | faults
+    is_readable = _finite(observed) & ~observed.invalid
+    faults = _wrong_numbers(observed, is_readable)
+    shapes, shape_faults = _normalise_shapes(observed, is_readable, concave)
+    return is_readable, shapes, shape_faults | faults
 
 
 def _sort_observations(observed: Observations) -> Observations:
     """Sort the observations by sample, then by name in order of code points."""
-    order = sorted(range(len(observed.names)), key=observed.names.__getitem__)
-    names = [observed.names[index] for index in order]
-    rank = np.zeros(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    name = rank[observed.name]
+    name_order = sorted(range(len(observed.names)), key=observed.names.__getitem__)
+    names = [observed.names[index] for index in name_order]
+    rank = np.zeros(len(name_order), np.int64)
+    rank[name_order] = np.arange(len(name_order))
+    name_index = rank[observed.name]
     # one integer sorts by both
-    key = observed.sample * max(1, len(names)) + name
+    sort_keys = observed.sample * max(1, len(names)) + name_index
     # readers mostly yield sorted rows, which need no copies
-    if (key[1:] >= key[:-1]).all():
-        return replace(observed, names=names, name=name)
-    by_key = np.argsort(key, kind="stable")
+    if (sort_keys[1:] >= sort_keys[:-1]).all():
+        return replace(observed, names=names, name=name_index)
+    row_order = np.argsort(sort_keys, kind="stable")
     return replace(
         observed,
         names=names,
-        name=name[by_key],
-        sample=observed.sample[by_key],
-        class_code=observed.class_code[by_key],
-        yaw=observed.yaw[by_key],
-        uncertainty=observed.uncertainty[by_key],
-        shapes=observed.shapes.select(by_key),
-        invalid=observed.invalid[by_key],
-        reported_ns=None if observed.reported_ns is None else observed.reported_ns[by_key],
+        name=name_index[row_order],
+        sample=observed.sample[row_order],
+        class_code=observed.class_code[row_order],
+        yaw=observed.yaw[row_order],
+        uncertainty=observed.uncertainty[row_order],
+        shapes=observed.shapes.select(row_order),
+        invalid=observed.invalid[row_order],
+        reported_ns=None if observed.reported_ns is None else observed.reported_ns[row_order],
     )
 
 
 def _duplicates(observed: Observations) -> dict[int, str]:
-    again = (observed.sample[1:] == observed.sample[:-1]) & (observed.name[1:] == observed.name[:-1])
-    what = "is there twice; name each object once"
+    is_duplicate = (observed.sample[1:] == observed.sample[:-1]) & (observed.name[1:] == observed.name[:-1])
+    problem = "is there twice; name each object once"
     return {
-        int(observed.sample[row]): f"object {observed.names[observed.name[row]]!r} {what}"
-        for row in np.flatnonzero(again).tolist()
+        int(observed.sample[row]): f"object {observed.names[observed.name[row]]!r} {problem}"
+        for row in np.flatnonzero(is_duplicate).tolist()
     }
 
 
 def _finite(observed: Observations) -> Booleans:
     """Return whether all numbers of each observation are finite, (R,). A missing yaw or height is allowed."""
     shapes = observed.shapes
-    is_bad = ~np.isfinite(shapes.radius)
-    finite = np.isfinite(shapes.vertices)
-    if not finite.all():
+    is_bad_part = ~np.isfinite(shapes.radius)
+    is_finite = np.isfinite(shapes.vertices)
+    if not is_finite.all():
         # per vertex only if needed: `all(axis=1)` over pairs takes ten times as long as `all()`
-        is_bad |= count_in_rows(np.asarray(~finite.all(axis=1)), shapes.vertex_start) > 0
-    bad_parts = count_in_rows(is_bad, shapes.part_start)
-    no_height = np.isnan(shapes.bottom) & np.isnan(shapes.top)
+        is_bad_part |= count_in_rows(np.asarray(~is_finite.all(axis=1)), shapes.vertex_start) > 0
+    bad_part_counts = count_in_rows(is_bad_part, shapes.part_start)
+    has_no_height = np.isnan(shapes.bottom) & np.isnan(shapes.top)
     return np.asarray(
-        (bad_parts == 0)
+        (bad_part_counts == 0)
         & np.isfinite(observed.uncertainty)
         & ~np.isinf(observed.yaw)
-        & (no_height | (np.isfinite(shapes.bottom) & np.isfinite(shapes.top)))
+        & (has_no_height | (np.isfinite(shapes.bottom) & np.isfinite(shapes.top)))
     )
 
 
-def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]:
+def _wrong_numbers(observed: Observations, is_readable: Booleans) -> dict[int, str]:
     shapes = observed.shapes
     # NaN in a comparison is no fault: such rows are unreadable
     with np.errstate(invalid="ignore"):
-        empty_parts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
-        negative_parts = count_in_rows(shapes.radius < 0, shapes.part_start)
+        empty_part_counts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
+        negative_part_counts = count_in_rows(shapes.radius < 0, shapes.part_start)
         checks = (
             (np.diff(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
-            (empty_parts > 0, "has a part without vertices; give each part at least one"),
-            (negative_parts > 0, "has a part with a negative radius; give a radius of at least 0"),
+            (empty_part_counts > 0, "has a part without vertices; give each part at least one"),
+            (negative_part_counts > 0, "has a part with a negative radius; give a radius of at least 0"),
             (observed.uncertainty < 0, "has a negative uncertainty; give a radius of at least 0"),
             (shapes.bottom > shapes.top, "has a height whose bottom is above its top; give [bottom, top]"),
         )
     faults: dict[int, str] = {}
-    for wrong, what in checks:
-        for row in np.flatnonzero(wrong & readable).tolist() if wrong.any() else ():
+    for is_wrong, problem in checks:
+        for row in np.flatnonzero(is_wrong & is_readable).tolist() if is_wrong.any() else ():
             name = observed.names[observed.name[row]]
-            faults.setdefault(int(observed.sample[row]), f"object {name!r} {what}")
+            faults.setdefault(int(observed.sample[row]), f"object {name!r} {problem}")
     return faults
 
 
 def _normalise_shapes(
-    observed: Observations, readable: Booleans, concave: Concave
+    observed: Observations, is_readable: Booleans, concave: Concave
 ) -> tuple[FootprintBatch, dict[int, str]]:
     """Return normalised polygons and the samples' faults; polygons that are not convex are decomposed."""
     shapes = observed.shapes
     part_counts = np.diff(shapes.part_start)
-    vertex_start, vertices, fault = normalise_polygons(shapes.vertex_start, shapes.vertices)
+    vertex_start, vertices, fault_codes = normalise_polygons(shapes.vertex_start, shapes.vertices)
     shapes = replace(shapes, vertex_start=vertex_start, vertices=vertices)
-    if not fault.any():
+    if not fault_codes.any():
         return shapes, {}
-    owner = np.repeat(np.arange(len(readable)), part_counts)
+    observation_of_part = np.repeat(np.arange(len(is_readable)), part_counts)
     # few polygons are concave, so the slow decomposition treats them one by one
     # unreadable parts stay unknown, and parts without vertices have a fault already
-    odd = np.flatnonzero((fault != SOUND) & readable[owner] & (np.diff(vertex_start) > 0))
-    pieces: dict[int, Footprint] = {}
+    faulty_parts = np.flatnonzero(
+        (fault_codes != SOUND) & is_readable[observation_of_part] & (np.diff(vertex_start) > 0)
+    )
+    footprint_by_part: dict[int, Footprint] = {}
     faults: dict[int, str] = {}
-    for part in odd.tolist():
+    for part in faulty_parts.tolist():
         polygon = vertices[vertex_start[part] : vertex_start[part + 1]]
         try:
-            pieces[part] = Footprint.polygon(polygon, concave=concave)
+            footprint_by_part[part] = Footprint.polygon(polygon, concave=concave)
         except GeometryError as error:
-            name = observed.names[observed.name[owner[part]]]
-            faults.setdefault(int(observed.sample[owner[part]]), f"object {name!r}: {error}")
-    return _with_pieces(shapes, pieces) if pieces else shapes, faults
+            name = observed.names[observed.name[observation_of_part[part]]]
+            faults.setdefault(int(observed.sample[observation_of_part[part]]), f"object {name!r}: {error}")
+    return _with_pieces(shapes, footprint_by_part) if footprint_by_part else shapes, faults
 
 
-def _with_pieces(shapes: FootprintBatch, pieces: Mapping[int, Footprint]) -> FootprintBatch:
+def _with_pieces(shapes: FootprintBatch, footprint_by_part: Mapping[int, Footprint]) -> FootprintBatch:
     """Replace each given part of the shapes by the parts of a footprint."""
-    counts = np.ones(len(shapes.radius), np.int64)
-    counts[list(pieces)] = [len(footprint.parts) for footprint in pieces.values()]
-    added = [part.vertices for footprint in pieces.values() for part in footprint.parts]
-    vertex_counts = np.concatenate([np.diff(shapes.vertex_start), [len(vertices) for vertices in added]])
-    vertices = np.concatenate([shapes.vertices, *added])
-    begins = starts_from_counts(vertex_counts)[:-1]
-    first = np.arange(len(shapes.radius), dtype=np.int64)
+    part_counts = np.ones(len(shapes.radius), np.int64)
+    part_counts[list(footprint_by_part)] = [len(footprint.parts) for footprint in footprint_by_part.values()]
+    new_polygons = [part.vertices for footprint in footprint_by_part.values() for part in footprint.parts]
+    vertex_counts = np.concatenate(
+        [np.diff(shapes.vertex_start), [len(vertices) for vertices in new_polygons]]
+    )
+    vertices = np.concatenate([shapes.vertices, *new_polygons])
+    vertex_begins = starts_from_counts(vertex_counts)[:-1]
+    first_parts = np.arange(len(shapes.radius), dtype=np.int64)
     # pieces are behind all parts, and `order` brings them to their places
-    first[list(pieces)] = len(shapes.radius) + starts_from_counts(counts[list(pieces)])[:-1]
-    order = flat_index(first, counts)
+    first_parts[list(footprint_by_part)] = (
+        len(shapes.radius) + starts_from_counts(part_counts[list(footprint_by_part)])[:-1]
+    )
+    part_order = flat_index(first_parts, part_counts)
     return replace(
         shapes,
-        part_start=starts_from_counts(counts)[shapes.part_start],
-        vertex_start=starts_from_counts(vertex_counts[order]),
-        vertices=vertices[flat_index(begins[order], vertex_counts[order])],
-        radius=np.repeat(shapes.radius, counts),
+        part_start=starts_from_counts(part_counts)[shapes.part_start],
+        vertex_start=starts_from_counts(vertex_counts[part_order]),
+        vertices=vertices[flat_index(vertex_begins[part_order], vertex_counts[part_order])],
+        radius=np.repeat(shapes.radius, part_counts),
     )

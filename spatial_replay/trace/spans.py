@@ -56,6 +56,6 @@ def join_spans(stretches: Iterable[tuple[TopicSpan, ...]]) -> tuple[TopicSpan, .
     spans: dict[str, TopicSpan] = {}
     for stretch in stretches:
         for span in stretch:
-            before = spans.get(span.topic)
-            spans[span.topic] = span if before is None else before.join(span)
+            earlier_span = spans.get(span.topic)
+            spans[span.topic] = span if earlier_span is None else earlier_span.join(span)
     return tuple(spans.values())

@@ -56,12 +56,12 @@ def require_time(value: object, name: str) -> None:
         raise UsageError(f"{name} is {shortened(value)}; give integer nanoseconds, 0 or more")
 
 
-def _require_name(name: object, what: str) -> None:
+def _require_name(name: object, kind: str) -> None:
     if not isinstance(name, str) or not name:
-        raise TraceError(f"{what} is named {shortened(name)}; give a text that is not empty")
+        raise TraceError(f"{kind} is named {shortened(name)}; give a text that is not empty")
     if not is_encodable(name):
         raise TraceError(
-            f"{what} is named {shortened(name)}, with half a character (a lone surrogate), which no log can"
+            f"{kind} is named {shortened(name)}, with half a character (a lone surrogate), which no log can"
             ' hold; decode names with errors="replace"'
         )
 
@@ -131,11 +131,11 @@ class Sample:
     def __post_init__(self) -> None:
         if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, (int, np.integer)):
             raise TraceError(f"time_ns is {self.time_ns!r}; give integer nanoseconds")
-        for what in _EXAMPLES:
-            named = getattr(self, what)
-            if not isinstance(named, Mapping):
+        for attribute in _EXAMPLES:
+            by_name = getattr(self, attribute)
+            if not isinstance(by_name, Mapping):
                 raise TraceError(
-                    f"{what} is {shortened(named)}; give a dict by name, as in {_EXAMPLES[what]}"
+                    f"{attribute} is {shortened(by_name)}; give a dict by name, as in {_EXAMPLES[attribute]}"
                 )
         if not 0 <= self.time_ns <= LATEST_NS:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
@@ -171,20 +171,20 @@ class Sample:
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
         # the sample's time is the default: equal samples store no report time equal to it
-        others = {
+        other_times = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
             if reported_ns != self.time_ns and name not in self.unknown
         }
-        object.__setattr__(self, "reported_ns", MappingProxyType(others))
+        object.__setattr__(self, "reported_ns", MappingProxyType(other_times))
         object.__setattr__(self, "lasting", frozenset(self.lasting) & objects.keys())
 
     def _check_report_time(self, name: str, reported_ns: object) -> None:
         if isinstance(reported_ns, bool) or not isinstance(reported_ns, (int, np.integer)):
             raise TraceError(f"reported_ns of {name!r} is {shortened(reported_ns)}; give integer nanoseconds")
         if not 0 <= reported_ns <= self.time_ns:
-            what = f"reported_ns of {name!r} is {reported_ns}"
-            raise TraceError(f"{what}; give a time from 0 to that of the sample, {self.time_ns} ns")
+            problem = f"reported_ns of {name!r} is {reported_ns}"
+            raise TraceError(f"{problem}; give a time from 0 to that of the sample, {self.time_ns} ns")
 
 
 def require_sample(value: object) -> None:
@@ -226,8 +226,8 @@ class MeasurementCache:
     def put(self, key: Hashable, array: Floats) -> None:
         """Store an array, which must not be written to afterwards."""
         with self._lock:
-            replaced = self._arrays.pop(key, None)
-            self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
+            old_array = self._arrays.pop(key, None)
+            self._bytes += array.nbytes - (0 if old_array is None else old_array.nbytes)
             self._arrays[key] = array
             # the newest array stays, even if it alone exceeds the limit
             while len(self._arrays) > 1 and self._bytes > _BYTES:
@@ -433,10 +433,10 @@ class Trace(Displayed):
     @property
     def is_unknown(self) -> NDArray[np.bool_]:
         """(T,), whether a sample has no known object and no known signal."""
-        unknown: NDArray[np.bool_] = np.asarray((self.rows < 0).all(axis=1))
+        is_unknown: NDArray[np.bool_] = np.asarray((self.rows < 0).all(axis=1))
         for values in self.signals.values():
-            unknown &= np.isnan(values)
-        return unknown
+            is_unknown &= np.isnan(values)
+        return is_unknown
 
     @property
     def filling(self) -> NDArray[np.bool_]:
@@ -444,24 +444,35 @@ class Trace(Displayed):
 
         Runs of unknown samples fill a pause if they begin 1 ns after a sample or end 1 ns before one.
         """
-        unknown = self.is_unknown
-        turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
-        is_close = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
+        is_unknown = self.is_unknown
+        span_ends = np.flatnonzero(np.diff(is_unknown, prepend=False, append=False))
+        is_adjacent = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
         is_filling = np.zeros(len(self), np.bool_)
-        for start, end in turns.reshape(-1, 2)[is_close[turns].reshape(-1, 2).any(axis=1)].tolist():
+        for start, end in span_ends.reshape(-1, 2)[
+            is_adjacent[span_ends].reshape(-1, 2).any(axis=1)
+        ].tolist():
             is_filling[start:end] = True
         return is_filling
 
     def without_filling(self) -> Trace:
         """Return the trace without the samples that fill pauses."""
-        filling = self.filling
-        return self.take(np.flatnonzero(~filling)) if filling.any() else self
+        is_filling = self.filling
+        return self.take(np.flatnonzero(~is_filling)) if is_filling.any() else self
 
     @classmethod
     def empty(cls) -> Trace:
         """Return a trace without samples."""
-        none, numbers = np.empty(0, np.int64), np.empty(0)
-        return cls(none, (), none.reshape(0, 0), FootprintBatch.unknown(0), numbers, numbers, none, ())
+        no_integers, no_floats = np.empty(0, np.int64), np.empty(0)
+        return cls(
+            no_integers,
+            (),
+            no_integers.reshape(0, 0),
+            FootprintBatch.unknown(0),
+            no_floats,
+            no_floats,
+            no_integers,
+            (),
+        )
 
     @classmethod
     def from_samples(cls, samples: Iterable[Sample], *, units: Mapping[str, str] | None = None) -> Trace:
@@ -474,47 +485,55 @@ class Trace(Displayed):
             TraceError: times that do not increase, or too many names.
             UsageError: units that are not texts.
         """
-        sequence = list(samples)
-        for sample in sequence:
+        sample_list = list(samples)
+        for sample in sample_list:
             require_sample(sample)
-        names = tuple(sorted({name for sample in sequence for name in (*sample.objects, *sample.unknown)}))
-        signals = sorted({name for sample in sequence for name in sample.signals})
-        require_few(names, signals)
-        number = {name: index for index, name in enumerate(names)}
-        rows = np.full((len(sequence), len(names)), ABSENT, np.int64)
-        observed: list[TrackedObject] = []
+        names = tuple(sorted({name for sample in sample_list for name in (*sample.objects, *sample.unknown)}))
+        signal_names = sorted({name for sample in sample_list for name in sample.signals})
+        require_few(names, signal_names)
+        column_of_name = {name: index for index, name in enumerate(names)}
+        rows = np.full((len(sample_list), len(names)), ABSENT, np.int64)
+        tracked_objects: list[TrackedObject] = []
         # rows of objects with unknown position come last; they store only the class
-        blank: list[tuple[int, str, str | None]] = []
-        for index, sample in enumerate(sequence):
+        unknown_objects: list[tuple[int, str, str | None]] = []
+        for index, sample in enumerate(sample_list):
             for name in sorted(sample.objects):
-                rows[index, number[name]] = len(observed)
-                observed.append(sample.objects[name])
-            blank += ((index, name, sample.unknown[name]) for name in sorted(sample.unknown))
-        for row, (index, name, _) in enumerate(blank, len(observed)):
-            rows[index, number[name]] = -2 - row
-        named = [*(tracked.class_name for tracked in observed), *(class_name for *_, class_name in blank)]
-        classes = class_order(named)
-        columns = {name: [sample.signals.get(name, np.nan) for sample in sequence] for name in signals}
+                rows[index, column_of_name[name]] = len(tracked_objects)
+                tracked_objects.append(sample.objects[name])
+            unknown_objects += ((index, name, sample.unknown[name]) for name in sorted(sample.unknown))
+        for row, (index, name, _) in enumerate(unknown_objects, len(tracked_objects)):
+            rows[index, column_of_name[name]] = -2 - row
+        class_names = [
+            *(tracked.class_name for tracked in tracked_objects),
+            *(class_name for *_, class_name in unknown_objects),
+        ]
+        classes = class_order(class_names)
+        signal_values = {
+            name: [sample.signals.get(name, np.nan) for sample in sample_list] for name in signal_names
+        }
         known_shapes = FootprintBatch.from_footprints(
-            [tracked.footprint for tracked in observed], [tracked.height for tracked in observed]
+            [tracked.footprint for tracked in tracked_objects],
+            [tracked.height for tracked in tracked_objects],
         )
-        shapes = FootprintBatch.concatenate([known_shapes, FootprintBatch.unknown(len(blank))])
+        shapes = FootprintBatch.concatenate([known_shapes, FootprintBatch.unknown(len(unknown_objects))])
         yaws = [
-            *(np.nan if tracked.yaw is None else tracked.yaw for tracked in observed),
-            *(np.nan for _ in blank),
+            *(np.nan if tracked.yaw is None else tracked.yaw for tracked in tracked_objects),
+            *(np.nan for _ in unknown_objects),
         ]
         return cls(
-            times_ns=np.array([sample.time_ns for sample in sequence], np.int64),
+            times_ns=np.array([sample.time_ns for sample in sample_list], np.int64),
             names=names,
             rows=rows,
             footprints=shapes,
             yaw=np.array(yaws, np.float64),
-            uncertainty=np.array([*(tracked.uncertainty for tracked in observed), *(0.0 for _ in blank)]),
-            class_code=np.array([classes.index(name) for name in named], np.int64),
+            uncertainty=np.array(
+                [*(tracked.uncertainty for tracked in tracked_objects), *(0.0 for _ in unknown_objects)]
+            ),
+            class_code=np.array([classes.index(name) for name in class_names], np.int64),
             classes=classes,
-            signals={name: np.array(values, np.float64) for name, values in columns.items()},
-            **_reported_of_samples(sequence, names, signals),
-            lasting=frozenset().union(*(sample.lasting for sample in sequence)),
+            signals={name: np.array(values, np.float64) for name, values in signal_values.items()},
+            **_reported_of_samples(sample_list, names, signal_names),
+            lasting=frozenset().union(*(sample.lasting for sample in sample_list)),
             units=checked_units(units),
         )
 
@@ -524,25 +543,29 @@ class Trace(Displayed):
         Numbers of unreadable observations and unknown signals are left out.
         """
         for index, time_ns in enumerate(self.times_ns.tolist()):
-            rows = list(zip(self.names, self.rows[index].tolist(), strict=True))
-            known_rows = [row for _, row in rows if row >= 0]
+            named_rows = list(zip(self.names, self.rows[index].tolist(), strict=True))
+            known_rows = [row for _, row in named_rows if row >= 0]
             footprints = iter(self.footprints.footprints(known_rows))
-            objects = {name: self._observation(row, next(footprints)) for name, row in rows if row >= 0}
+            objects = {name: self._observation(row, next(footprints)) for name, row in named_rows if row >= 0}
             unknown = {
-                name: self.classes[int(self.class_code[-2 - row])] for name, row in rows if row < ABSENT
+                name: self.classes[int(self.class_code[-2 - row])] for name, row in named_rows if row < ABSENT
             }
-            values = ((name, float(column[index])) for name, column in self.signals.items())
-            signals = {name: value for name, value in values if value == value}
+            named_values = ((name, float(column[index])) for name, column in self.signals.items())
+            signals = {name: value for name, value in named_values if value == value}
             reported_ns = self._reported_in(index, objects, signals)
             yield Sample(time_ns, objects, signals, unknown, reported_ns, self.lasting)
 
-    def _reported_in(self, index: int, objects: Collection[str], signals: Collection[str]) -> dict[str, int]:
+    def _reported_in(
+        self, sample_index: int, objects: Collection[str], signals: Collection[str]
+    ) -> dict[str, int]:
         reported_ns = {
-            name: int(times[index]) for name, times in self.signals_reported_ns.items() if name in signals
+            name: int(report_times[sample_index])
+            for name, report_times in self.signals_reported_ns.items()
+            if name in signals
         }
         if self.reported_ns is not None:
-            times = zip(self.names, self.reported_ns[index].tolist(), strict=True)
-            reported_ns |= {name: time_ns for name, time_ns in times if name in objects}
+            report_times = zip(self.names, self.reported_ns[sample_index].tolist(), strict=True)
+            reported_ns |= {name: time_ns for name, time_ns in report_times if name in objects}
         return reported_ns
 
     def observation(self, row: int) -> TrackedObject:
@@ -567,15 +590,15 @@ class Trace(Displayed):
     def take(self, samples: Integers) -> Trace:
         """Return the samples with the given indices (K,), which must increase."""
         rows = self.rows[samples]
-        used, numbered = renumber_rows(rows)
+        used_rows, new_rows = renumber_rows(rows)
         return replace(
             self,
             times_ns=self.times_ns[samples],
-            rows=numbered,
-            footprints=self.footprints.select(used),
-            yaw=self.yaw[used],
-            uncertainty=self.uncertainty[used],
-            class_code=self.class_code[used],
+            rows=new_rows,
+            footprints=self.footprints.select(used_rows),
+            yaw=self.yaw[used_rows],
+            uncertainty=self.uncertainty[used_rows],
+            class_code=self.class_code[used_rows],
             signals={name: values[samples] for name, values in self.signals.items()},
             reported_ns=None if self.reported_ns is None else self.reported_ns[samples],
             signals_reported_ns={name: times[samples] for name, times in self.signals_reported_ns.items()},
@@ -587,33 +610,39 @@ class Trace(Displayed):
         Observations are numbered by sample, then name; names, classes and signals that no sample uses
         are dropped; classes are sorted, None first.
         """
-        observed = (self.rows != ABSENT).any(axis=0)
-        whole = replace(
+        is_observed = (self.rows != ABSENT).any(axis=0)
+        used_trace = replace(
             self,
-            names=tuple(name for name, used in zip(self.names, observed.tolist(), strict=True) if used),
-            rows=self.rows[:, observed],
+            names=tuple(
+                name for name, is_used in zip(self.names, is_observed.tolist(), strict=True) if is_used
+            ),
+            rows=self.rows[:, is_observed],
             signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
-            **self._report_times(observed),
+            **self._report_times(is_observed),
         ).take(np.arange(len(self), dtype=np.int64))
-        codes, inverse = np.unique(whole.class_code, return_inverse=True)
+        codes, code_indices = np.unique(used_trace.class_code, return_inverse=True)
         classes = class_order(self.classes[code] for code in codes.tolist())
-        order = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
-        return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
+        new_codes = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
+        return replace(
+            used_trace,
+            class_code=new_codes[code_indices] if len(codes) else used_trace.class_code,
+            classes=classes,
+        )
 
-    def _report_times(self, observed: NDArray[np.bool_]) -> dict[str, Any]:
+    def _report_times(self, is_observed: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the report times of the normal form, where unknown values have the time of the sample."""
-        own_ns = self.times_ns[:, None]
+        sample_ns = self.times_ns[:, None]
         reported_ns = None
         if self.reported_ns is not None:
-            reported_ns = np.where(self.rows >= 0, self.reported_ns, own_ns)[:, observed]
-        signals = {
+            reported_ns = np.where(self.rows >= 0, self.reported_ns, sample_ns)[:, is_observed]
+        signal_times = {
             name: np.where(np.isnan(self.signals[name]), self.times_ns, times)
             for name, times in self.signals_reported_ns.items()
         }
         return {
-            "reported_ns": None if reported_ns is None or (reported_ns == own_ns).all() else reported_ns,
+            "reported_ns": None if reported_ns is None or (reported_ns == sample_ns).all() else reported_ns,
             "signals_reported_ns": {
-                name: times for name, times in signals.items() if (times != self.times_ns).any()
+                name: times for name, times in signal_times.items() if (times != self.times_ns).any()
             },
             "lasting": self.lasting
             & {name for name, rows in zip(self.names, self.rows.T, strict=True) if (rows >= 0).any()},
@@ -627,28 +656,33 @@ class Trace(Displayed):
             TraceError: a trace begins before the previous one has ended.
         """
         names = tuple(sorted({name for trace in traces for name in trace.names}))
-        number = {name: index for index, name in enumerate(names)}
+        column_of_name = {name: index for index, name in enumerate(names)}
         classes = class_order(name for trace in traces for name in trace.classes)
-        code = {name: index for index, name in enumerate(classes)}
+        code_of_class = {name: index for index, name in enumerate(classes)}
         signals = sorted({name for trace in traces for name in trace.signals})
         rows = np.full((sum(map(len, traces)), len(names)), ABSENT, np.int64)
         reported_ns = None
         if any(trace.reported_ns is not None for trace in traces):
             reported_ns = np.zeros(rows.shape, np.int64)
-        sample = row = 0
+        sample_start = row_start = 0
         for trace in traces:
             # an unreadable row is stored as -2 - row, so its shift is negative
-            shift = np.where(trace.rows >= 0, row, np.where(trace.rows == ABSENT, 0, -row))
-            columns = [number[name] for name in trace.names]
-            rows[sample : sample + len(trace), columns] = trace.rows + shift
+            row_shift = np.where(trace.rows >= 0, row_start, np.where(trace.rows == ABSENT, 0, -row_start))
+            columns = [column_of_name[name] for name in trace.names]
+            rows[sample_start : sample_start + len(trace), columns] = trace.rows + row_shift
             if reported_ns is not None:
-                own_ns = trace.times_ns[:, None] if trace.reported_ns is None else trace.reported_ns
-                reported_ns[sample : sample + len(trace), columns] = own_ns
-            sample += len(trace)
-            row += len(trace.footprints)
+                trace_reported_ns = (
+                    trace.times_ns[:, None] if trace.reported_ns is None else trace.reported_ns
+                )
+                reported_ns[sample_start : sample_start + len(trace), columns] = trace_reported_ns
+            sample_start += len(trace)
+            row_start += len(trace.footprints)
         # one column for each length, shared by all missing signals
-        unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
-        codes = (np.array([code[n] for n in trace.classes], np.int64)[trace.class_code] for trace in traces)
+        unknown_values = {len(trace): np.full(len(trace), np.nan) for trace in traces}
+        class_codes = (
+            np.array([code_of_class[n] for n in trace.classes], np.int64)[trace.class_code]
+            for trace in traces
+        )
         return cls(
             # the empty arrays are for no traces at all
             times_ns=np.concatenate([np.empty(0, np.int64), *(trace.times_ns for trace in traces)]),
@@ -657,10 +691,12 @@ class Trace(Displayed):
             footprints=FootprintBatch.concatenate([trace.footprints for trace in traces]),
             yaw=np.concatenate([np.empty(0), *(trace.yaw for trace in traces)]),
             uncertainty=np.concatenate([np.empty(0), *(trace.uncertainty for trace in traces)]),
-            class_code=np.concatenate([np.empty(0, np.int64), *codes]),
+            class_code=np.concatenate([np.empty(0, np.int64), *class_codes]),
             classes=classes,
             signals={
-                name: np.concatenate([trace.signals.get(name, unknown[len(trace)]) for trace in traces])
+                name: np.concatenate(
+                    [trace.signals.get(name, unknown_values[len(trace)]) for trace in traces]
+                )
                 for name in signals
             },
             reported_ns=reported_ns,
@@ -684,14 +720,14 @@ def _reported_of_samples(
     if not any(sample.reported_ns for sample in samples):
         return {}
     times_ns = np.array([sample.time_ns for sample in samples], np.int64)
-    columns = {name: times_ns.copy() for sample in samples for name in sample.reported_ns}
+    times_of_name = {name: times_ns.copy() for sample in samples for name in sample.reported_ns}
     for index, sample in enumerate(samples):
         for name, reported_ns in sample.reported_ns.items():
-            columns[name][index] = reported_ns
-    objects = np.stack([columns.get(name, times_ns) for name in names] or [times_ns], axis=1)
+            times_of_name[name][index] = reported_ns
+    object_times = np.stack([times_of_name.get(name, times_ns) for name in names] or [times_ns], axis=1)
     return {
-        "reported_ns": objects[:, : len(names)] if columns.keys() & set(names) else None,
-        "signals_reported_ns": {name: columns[name] for name in signals if name in columns},
+        "reported_ns": object_times[:, : len(names)] if times_of_name.keys() & set(names) else None,
+        "signals_reported_ns": {name: times_of_name[name] for name in signals if name in times_of_name},
     }
 
 
@@ -713,8 +749,8 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
     for name, unit in units.items():
         is_text = isinstance(unit, str) and is_encodable(unit)
         if not is_text or not (0 < len(unit) <= _LONGEST_UNIT or names_from_unit(unit)):
-            what = f"of signal {name!r}" if name else "of lengths"
-            raise UsageError(f"the unit {what} is {shortened(unit)}; give a short text, such as 'm'")
+            subject = f"of signal {name!r}" if name else "of lengths"
+            raise UsageError(f"the unit {subject} is {shortened(unit)}; give a short text, such as 'm'")
     return dict(sorted(units.items()))
 
 
@@ -741,47 +777,53 @@ def require_few(objects: Collection[str], signals: Collection[str]) -> None:
     Raises:
         TraceError: more objects or signals than `MOST_NAMES`.
     """
-    for names, what in ((objects, "objects"), (signals, "signals")):
+    for names, kind in ((objects, "objects"), (signals, "signals")):
         if len(names) > MOST_NAMES:
-            raise TraceError(f"there are {len(names):,} {what}; {MOST_NAMES:,} is the limit: leave some out")
+            raise TraceError(f"there are {len(names):,} {kind}; {MOST_NAMES:,} is the limit: leave some out")
 
 
 def _check_shapes(trace: Trace) -> None:
     require_few(trace.names, trace.signals)
-    samples, observations = len(trace.times_ns), len(trace.footprints)
-    if trace.times_ns.ndim != 1 or trace.rows.shape != (samples, len(trace.names)):
+    sample_count, observation_count = len(trace.times_ns), len(trace.footprints)
+    if trace.times_ns.ndim != 1 or trace.rows.shape != (sample_count, len(trace.names)):
         raise TraceError(
-            f"rows have the shape {trace.rows.shape}; {samples} times and {len(trace.names)} names"
-            f" need ({samples}, {len(trace.names)})"
+            f"rows have the shape {trace.rows.shape}; {sample_count} times and {len(trace.names)} names"
+            f" need ({sample_count}, {len(trace.names)})"
         )
     if list(trace.names) != sorted(set(trace.names)):
         raise TraceError(f"names are {trace.names}; give each once, in order of code points")
     for column in ("yaw", "uncertainty", "class_code"):
-        if (shape := getattr(trace, column).shape) != (observations,):
-            needed = f"{observations} footprints need ({observations},)"
+        if (shape := getattr(trace, column).shape) != (observation_count,):
+            needed = f"{observation_count} footprints need ({observation_count},)"
             raise TraceError(f"{column} has the shape {shape}; {needed}")
     # -2 - (observations - 1) is the least row of an unreadable observation
-    if trace.rows.size and (trace.rows.max() >= observations or trace.rows.min() < -1 - observations):
-        raise TraceError(f"a row number lies outside the {observations} observations")
+    if trace.rows.size and (
+        trace.rows.max() >= observation_count or trace.rows.min() < -1 - observation_count
+    ):
+        raise TraceError(f"a row number lies outside the {observation_count} observations")
     for name, values in trace.signals.items():
-        if values.shape != (samples,):
-            raise TraceError(f"signal {name!r} has the shape {values.shape}; the times need ({samples},)")
+        if values.shape != (sample_count,):
+            raise TraceError(
+                f"signal {name!r} has the shape {values.shape}; the times need ({sample_count},)"
+            )
     if trace.reported_ns is not None and trace.reported_ns.shape != trace.rows.shape:
         raise TraceError(f"reported_ns has the shape {trace.reported_ns.shape}; rows have {trace.rows.shape}")
     for name, times in trace.signals_reported_ns.items():
-        if name not in trace.signals or times.shape != (samples,):
-            raise TraceError(f"signals_reported_ns of {name!r} needs a signal and the shape ({samples},)")
+        if name not in trace.signals or times.shape != (sample_count,):
+            raise TraceError(
+                f"signals_reported_ns of {name!r} needs a signal and the shape ({sample_count},)"
+            )
 
 
 def _check_times(times_ns: Integers) -> None:
     if len(times_ns) and times_ns[0] < 0:
         raise TraceError(f"the first sample is at {times_ns[0]} ns; give times from 0 on")
-    late = np.flatnonzero(times_ns[1:] <= times_ns[:-1])
-    if len(late):
-        at = int(late[0])
-        this, before = times_apart(int(times_ns[at + 1]), int(times_ns[at]))
+    late_indices = np.flatnonzero(times_ns[1:] <= times_ns[:-1])
+    if len(late_indices):
+        index = int(late_indices[0])
+        time_text, previous_text = times_apart(int(times_ns[index + 1]), int(times_ns[index]))
         raise TraceError(
-            f"sample {at + 1} is at {this} and the one before it at {before}; give times that increase"
+            f"sample {index + 1} is at {time_text} and the one before it at {previous_text}; give times that increase"
         )
 
 
@@ -790,33 +832,36 @@ def _same_samples(a: Trace, b: Trace) -> bool:
         return False
     columns = ("times_ns", "rows", "class_code", "yaw", "uncertainty")
     shapes = ("part_start", "vertex_start", "vertices", "radius", "bottom", "top")
-    pairs = [(getattr(a, name), getattr(b, name)) for name in columns]
-    pairs += [(getattr(a.footprints, name), getattr(b.footprints, name)) for name in shapes]
-    pairs += [(a.signals[name], b.signals[name]) for name in a.signals]
-    reported, others = a.signals_reported_ns, b.signals_reported_ns
-    if (a.reported_ns is None, reported.keys(), a.lasting) != (
+    array_pairs = [(getattr(a, name), getattr(b, name)) for name in columns]
+    array_pairs += [(getattr(a.footprints, name), getattr(b.footprints, name)) for name in shapes]
+    array_pairs += [(a.signals[name], b.signals[name]) for name in a.signals]
+    reported_a, reported_b = a.signals_reported_ns, b.signals_reported_ns
+    if (a.reported_ns is None, reported_a.keys(), a.lasting) != (
         b.reported_ns is None,
-        others.keys(),
+        reported_b.keys(),
         b.lasting,
     ):
         return False
-    pairs += [(reported[name], others[name]) for name in reported]
+    array_pairs += [(reported_a[name], reported_b[name]) for name in reported_a]
     if a.reported_ns is not None and b.reported_ns is not None:
-        pairs.append((a.reported_ns, b.reported_ns))
+        array_pairs.append((a.reported_ns, b.reported_ns))
     # `equal_nan` is for floats: integers are never NaN
-    return all(np.array_equal(first, second, equal_nan=first.dtype.kind == "f") for first, second in pairs)
+    return all(
+        np.array_equal(array_a, array_b, equal_nan=array_a.dtype.kind == "f")
+        for array_a, array_b in array_pairs
+    )
 
 
 def renumber_rows(rows: Integers) -> tuple[Integers, Integers]:
     """Return the used observations, by sample and name, and the new row numbers that point at them."""
-    present = rows != ABSENT
-    marked = rows[present]
-    unreadable = marked < ABSENT
-    used = np.where(unreadable, -2 - marked, marked)
-    number = np.arange(len(used), dtype=np.int64)
-    result = np.full(rows.shape, ABSENT, np.int64)
-    result[present] = np.where(unreadable, -2 - number, number)
-    return used, result
+    is_present = rows != ABSENT
+    present_rows = rows[is_present]
+    is_unreadable = present_rows < ABSENT
+    used_rows = np.where(is_unreadable, -2 - present_rows, present_rows)
+    new_numbers = np.arange(len(used_rows), dtype=np.int64)
+    new_rows = np.full(rows.shape, ABSENT, np.int64)
+    new_rows[is_present] = np.where(is_unreadable, -2 - new_numbers, new_numbers)
+    return used_rows, new_rows
 
 
 def class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
@@ -839,10 +884,10 @@ class Pauses:
     """The intervals between times, added in order; a long log stores only long intervals."""
 
     def __init__(self) -> None:
-        self._last, self._is_lost = np.empty(0, np.int64), np.empty(0, np.bool_)
-        self._pieces: list[Integers] = []
+        self._last_time_ns, self._is_last_lost = np.empty(0, np.int64), np.empty(0, np.bool_)
+        self._interval_blocks: list[Integers] = []
         self._first_usual_ns: int | None = None
-        self._count = 0
+        self._interval_count = 0
 
     def add(self, times_ns: Integers, is_lost: NDArray[np.bool_] | None = None) -> None:
         """Add times that follow the previous ones.
@@ -850,105 +895,121 @@ class Pauses:
         Args:
             is_lost: (T,), whether everything is unknown after a time. The interval after it is no pause.
         """
-        times = np.concatenate([self._last, times_ns])
-        lost = np.concatenate(
-            [self._is_lost, np.zeros(len(times_ns), np.bool_) if is_lost is None else is_lost]
+        all_times_ns = np.concatenate([self._last_time_ns, times_ns])
+        is_time_lost = np.concatenate(
+            [self._is_last_lost, np.zeros(len(times_ns), np.bool_) if is_lost is None else is_lost]
         )
-        self._last, self._is_lost = times[-1:].copy(), lost[-1:].copy()
-        self._count += max(0, len(times) - 1)
-        self._hold(np.array([times[:-1], np.diff(times)])[:, ~lost[:-1]])
-        if self._first_usual_ns is None and self._count >= _MOST_HELD:
-            held = self._held
-            self._first_usual_ns = int(np.median(held[1, :_MOST_HELD]))
+        self._last_time_ns, self._is_last_lost = all_times_ns[-1:].copy(), is_time_lost[-1:].copy()
+        self._interval_count += max(0, len(all_times_ns) - 1)
+        self._store(np.array([all_times_ns[:-1], np.diff(all_times_ns)])[:, ~is_time_lost[:-1]])
+        if self._first_usual_ns is None and self._interval_count >= _MOST_HELD:
+            intervals = self._stored_intervals
+            self._first_usual_ns = int(np.median(intervals[1, :_MOST_HELD]))
             # the stored intervals are filtered again, now that the usual one is known
-            self._pieces = []
-            self._hold(held)
+            self._interval_blocks = []
+            self._store(intervals)
 
-    def _hold(self, intervals: Integers) -> None:
+    def _store(self, intervals: Integers) -> None:
         if self._first_usual_ns is not None:
             intervals = intervals[:, intervals[1] > LONG_PAUSE * self._first_usual_ns]
         if intervals.size:
-            self._pieces.append(intervals)
+            self._interval_blocks.append(intervals)
 
     @property
-    def _held(self) -> Integers:
+    def _stored_intervals(self) -> Integers:
         """(2, N): starts and lengths of the stored intervals."""
-        return np.concatenate([np.empty((2, 0), np.int64), *self._pieces], axis=1)
+        return np.concatenate([np.empty((2, 0), np.int64), *self._interval_blocks], axis=1)
 
     def longest_first(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
-        held = self._held
+        intervals = self._stored_intervals
         if not self.is_regular:
             return []
-        starts, lengths = held[:, held[1] > LONG_PAUSE * self.usual_ns].tolist()
+        starts, lengths = intervals[:, intervals[1] > LONG_PAUSE * self.usual_ns].tolist()
         return sorted(zip(starts, lengths, strict=True), key=lambda pause: -pause[1])
 
     @property
     def last_ns(self) -> int | None:
         """The latest time; None without times."""
-        return int(self._last[-1]) if len(self._last) else None
+        return int(self._last_time_ns[-1]) if len(self._last_time_ns) else None
 
     @property
     def is_regular(self) -> bool:
         """Whether there are enough intervals to determine the usual one, and few are long."""
-        long = int(np.count_nonzero(self._held[1] > LONG_PAUSE * self.usual_ns))
+        long_count = int(np.count_nonzero(self._stored_intervals[1] > LONG_PAUSE * self.usual_ns))
         # a single long interval is a pause, however short the log
-        return self._count >= _FEWEST and long <= max(1, self._count // _RARE)
+        return self._interval_count >= _FEWEST and long_count <= max(1, self._interval_count // _RARE)
 
     @property
     def usual_ns(self) -> int:
         """The median of the intervals, for a long log of its first ones; 0 without intervals."""
         if self._first_usual_ns is not None:
             return self._first_usual_ns
-        return int(np.median(self._held[1])) if self._pieces else 0
+        return int(np.median(self._stored_intervals[1])) if self._interval_blocks else 0
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without pauses."""
         pauses = self.longest_first()
         if not pauses:
             return None
-        parts: list[str | Instant] = []
+        pause_texts: list[str | Instant] = []
         for start_ns, length_ns in pauses[:_MOST_LISTED]:
-            comma = ", " if parts else ""
-            parts += [f"{comma}for {length_ns / 1e9:.3f} s from ", Instant(start_ns, 0), " on"]
-        more = len(pauses) - _MOST_LISTED
-        others = f", and {plural(more, 'more time')}" if more > 0 else ""
-        usual = f", where one usually comes every {self.usual_ns / 1e9:.3g} s"
-        unknown = "`max_gap` makes what lies there unknown"
+            comma = ", " if pause_texts else ""
+            pause_texts += [f"{comma}for {length_ns / 1e9:.3f} s from ", Instant(start_ns, 0), " on"]
+        unlisted_count = len(pauses) - _MOST_LISTED
+        unlisted_text = f", and {plural(unlisted_count, 'more time')}" if unlisted_count > 0 else ""
+        usual_text = f", where one usually comes every {self.usual_ns / 1e9:.3g} s"
+        unknown_text = "`max_gap` makes what lies there unknown"
         if max_gap_ns is not None and pauses[0][1] > max_gap_ns:
-            unknown = f"what lies in a pause of more than {max_gap_ns / 1e9:g} s is unknown (`max_gap`)"
-        return Sentence(f"{what} pause ", *parts, f"{others}{usual}; {unknown}")
+            unknown_text = f"what lies in a pause of more than {max_gap_ns / 1e9:g} s is unknown (`max_gap`)"
+        return Sentence(f"{what} pause ", *pause_texts, f"{unlisted_text}{usual_text}; {unknown_text}")
 
 
 class ReportsBack:
     """Counts reports that are earlier than the previous report of their object or signal."""
 
     def __init__(self) -> None:
-        self._last = Trace.empty()
+        self._last_trace = Trace.empty()
         self._counts: dict[str, tuple[int, int]] = {}
 
     def add(self, trace: Trace) -> None:
         """Add samples that follow the previous ones."""
-        before, self._last = self._last, trace if len(trace) else self._last
-        if any(part.reported_ns is not None or part.signals_reported_ns for part in (before, trace)):
+        previous_trace, self._last_trace = self._last_trace, trace if len(trace) else self._last_trace
+        if any(
+            block.reported_ns is not None or block.signals_reported_ns for block in (previous_trace, trace)
+        ):
             # with the last sample before, so that steps between two blocks count
-            joined = Trace.concatenate([before.slice(len(before) - 1, len(before)), trace])
-            if joined.reported_ns is not None:
-                for name, rows, times in zip(joined.names, joined.rows.T, joined.reported_ns.T, strict=True):
-                    self._count(name, rows >= 0, times, joined.times_ns)
-            for name, times in joined.signals_reported_ns.items():
-                self._count(name, np.isfinite(joined.signals[name]), times, joined.times_ns)
+            joined_trace = Trace.concatenate(
+                [previous_trace.slice(len(previous_trace) - 1, len(previous_trace)), trace]
+            )
+            if joined_trace.reported_ns is not None:
+                for name, rows, report_times in zip(
+                    joined_trace.names, joined_trace.rows.T, joined_trace.reported_ns.T, strict=True
+                ):
+                    self._count(name, rows >= 0, report_times, joined_trace.times_ns)
+            for name, report_times in joined_trace.signals_reported_ns.items():
+                self._count(
+                    name, np.isfinite(joined_trace.signals[name]), report_times, joined_trace.times_ns
+                )
 
-    def _count(self, name: str, known: NDArray[np.bool_], reported_ns: Integers, times_ns: Integers) -> None:
-        back = np.flatnonzero(known[1:] & known[:-1] & (reported_ns[1:] < reported_ns[:-1])) + 1
-        if len(back):
-            count, first_ns = self._counts.get(name, (0, int(times_ns[back[0]])))
-            self._counts[name] = count + len(back), first_ns
+    def _count(
+        self, name: str, is_known: NDArray[np.bool_], reported_ns: Integers, times_ns: Integers
+    ) -> None:
+        backward_samples = (
+            np.flatnonzero(is_known[1:] & is_known[:-1] & (reported_ns[1:] < reported_ns[:-1])) + 1
+        )
+        if len(backward_samples):
+            report_count, first_ns = self._counts.get(name, (0, int(times_ns[backward_samples[0]])))
+            self._counts[name] = report_count + len(backward_samples), first_ns
 
     def remarks(self) -> Iterator[Sentence]:
         """Yield a sentence on each object or signal whose reports step back."""
-        for name, (count, first_ns) in sorted(self._counts.items()):
-            reports = f"report of {name} is" if count == 1 else f"reports of {name} are"
-            first = Instant(first_ns, 0)
-            what = ": there is no rate of change there"
-            yield Sentence(f"{count} {reports} earlier than the one before, the first at ", first, what)
+        for name, (report_count, first_ns) in sorted(self._counts.items()):
+            reports = f"report of {name} is" if report_count == 1 else f"reports of {name} are"
+            first_time = Instant(first_ns, 0)
+            consequence = ": there is no rate of change there"
+            yield Sentence(
+                f"{report_count} {reports} earlier than the one before, the first at ",
+                first_time,
+                consequence,
+            )

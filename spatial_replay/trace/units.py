@@ -51,8 +51,8 @@ class Axes:
         try:
             axes, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
             y: Literal["up", "down"] = "down" if axes.get("y") == "down" else "up"
-            declared = {name: unit for name, unit in signals.items() if name and isinstance(unit, str)}
-            return cls(y, float(axes.get("scale", 1.0)), str(axes.get("unit", "")), declared)
+            signal_units = {name: unit for name, unit in signals.items() if name and isinstance(unit, str)}
+            return cls(y, float(axes.get("scale", 1.0)), str(axes.get("unit", "")), signal_units)
         # other programs may write anything under these keys
         except (ValueError, TypeError, AttributeError, RecursionError):
             return cls()
@@ -61,8 +61,8 @@ class Axes:
         """Return the entries for a log's metadata; none for a source with our axes and no units."""
         unit = {"unit": self.unit} if self.unit else {}
         axes = {"scale": self.scale, **unit, "y": self.y} if self != OUR_AXES else {}
-        about = {AXES_KEY: axes, SIGNAL_UNITS_KEY: dict(sorted(self.signals.items()))}
-        return {key: json.dumps(value) for key, value in about.items() if value}
+        entries = {AXES_KEY: axes, SIGNAL_UNITS_KEY: dict(sorted(self.signals.items()))}
+        return {key: json.dumps(value) for key, value in entries.items() if value}
 
     @property
     def units(self) -> dict[str, str]:
@@ -79,11 +79,13 @@ class Axes:
         """Return footprints of the source as footprints of samples."""
         if self == OUR_AXES:
             return shapes
-        vertices, start = shapes.vertices, shapes.vertex_start
+        vertices, vertex_start = shapes.vertices, shapes.vertex_start
         if self.y == "down":
             # mirroring turns an outline clockwise, so the order of each part's vertices is reversed
-            mirror = np.repeat(start[:-1] + start[1:] - 1, np.diff(start)) - np.arange(len(vertices))
-            vertices = vertices[mirror]
+            reversed_order = np.repeat(
+                vertex_start[:-1] + vertex_start[1:] - 1, np.diff(vertex_start)
+            ) - np.arange(len(vertices))
+            vertices = vertices[reversed_order]
             # 0 - y rather than -y: zero stays zero
             vertices = np.column_stack([vertices[:, 0], 0.0 - vertices[:, 1]])
         return replace(
@@ -136,8 +138,8 @@ def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B"))
         size_a, size_b = _size(a, name), _size(b, name)
         if min(size_a, size_b) > 0.0:
             ratios.append(size_a / size_b)
-            times, which = (ratios[0], called[0]) if ratios[0] > 1.0 else (1.0 / ratios[0], called[1])
-            example = example or f"{name} is {times:,.0f} times as large in {which}"
+            ratio, larger_run = (ratios[0], called[0]) if ratios[0] > 1.0 else (1.0 / ratios[0], called[1])
+            example = example or f"{name} is {ratio:,.0f} times as large in {larger_run}"
     if ratios and (min(ratios) >= OTHER_UNITS or max(ratios) <= 1.0 / OTHER_UNITS):
         runs = "the runs" if called == ("A", "B") else " and ".join(called)
         raise UsageError(
