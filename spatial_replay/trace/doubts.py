@@ -11,7 +11,7 @@ from typing import Any, Final
 from spatial_replay.text import Sentence, counted_from
 
 MANY_TURNS: Final = 8 * pi
-"""Limit on angles in radians, four turns; larger angles are probably degrees."""
+"""Largest plausible angle, radians: four turns. Larger angles are probably degrees."""
 
 SHORTEST_PERIOD_NS: Final = 200_000
 """Shortest plausible period of a recording, ns; shorter periods are times in another unit."""
@@ -24,9 +24,9 @@ class Doubt:
     Attributes:
         assumption: name of the assumption, as in `accept` of a mapping.
         topic: topic whose messages contradict it; "" for a log without topics.
-        text: sentence with the topic, the measurement, and the key that settles the doubt.
+        text: sentence with the topic, the measurement, and the mapping key that settles the doubt.
         objects, signals: names whose values depend on the assumption.
-        is_accepted: whether the mapping accepts the doubt, so that verdicts are not doubtful.
+        is_accepted: whether the mapping accepts the doubt. Verdicts are not doubtful then.
     """
 
     assumption: str
@@ -37,7 +37,7 @@ class Doubt:
     is_accepted: bool = False
 
     def remark(self, log: str) -> Sentence:
-        """Return the remark on a log with this doubt."""
+        """Return the remark with this doubt about the log named `log`."""
         if self.is_accepted:
             return Sentence(f"{log}: accepted: ", self.text)
         remedy = f"`accept: [{self.assumption}]` in the mapping" if self.topic else "`--allow doubtful`"

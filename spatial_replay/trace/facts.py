@@ -1,4 +1,4 @@
-"""Facts about each topic of a log, as numbers that show a person how it was read."""
+"""Statistics of each mapped topic of a log, for a person who checks how the log was read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Distribution(NamedTuple):
-    """Least, median and greatest number of a set, and the time of the greatest, if known."""
+    """Least, median and greatest number of a set, and the time of the greatest number or None."""
 
     least: float
     median: float
@@ -17,7 +17,7 @@ class Distribution(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TopicFacts:
-    """Content of one mapped topic, as it was read; numbers without a measurement are None.
+    """Content of one mapped topic after reading. Distributions without a measurement are None.
 
     Attributes:
         messages: number of messages.
@@ -25,16 +25,16 @@ class TopicFacts:
         period_s: intervals between messages, s; the greatest is the longest pause.
         lateness_s: recording times minus stamps of messages, s.
         publishers: number of channels.
-        frames: frames that its messages name.
+        frames: coordinate frames named in the messages.
         objects: number of reports of objects.
         most_at_once: largest number of reports in one message.
-        name: entry of the mapping that makes names; "" for the default of the type.
+        name: mapping entry from which object names are made; "" for the default of the message type.
         names: names of the objects.
         classes: classes of the objects; None for objects without a class.
         class_changes: number of changes of an object's class between reports.
         signals: names of the signals.
         size, shorter_side: longer and shorter sides of outlines, in footprint units.
-        low, high: least and greatest coordinates, as in messages.
+        low, high: least and greatest coordinates, in the units of the messages.
         speed, turn_rate: speeds between reports of an object, in footprint units and radians per second.
         bottom, top: heights of objects.
         uncertainty: uncertainty radii of objects.

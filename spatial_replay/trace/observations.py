@@ -23,7 +23,7 @@ from spatial_replay.trace.trace import ABSENT, Trace
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """R objects detected in T samples, as reported: unchecked, vertices in any order.
+    """R reports of objects in T samples, unchecked, with vertices in any order.
 
     Attributes:
         times_ns: (T,) int64, increasing.
@@ -37,7 +37,7 @@ class Observations:
         shapes: footprints of the R objects; bottom and top are NaN for objects without height.
         invalid: (R,) bool, whether the report itself marks a number as unknown.
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
-        reported_ns: (R,) int64, times of the reports; None if all equal the times of their samples.
+        reported_ns: (R,) int64, times of the reports; None if every report has its sample's time.
         signals_reported_ns: times of the signals' reports, as in a `Trace`.
         lasting: objects that keep their position until their next report.
     """
@@ -62,7 +62,8 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     """Check every observation and normalise its polygons.
 
     Observations with a number that is not finite become unreadable rows. Samples are left out if they name
-    an object twice, or have a negative radius or uncertainty, a height upside down, or an invalid polygon.
+    an object twice. They are also left out if an object has a negative radius or uncertainty, a top below
+    its bottom, or an invalid polygon.
 
     Args:
         concave: treatment of polygons that are not convex.
@@ -73,7 +74,7 @@ def trace_from_observations(observed: Observations, *, concave: Concave) -> tupl
     observed = _sort_observations(observed)
     faults = _duplicates(observed)
     is_readable, shapes, observation_faults = check_observations(observed, concave=concave)
-    # of several faults of a sample, the duplicate is reported
+    # if a sample has several faults, the duplicate is reported
     faults = observation_faults | faults
     rows = np.full((len(observed.times_ns), len(observed.names)), ABSENT, np.int64)
     row_numbers = np.arange(len(observed.name), dtype=np.int64)
@@ -109,8 +110,8 @@ def check_observations(
     """Check every observation on its own, and normalise its polygons.
 
     Returns:
-        whether each observation (R,) has only finite numbers; the footprints; and the fault of each sample
-        with an impossible observation, by its index.
+        whether each observation (R,) is readable, the footprints, and a fault by sample index for each
+        sample with an invalid observation.
     """
     is_readable = _finite(observed) & ~observed.invalid
     faults = _wrong_numbers(observed, is_readable)
@@ -125,7 +126,7 @@ def _sort_observations(observed: Observations) -> Observations:
     rank = np.zeros(len(name_order), np.int64)
     rank[name_order] = np.arange(len(name_order))
     name_index = rank[observed.name]
-    # one integer sorts by both
+    # one integer per observation sorts by sample and name
     sort_keys = observed.sample * max(1, len(names)) + name_index
     # readers mostly yield sorted rows, which need no copies
     if (sort_keys[1:] >= sort_keys[:-1]).all():
@@ -196,7 +197,7 @@ def _wrong_numbers(observed: Observations, is_readable: Booleans) -> dict[int, s
 def _normalise_shapes(
     observed: Observations, is_readable: Booleans, concave: Concave
 ) -> tuple[FootprintBatch, dict[int, str]]:
-    """Return normalised polygons and the samples' faults; polygons that are not convex are decomposed."""
+    """Return normalised polygons, and faults by sample index. Concave polygons are decomposed."""
     shapes = observed.shapes
     part_counts = np.diff(shapes.part_start)
     vertex_start, vertices, fault_codes = normalise_polygons(shapes.vertex_start, shapes.vertices)
@@ -222,7 +223,7 @@ def _normalise_shapes(
 
 
 def _with_pieces(shapes: FootprintBatch, footprint_by_part: Mapping[int, Footprint]) -> FootprintBatch:
-    """Replace each given part of the shapes by the parts of a footprint."""
+    """Replace parts of the shapes, given by index, by the parts of a footprint."""
     part_counts = np.ones(len(shapes.radius), np.int64)
     part_counts[list(footprint_by_part)] = [len(footprint.parts) for footprint in footprint_by_part.values()]
     new_polygons = [part.vertices for footprint in footprint_by_part.values() for part in footprint.parts]
@@ -232,7 +233,7 @@ def _with_pieces(shapes: FootprintBatch, footprint_by_part: Mapping[int, Footpri
     vertices = np.concatenate([shapes.vertices, *new_polygons])
     vertex_begins = starts_from_counts(vertex_counts)[:-1]
     first_parts = np.arange(len(shapes.radius), dtype=np.int64)
-    # pieces are behind all parts, and `order` brings them to their places
+    # new polygons are appended, and `part_order` moves them to the places of the replaced parts
     first_parts[list(footprint_by_part)] = (
         len(shapes.radius) + starts_from_counts(part_counts[list(footprint_by_part)])[:-1]
     )

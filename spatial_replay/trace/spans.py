@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 class TopicSpan:
     """The samples in which one topic could be judged.
 
-    A topic can be judged after its first message, while messages arrive, and if transforms place them.
+    A topic can be judged from its first message on, while messages arrive and transforms locate them.
 
     Attributes:
         objects: names of its objects so far.
         pattern: regular expression for the names of its possible objects; None without objects.
         signals: names of its signals.
         classes: classes of its possible objects, in lower case; None for any class.
-        limit_ns: longest part of the log that may be left out at an end because of this topic, ns.
+        limit_ns: longest time that may be left out at an end of the log because of this topic, ns.
         begun_ns, heard_ns: times of its first and last message; None without messages.
-        first_ns, last_ns: times of the first and the last of these samples; None without any.
+        first_ns, last_ns: times of the first and the last such sample; None without such samples.
     """
 
     topic: str
@@ -40,7 +40,7 @@ class TopicSpan:
         return self.pattern is not None and re.fullmatch(self.pattern, name, re.DOTALL) is not None
 
     def join(self, later: TopicSpan) -> TopicSpan:
-        """Return the span over these and later samples of the topic."""
+        """Return the span that covers this span and a later span of the same topic."""
         return replace(
             later,
             objects=self.objects | later.objects,

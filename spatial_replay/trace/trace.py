@@ -1,4 +1,4 @@
-"""Samples and traces, with a cache of measurements; pauses of a log, and time points that users write.
+"""Samples, traces with a cache of measurements, pauses of a log, and time points that users write.
 
 Times are whole nanoseconds (signed 64-bit).
 """
@@ -77,7 +77,7 @@ _EXAMPLES = MappingProxyType(
 
 
 def _signal_value(name: str, value: Any) -> float:
-    """Return a number unchanged, and a text as its `text_number`."""
+    """Return a number as a float, and a text as its `text_number`."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
@@ -101,8 +101,8 @@ class Sample:
         signals: numbers by name, NaN for an unknown value; a text is stored as its `text_number`.
         unknown: classes of objects with unknown position, by name; None for an object without a class. Such
             objects stay members of open groups, so atoms over these groups are unknown.
-        reported_ns: times of the reports of objects and signals, by name, at most `time_ns`. By default
-            it is the sample's time. An object and a signal of the same name share a time.
+        reported_ns: times of the reports of objects and signals, by name, at most `time_ns`. The default
+            is the sample's time. An object and a signal of the same name share a time.
         lasting: objects that keep their position until their next report, such as a latched map.
 
     Raises:
@@ -170,7 +170,7 @@ class Sample:
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
-        # the sample's time is the default: equal samples store no report time equal to it
+        # the sample's time is the default; storing it would make equal samples differ
         other_times = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
@@ -203,10 +203,10 @@ _BYTES = 1 << 30
 
 
 class MeasurementCache:
-    """Cache of arrays computed from one frozen trace; above 1 GiB, the least recently used are evicted.
+    """Cache of arrays computed from one frozen trace. Above 1 GiB, the least recently used are evicted.
 
     Each trace has its own cache, so traces never share results. Keys are compared by equality, never by hash
-    alone. Several threads may evaluate the same trace.
+    alone. Several threads may use the cache at once.
     """
 
     def __init__(self) -> None:
@@ -218,7 +218,7 @@ class MeasurementCache:
         """Return the array stored under a key, or None."""
         with self._lock:
             array = self._arrays.pop(key, None)
-            # added again as the last one, because the order of the dict is the order of use
+            # moved to the end, because the order of the dict is the order of use
             if array is not None:
                 self._arrays[key] = array
             return array
@@ -239,7 +239,7 @@ _DURATION = re.compile(
 )
 _ABSOLUTE = re.compile(r"(?P<number>\d{1,19})(?P<unit>ns)?", re.ASCII | re.I)
 _LEAST_WITHOUT_UNIT_NS = 10**12
-"""Least integer that is read as nanoseconds without a unit; smaller ones could be s or ms."""
+"""Least integer that is read as nanoseconds without a unit. Smaller integers could be s or ms."""
 _CALENDAR = re.compile(
     r"(?P<date>\d{4}-\d\d-\d\d)[T ](?P<time>\d\d:\d\d:\d\d)(?:\.(?P<fraction>\d{1,9}))?"
     r"(?P<offset>Z|[+-]\d\d:\d\d)",
@@ -253,7 +253,7 @@ class TimePoint:
     """A time in a log, as users write it.
 
     Attributes:
-        nanoseconds: time after the origin, ns; at most 0 from the last sample.
+        nanoseconds: time after the origin, ns. It is at most 0 if the origin is the last sample.
         origin: first sample, last sample, or zero of the log's clock.
     """
 
@@ -261,7 +261,11 @@ class TimePoint:
     origin: Literal["first sample", "last sample", "zero"]
 
     def absolute_ns(self, first_ns: int = 0, last_ns: int = 0) -> int:
-        """Return this time on the clock of a log, given the times of its first and last sample."""
+        """Return this time on the clock of a log, ns.
+
+        Args:
+            first_ns, last_ns: times of the log's first and last sample.
+        """
         origins_ns = {"first sample": first_ns, "last sample": last_ns, "zero": 0}
         return max(0, origins_ns[self.origin] + self.nanoseconds)
 
@@ -269,7 +273,7 @@ class TimePoint:
 def time_point_from_text(text: str) -> TimePoint:
     """Read `12.5s` after the first sample, `-1s` before the last, `5250000000ns` on the clock, or RFC 3339.
 
-    Integers from 10^12 on are nanoseconds without a unit.
+    An integer of at least 10^12 without a unit is read as nanoseconds.
 
     Raises:
         UsageError: any other text, a small integer without a unit, or a time beyond the range of logs.
@@ -303,7 +307,7 @@ def duration_ns_from_text(text: str) -> int:
     if match is None:
         raise UsageError(f"{text!r} is not a duration; write it as 2s, 0.5s or 1500ms")
     nanoseconds = Decimal(match["number"]) * (10**9 if match["unit"].lower() == "s" else 10**6)
-    # capped before the conversion, because an exponent can give an integer of a hundred digits
+    # limited before the conversion, because an exponent can give an integer of a hundred digits
     return _checked_ns(int(min(nanoseconds, Decimal(LATEST_NS + 1)).to_integral_value()), text)
 
 
@@ -314,7 +318,7 @@ def _ns_from_calendar(match: re.Match[str], text: str) -> int:
     except ValueError as error:
         raise UsageError(f"{text!r} is not a calendar time: {error}") from error
     fraction_ns = int((match["fraction"] or "").ljust(9, "0"))
-    # in integers: a timestamp as float would lose nanoseconds
+    # integer arithmetic, because a timestamp as float would lose nanoseconds
     return (whole_seconds - _EPOCH) // timedelta(seconds=1) * 10**9 + fraction_ns
 
 
@@ -325,7 +329,7 @@ def _checked_ns(nanoseconds: int, text: str) -> int:
 
 
 ABSENT = -1
-"""The row number of an object that is not in the sample."""
+"""Row number of an object that is not in the sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,8 +338,8 @@ class Trace(Displayed):
 
     Objects are stored as observations: rows of flat arrays, one row for each report of an object.
     `rows[t, n]` is the observation of object n in sample t, or `ABSENT`. An observation with a number
-    that is not finite is unreadable: the object is unknown. It is stored under the row number -2 - row, so
-    that no data is lost.
+    that is not finite is unreadable, and its object is unknown. `rows` has -2 - row for such an observation,
+    which keeps its row number.
 
     Two traces are equal if they hold the same samples. Equality ignores `faults`, `remarks`, `doubts`,
     `units`, `spans`, the order of observations, and names that no sample uses.
@@ -355,10 +359,10 @@ class Trace(Displayed):
         signals_reported_ns: times of reports by signal, each (T,) int64. A signal is left out if all its
             reports have the times of their samples.
         lasting: objects that keep their position until their next report.
-        faults: messages about samples lost or left out while reading, each with its place.
-        remarks: other messages about the log; no data was lost.
+        faults: messages about samples lost or left out while reading, each with its place in the log.
+        remarks: messages about the log that are no faults.
         doubts: assumptions of the reader that the log contradicts.
-        units: declared units, of signals by name, of lengths under "".
+        units: declared units of signals by name; the unit of lengths under "".
         spans: samples in which each mapped topic could be judged, for logs with trimmed ends.
         cache: cached measurements of this trace.
 
@@ -419,7 +423,7 @@ class Trace(Displayed):
 
     @property
     def nbytes(self) -> int:
-        """The size of its arrays in bytes, without the cache."""
+        """Size of the arrays in bytes, without the cache."""
         columns = [self.times_ns, self.rows, self.yaw, self.uncertainty, self.class_code]
         columns += [*self.signals.values(), *self.signals_reported_ns.values()]
         columns += [] if self.reported_ns is None else [self.reported_ns]
@@ -479,7 +483,7 @@ class Trace(Displayed):
         """Build the trace of the given samples, in their order.
 
         Args:
-            units: declared units for sentences and axes: of signals by name, of lengths under "".
+            units: declared units of signals by name; the unit of lengths under "".
 
         Raises:
             TraceError: times that do not increase, or too many names.
@@ -494,7 +498,7 @@ class Trace(Displayed):
         column_of_name = {name: index for index, name in enumerate(names)}
         rows = np.full((len(sample_list), len(names)), ABSENT, np.int64)
         tracked_objects: list[TrackedObject] = []
-        # rows of objects with unknown position come last; they store only the class
+        # rows of objects with unknown position come last, and store only the class
         unknown_objects: list[tuple[int, str, str | None]] = []
         for index, sample in enumerate(sample_list):
             for name in sorted(sample.objects):
@@ -583,12 +587,12 @@ class Trace(Displayed):
         )
 
     def slice(self, start: int, stop: int) -> Trace:
-        """Return the samples from `start` to before `stop`, with their observations only."""
+        """Return the samples from `start` to before `stop` as a trace without other observations."""
         begin, end, _ = slice(start, stop).indices(len(self))
         return self.take(np.arange(begin, max(begin, end), dtype=np.int64))
 
     def take(self, samples: Integers) -> Trace:
-        """Return the samples with the given indices (K,), which must increase."""
+        """Return the trace of the samples with the given indices (K,), which must increase."""
         rows = self.rows[samples]
         used_rows, new_rows = renumber_rows(rows)
         return replace(
@@ -630,7 +634,10 @@ class Trace(Displayed):
         )
 
     def _report_times(self, is_observed: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the report times of the normal form, where unknown values have the time of the sample."""
+        """Return the fields of the normal form that depend on reports.
+
+        The report time of an unknown value is replaced by the time of its sample.
+        """
         sample_ns = self.times_ns[:, None]
         reported_ns = None
         if self.reported_ns is not None:
@@ -666,7 +673,7 @@ class Trace(Displayed):
             reported_ns = np.zeros(rows.shape, np.int64)
         sample_start = row_start = 0
         for trace in traces:
-            # an unreadable row is stored as -2 - row, so its shift is negative
+            # an unreadable row is stored as -2 - row, so its number is shifted downwards
             row_shift = np.where(trace.rows >= 0, row_start, np.where(trace.rows == ABSENT, 0, -row_start))
             columns = [column_of_name[name] for name in trace.names]
             rows[sample_start : sample_start + len(trace), columns] = trace.rows + row_shift
@@ -677,14 +684,14 @@ class Trace(Displayed):
                 reported_ns[sample_start : sample_start + len(trace), columns] = trace_reported_ns
             sample_start += len(trace)
             row_start += len(trace.footprints)
-        # one column for each length, shared by all missing signals
+        # NaN by trace length; signals that a trace lacks share the array
         unknown_values = {len(trace): np.full(len(trace), np.nan) for trace in traces}
         class_codes = (
             np.array([code_of_class[n] for n in trace.classes], np.int64)[trace.class_code]
             for trace in traces
         )
         return cls(
-            # the empty arrays are for no traces at all
+            # the empty arrays give the type if there are no traces
             times_ns=np.concatenate([np.empty(0, np.int64), *(trace.times_ns for trace in traces)]),
             names=names,
             rows=rows,
@@ -716,7 +723,7 @@ class Trace(Displayed):
 def _reported_of_samples(
     samples: Sequence[Sample], names: Sequence[str], signals: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the columns `reported_ns` and `signals_reported_ns` of samples, if they are needed."""
+    """Return the fields `reported_ns` and `signals_reported_ns`; {} if every report has its sample's time."""
     if not any(sample.reported_ns for sample in samples):
         return {}
     times_ns = np.array([sample.time_ns for sample in samples], np.int64)
@@ -736,7 +743,7 @@ _LONGEST_UNIT = 64
 
 
 def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Return declared units in the order of their names; none for None.
+    """Return declared units sorted by name; {} for None.
 
     Raises:
         UsageError: the units are not short texts by name.
@@ -761,7 +768,7 @@ def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]
         times_ns: (T,) int64, in order.
         start_ns, end_ns: integers of any size.
     """
-    # `np.searchsorted` would round to doubles for an end that no int64 holds
+    # `np.searchsorted` would compare an end beyond int64 as a rounded double
     return bisect_left(times_ns, start_ns), bisect_left(times_ns, end_ns)
 
 
@@ -772,7 +779,7 @@ def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
 
 
 def require_few(objects: Collection[str], signals: Collection[str]) -> None:
-    """Check the number of names, because each name takes a number in every sample.
+    """Limit the number of names, because each sample stores a number for each name.
 
     Raises:
         TraceError: more objects or signals than `MOST_NAMES`.
@@ -796,7 +803,7 @@ def _check_shapes(trace: Trace) -> None:
         if (shape := getattr(trace, column).shape) != (observation_count,):
             needed = f"{observation_count} footprints need ({observation_count},)"
             raise TraceError(f"{column} has the shape {shape}; {needed}")
-    # -2 - (observations - 1) is the least row of an unreadable observation
+    # -2 - (observation_count - 1) is the least row of an unreadable observation
     if trace.rows.size and (
         trace.rows.max() >= observation_count or trace.rows.min() < -1 - observation_count
     ):
@@ -823,7 +830,8 @@ def _check_times(times_ns: Integers) -> None:
         index = int(late_indices[0])
         time_text, previous_text = times_apart(int(times_ns[index + 1]), int(times_ns[index]))
         raise TraceError(
-            f"sample {index + 1} is at {time_text} and the one before it at {previous_text}; give times that increase"
+            f"sample {index + 1} is at {time_text} and the one before it at {previous_text};"
+            " give times that increase"
         )
 
 
@@ -853,7 +861,7 @@ def _same_samples(a: Trace, b: Trace) -> bool:
 
 
 def renumber_rows(rows: Integers) -> tuple[Integers, Integers]:
-    """Return the used observations, by sample and name, and the new row numbers that point at them."""
+    """Return the used observations in the order of samples and names, and the renumbered rows (T, N)."""
     is_present = rows != ABSENT
     present_rows = rows[is_present]
     is_unreadable = present_rows < ABSENT
@@ -865,23 +873,26 @@ def renumber_rows(rows: Integers) -> tuple[Integers, Integers]:
 
 
 def class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
-    """Return class names in the order of a trace: None first."""
+    """Return distinct class names in the order of `Trace.classes`: None first, then by name."""
     return tuple(sorted(set(classes), key=lambda name: (name is not None, name or "")))
 
 
 LONG_PAUSE: Final = 5
-"""Ratio of an interval to the usual period above which the interval is a pause."""
+"""An interval longer than this many usual intervals is a pause."""
 _FEWEST: Final = 10
-"""Minimum number of intervals to determine the usual period."""
+"""Minimum number of intervals to determine the usual interval."""
 _RARE: Final = 20
 """Minimum number of intervals per pause; with more pauses, the times are irregular."""
 _MOST_LISTED: Final = 3
 _MOST_HELD: Final = 65_536
-"""Number of intervals after which only long ones are stored."""
+"""Number of intervals after which only long intervals are stored."""
 
 
 class Pauses:
-    """The intervals between times, added in order; a long log stores only long intervals."""
+    """The pauses in a sequence of times, which are added in order.
+
+    All intervals are stored at first; after `_MOST_HELD` intervals, only long intervals.
+    """
 
     def __init__(self) -> None:
         self._last_time_ns, self._is_last_lost = np.empty(0, np.int64), np.empty(0, np.bool_)
@@ -893,7 +904,8 @@ class Pauses:
         """Add times that follow the previous ones.
 
         Args:
-            is_lost: (T,), whether everything is unknown after a time. The interval after it is no pause.
+            is_lost: (T,), whether everything is unknown after each time. An interval after such a time is
+                no pause.
         """
         all_times_ns = np.concatenate([self._last_time_ns, times_ns])
         is_time_lost = np.concatenate(
@@ -905,7 +917,7 @@ class Pauses:
         if self._first_usual_ns is None and self._interval_count >= _MOST_HELD:
             intervals = self._stored_intervals
             self._first_usual_ns = int(np.median(intervals[1, :_MOST_HELD]))
-            # the stored intervals are filtered again, now that the usual one is known
+            # the stored intervals are filtered, now that the usual interval is known
             self._interval_blocks = []
             self._store(intervals)
 
@@ -917,11 +929,11 @@ class Pauses:
 
     @property
     def _stored_intervals(self) -> Integers:
-        """(2, N): starts and lengths of the stored intervals."""
+        """(2, N): starts and lengths of the stored intervals, ns."""
         return np.concatenate([np.empty((2, 0), np.int64), *self._interval_blocks], axis=1)
 
     def longest_first(self) -> list[tuple[int, int]]:
-        """Return the start and the length of each pause, the longest first."""
+        """Return the start and the length of each pause, ns, the longest pause first."""
         intervals = self._stored_intervals
         if not self.is_regular:
             return []
@@ -935,14 +947,14 @@ class Pauses:
 
     @property
     def is_regular(self) -> bool:
-        """Whether there are enough intervals to determine the usual one, and few are long."""
+        """Whether there are enough intervals to determine the usual interval, and few are pauses."""
         long_count = int(np.count_nonzero(self._stored_intervals[1] > LONG_PAUSE * self.usual_ns))
         # a single long interval is a pause, however short the log
         return self._interval_count >= _FEWEST and long_count <= max(1, self._interval_count // _RARE)
 
     @property
     def usual_ns(self) -> int:
-        """The median of the intervals, for a long log of its first ones; 0 without intervals."""
+        """Median of the intervals, ns; 0 without intervals. A long log uses its first intervals only."""
         if self._first_usual_ns is not None:
             return self._first_usual_ns
         return int(np.median(self._stored_intervals[1])) if self._interval_blocks else 0
@@ -978,7 +990,7 @@ class ReportsBack:
         if any(
             block.reported_ns is not None or block.signals_reported_ns for block in (previous_trace, trace)
         ):
-            # with the last sample before, so that steps between two blocks count
+            # the previous block's last sample is joined, so that steps between blocks count
             joined_trace = Trace.concatenate(
                 [previous_trace.slice(len(previous_trace) - 1, len(previous_trace)), trace]
             )

@@ -47,9 +47,12 @@ class TrackEvidence:
             self._turning_objects.update(trace.names)
 
     def _add_steps(self, trace: Trace) -> None:
-        """Update whether angles count turns: they begin within one turn, and step by less than half of it."""
+        """Update the count of fast steps, and whether angles count turns.
+
+        Angles that count turns begin within one turn, and each step is shorter than half a turn.
+        """
         yaw = np.where(trace.rows >= 0, trace.yaw[np.maximum(trace.rows, 0)], np.nan)
-        # whether this is the first block
+
         is_first_block = self._sample_count == len(trace)
         yaw_steps, step_seconds = np.abs(np.diff(yaw, axis=0)), np.diff(trace.times_ns)[:, None] / 1e9
         self._counts_turns &= not (yaw_steps >= pi).any() and not (
@@ -59,7 +62,7 @@ class TrackEvidence:
         self._fast_step_count += int(np.count_nonzero(yaw_steps > 2 * pi * step_seconds))
 
     def doubts(self) -> Iterator[Doubt]:
-        """Yield the assumptions that the samples contradict; call it after the last sample."""
+        """Yield the assumptions that the samples contradict. Call this after the last sample."""
         # few robots turn more than once per second, so many fast steps point to degrees
         is_fast = self._fast_step_count > self._step_count / 10
         if self._turning_objects and not (self._counts_turns and not is_fast):

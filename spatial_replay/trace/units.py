@@ -1,4 +1,4 @@
-"""The axes and units of a source: direction of y, length of its unit, and units of its signals.
+"""The axes and units of a source: direction of y, unit of lengths, and units of signals.
 
 Samples always have y upwards, so that `above` means above and drawings are the right way up. Image rows count
 downwards, so coordinates from images are mirrored once, when they are read.
@@ -19,20 +19,20 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
-"""Key of a log's metadata for the axes of its source and the unit of lengths."""
+"""Metadata key of a log for the axes of its source and the unit of lengths."""
 SIGNAL_UNITS_KEY = "signal_units"
-"""Key of a log's metadata for the units of its signals."""
+"""Metadata key of a log for the units of its signals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """The axes and units of a source, as opposed to those of samples.
+    """The axes and units of a source, from which reading converts to the axes of samples.
 
     Attributes:
         y: direction of its y axis.
         scale: footprint units per unit of the source.
         unit: name of the footprint unit, such as "m"; "" if it is not declared.
-        signals: units of signals, by name; or names of their numbers (see `names_from_unit`).
+        signals: units by name of a signal. A unit may be replaced by names of numbers, see `names_from_unit`.
     """
 
     y: Literal["up", "down"] = "up"
@@ -42,12 +42,16 @@ class Axes:
 
     @classmethod
     def of_units(cls, units: Mapping[str, str]) -> Axes:
-        """Return our axes with declared units: of signals by name, of lengths under ""."""
+        """Return `OUR_AXES` with declared units.
+
+        Args:
+            units: units of signals by name; the unit of lengths under "".
+        """
         return cls(unit=units.get("", ""), signals={name: unit for name, unit in units.items() if name})
 
     @classmethod
     def from_metadata(cls, about: Mapping[str, str]) -> Axes:
-        """Return the axes of a log's source from its metadata; our axes if they have none."""
+        """Return the axes of a log's source from the log's metadata, by default `OUR_AXES`."""
         try:
             axes, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
             y: Literal["up", "down"] = "down" if axes.get("y") == "down" else "up"
@@ -58,7 +62,7 @@ class Axes:
             return cls()
 
     def metadata(self) -> dict[str, str]:
-        """Return the entries for a log's metadata; none for a source with our axes and no units."""
+        """Return the entries for a log's metadata. `OUR_AXES` without units have no entries."""
         unit = {"unit": self.unit} if self.unit else {}
         axes = {"scale": self.scale, **unit, "y": self.y} if self != OUR_AXES else {}
         entries = {AXES_KEY: axes, SIGNAL_UNITS_KEY: dict(sorted(self.signals.items()))}
@@ -66,7 +70,7 @@ class Axes:
 
     @property
     def units(self) -> dict[str, str]:
-        """All declared units: of signals by name, of lengths under ""."""
+        """The declared units: units of signals by name, the unit of lengths under ""."""
         return {**self.signals, **({"": self.unit} if self.unit else {})}
 
     def __str__(self) -> str:
@@ -76,7 +80,7 @@ class Axes:
         return f"y up{turned}{scaled}{lengths}"
 
     def convert_shapes(self, shapes: FootprintBatch) -> FootprintBatch:
-        """Return footprints of the source as footprints of samples."""
+        """Convert footprints from the axes of the source to the axes of samples."""
         if self == OUR_AXES:
             return shapes
         vertices, vertex_start = shapes.vertices, shapes.vertex_start
@@ -86,7 +90,7 @@ class Axes:
                 vertex_start[:-1] + vertex_start[1:] - 1, np.diff(vertex_start)
             ) - np.arange(len(vertices))
             vertices = vertices[reversed_order]
-            # 0 - y rather than -y: zero stays zero
+            # 0 - y instead of -y, which would turn 0 into -0
             vertices = np.column_stack([vertices[:, 0], 0.0 - vertices[:, 1]])
         return replace(
             shapes,
@@ -97,12 +101,12 @@ class Axes:
         )
 
     def convert_yaw(self, yaw: Floats) -> Floats:
-        """Return angles (R,) of the source as angles of samples."""
-        # 0 - yaw rather than -yaw: zero stays zero
+        """Convert angles (R,) from the axes of the source to the axes of samples, radians."""
+        # 0 - yaw instead of -yaw, which would turn 0 into -0
         return 0.0 - yaw if self.y == "down" else yaw
 
     def convert_trace(self, trace: Trace) -> Trace:
-        """Return samples of the source with our axes."""
+        """Convert samples from the axes of the source to `OUR_AXES`."""
         if (self.y, self.scale) == ("up", 1.0):
             return trace
         return replace(
@@ -118,10 +122,10 @@ OUR_AXES = Axes()
 
 
 OTHER_UNITS: Final = 8.0
-"""Size ratio from which two runs are taken to use different units."""
+"""Size ratio from which on two runs are assumed to use different units."""
 
 _MOST_SIZES: Final = 256
-"""Limit on samples of an object for its median size."""
+"""Maximum number of samples from which an object's median size is computed."""
 
 
 def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B")) -> None:
@@ -153,5 +157,5 @@ def _size(trace: Trace, name: str) -> float:
     rows = rows[rows >= 0]
     if not len(rows):
         return 0.0
-    # ceiling division, so that the rows are spread evenly and no more than the limit
+    # ceiling division gives an even spread of at most `_MOST_SIZES` rows
     return float(np.median(trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)]).sizes))
