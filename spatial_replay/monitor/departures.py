@@ -112,13 +112,13 @@ class Departures:
         self._watches: dict[_Visitors, list[_Watch]] = {}
         for watch in dict.fromkeys(watch for instance in instances for watch in _watches_of(instance)):
             self._watches.setdefault(watch.visitors, []).append(watch)
-        self._past: Trace | None = None
-        self._absent: dict[tuple[_Visitors, str], _Absence] = {}
+        self._recent_samples: Trace | None = None
+        self._open_absences: dict[tuple[_Visitors, str], _Absence] = {}
 
     def restart(self) -> Departures:
         """Return an empty collection for another log, with the same specification."""
         departures = copy(self)
-        departures.departures, departures._past, departures._absent = [], None, {}
+        departures.departures, departures._recent_samples, departures._open_absences = [], None, {}
         return departures
 
     def add(self, trace: Trace) -> None:
@@ -126,39 +126,39 @@ class Departures:
         trace = trace.without_filling() if self._watches else trace
         if not self._watches or not len(trace):
             return
-        if self._past is not None:
-            trace = Trace.concatenate([self._past, trace])
+        if self._recent_samples is not None:
+            trace = Trace.concatenate([self._recent_samples, trace])
         scene = TraceScene(trace, self._regions)
         for visitors in self._watches:
             self._follow(visitors, scene)
         # the last second suffices to measure the approach of the next member that leaves
-        self._past = tail(trace, Reach(1, _APPROACH_NS))
+        self._recent_samples = tail(trace, Reach(1, _APPROACH_NS))
 
     def _follow(self, visitors: _Visitors, scene: TraceScene) -> None:
-        trace, past_count = scene.trace, 0 if self._past is None else len(self._past)
-        names, members = _memberships(visitors, scene)
+        trace, recent_count = scene.trace, 0 if self._recent_samples is None else len(self._recent_samples)
+        member_names, memberships = _memberships(visitors, scene)
         # membership cannot change in the first sample of a log
-        start = max(past_count, 1)
-        samples, columns = np.nonzero(np.diff(members[start - 1 :], axis=0))
-        turns = list(zip((samples + start).tolist(), columns.tolist(), strict=True))
-        if not turns:
+        first_sample = max(recent_count, 1)
+        samples, columns = np.nonzero(np.diff(memberships[first_sample - 1 :], axis=0))
+        changes = list(zip((samples + first_sample).tolist(), columns.tolist(), strict=True))
+        if not changes:
             return
-        early_samples = [_early(trace, members, *turn) for turn in turns]
+        early_samples = [_early(trace, memberships, *change) for change in changes]
         sample_triples = [
             (early_sample, sample - 1, sample)
-            for early_sample, (sample, _) in zip(early_samples, turns, strict=True)
+            for early_sample, (sample, _) in zip(early_samples, changes, strict=True)
         ]
-        member_columns = np.array([trace.names.index(names[column]) for _, column in turns])
+        member_columns = np.array([trace.names.index(member_names[column]) for _, column in changes])
         distances = self._distances(visitors, member_columns, np.array(sample_triples), trace)
         sizes = _sizes(trace, np.array(sample_triples)[:, 1:], member_columns)
         for (sample, column), triple, member_distances, (last_size, size) in zip(
-            turns, sample_triples, distances, sizes.tolist(), strict=True
+            changes, sample_triples, distances, sizes.tolist(), strict=True
         ):
-            key, times_ns = (visitors, names[column]), trace.times_ns[list(triple)].tolist()
-            if not members[sample, column]:
-                reason = _why_absent(visitors, names[column], trace, sample)
+            absence_key, times_ns = (visitors, member_names[column]), trace.times_ns[list(triple)].tolist()
+            if not memberships[sample, column]:
+                reason = _why_absent(visitors, member_names[column], trace, sample)
                 early_ns, last_ns, start_ns = times_ns
-                self._absent[key] = _Absence(
+                self._open_absences[absence_key] = _Absence(
                     reason,
                     early_ns,
                     last_ns,
@@ -167,21 +167,28 @@ class Departures:
                     member_distances[:, 1],
                     last_size,
                 )
-            elif key in self._absent:
+            elif absence_key in self._open_absences:
                 self._return(
-                    visitors, names[column], self._absent.pop(key), times_ns[-1], member_distances[:, 2], size
+                    visitors,
+                    member_names[column],
+                    self._open_absences.pop(absence_key),
+                    times_ns[-1],
+                    member_distances[:, 2],
+                    size,
                 )
 
-    def _distances(self, visitors: _Visitors, columns: Integers, samples: Integers, trace: Trace) -> Floats:
+    def _distances(
+        self, visitors: _Visitors, member_columns: Integers, member_samples: Integers, trace: Trace
+    ) -> Floats:
         """Return the distances (N, watches, 3) of N members in three samples (N, 3) per member."""
-        rows = trace.rows[samples.ravel()]
-        cells = np.arange(len(rows)), np.repeat(columns, samples.shape[1])
+        rows = trace.rows[member_samples.ravel()]
+        own_cells = np.arange(len(rows)), np.repeat(member_columns, member_samples.shape[1])
         # a stand-in replaces each member in its samples, so that one call measures all members
         # 0.4 ms for a block; a trace for each departure took 2.2 ms
-        rows = np.column_stack([rows[cells], rows])
+        rows = np.column_stack([rows[own_cells], rows])
         # without its own column, a member is not in the group that it is compared with
-        rows[cells[0], cells[1] + 1] = ABSENT
-        stand_in = replace(
+        rows[own_cells[0], own_cells[1] + 1] = ABSENT
+        stand_in_trace = replace(
             trace,
             # rows repeat samples in any order, and times of a trace have to increase
             times_ns=np.arange(len(rows), dtype=np.int64),
@@ -192,35 +199,43 @@ class Departures:
             signals_reported_ns={},
         )
         watches = self._watches[visitors]
-        values, _ = measurement_values(
-            TraceScene(stand_in, self._regions), [watch.distance(_STAND_IN) for watch in watches]
+        distances, _ = measurement_values(
+            TraceScene(stand_in_trace, self._regions), [watch.distance(_STAND_IN) for watch in watches]
         )
-        by_member: Floats = values.reshape(len(watches), *samples.shape).swapaxes(0, 1)
+        by_member: Floats = distances.reshape(len(watches), *member_samples.shape).swapaxes(0, 1)
         return by_member
 
     def _return(
-        self, visitors: _Visitors, name: str, absence: _Absence, end_ns: int, distances: Floats, size: float
+        self,
+        visitors: _Visitors,
+        name: str,
+        absence: _Absence,
+        end_ns: int,
+        distances: Floats,
+        return_size: float,
     ) -> None:
         """Add the departure of a member that has returned, if it was near a threshold."""
         # a member of a single sample has no approach; 1 avoids a division by zero
         span_ns = max(absence.last_ns - absence.early_ns, 1)
         # an empty group is infinitely far away: inf - inf is NaN, which counts as no approach
         with np.errstate(invalid="ignore"):
-            approaches = (absence.early - absence.last) / span_ns * (end_ns - absence.last_ns)
+            approaches = (
+                (absence.early_distances - absence.last_distances) / span_ns * (end_ns - absence.last_ns)
+            )
         for watch, approach, last_distance, return_distance in zip(
             self._watches[visitors],
             approaches.tolist(),
-            absence.last.tolist(),
+            absence.last_distances.tolist(),
             distances.tolist(),
             strict=True,
         ):
-            was_near = last_distance - watch.threshold < max(watch.threshold or absence.size, approach)
-            if was_near or return_distance - watch.threshold < (watch.threshold or size):
-                start, end = Instant(absence.start_ns, 0), Instant(end_ns, 0)
+            was_near = last_distance - watch.threshold < max(watch.threshold or absence.last_size, approach)
+            if was_near or return_distance - watch.threshold < (watch.threshold or return_size):
+                start_time, end_time = Instant(absence.start_ns, 0), Instant(end_ns, 0)
                 distance, side = (last_distance, "before") if was_near else (return_distance, "after")
                 distance_text = f"it was {with_unit(distance, self._unit)} away {side}"
                 text = f"; {distance_text}, from {format_term(_without(watch.reference, name))}"
-                message = Sentence(absence.reason, " from ", start, " to ", end, text)
+                message = Sentence(absence.reason, " from ", start_time, " to ", end_time, text)
                 self.departures.append(Departure(name, absence.start_ns, end_ns, distance, message))
                 return
 
@@ -233,23 +248,23 @@ class _Absence(NamedTuple):
         early_ns: time of the first sample with the member in the last second up to `last_ns`.
         last_ns: time of the last sample with the member.
         start_ns: time of the first sample without it.
-        early, last: (watches,), distances at `early_ns` and `last_ns`.
-        size: size of the member at `last_ns`.
+        early_distances, last_distances: (watches,), distances at `early_ns` and `last_ns`.
+        last_size: size of the member at `last_ns`.
     """
 
     reason: str
     early_ns: int
     last_ns: int
     start_ns: int
-    early: Floats
-    last: Floats
-    size: float
+    early_distances: Floats
+    last_distances: Floats
+    last_size: float
 
 
-def _early(trace: Trace, members: Flags, sample: int, column: int) -> int:
+def _early(trace: Trace, memberships: Flags, sample: int, column: int) -> int:
     """Return the first sample with a member in the last second up to `sample` - 1."""
-    begin = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
-    return begin + int(members[begin:sample, column].argmax())
+    first_sample = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
+    return first_sample + int(memberships[first_sample:sample, column].argmax())
 
 
 def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
@@ -263,8 +278,8 @@ def _sizes(trace: Trace, samples: Integers, columns: Integers) -> Floats:
 def _memberships(visitors: _Visitors, scene: TraceScene) -> tuple[Sequence[str], Flags]:
     """Return the names (M,) of all members, and their membership (T, M) in each sample, 1 or 0."""
     if isinstance(visitors, Group):
-        names, members, _ = scene.members(visitors)
-        return names, members
+        names, memberships, _ = scene.members(visitors)
+        return names, memberships
     trace = scene.trace
     # empty until the object appears
     names = tuple(name for name in trace.names if name == visitors.name)
@@ -291,12 +306,12 @@ def _watches_of(instance: Instance) -> Iterator[_Watch]:
         if not isinstance(node, Atom) or len(distances) != 1:
             continue
         groups = {variable: scope.group for scope in quantifiers for variable in scope.variables}
-        terms = distances[0].first, distances[0].second
+        distance_terms = distances[0].first, distances[0].second
         limits = (abs(limit) for limit in node.parameters if isinstance(limit, float))
         # enlarged terms meet at the sum of their radii
-        threshold = max(limits, default=0.0) + sum(map(_enlargement, terms))
-        first, second = (_with_group(_without_enlargement(term), groups) for term in terms)
-        for member, reference in ((first, second), (second, first)):
+        threshold = max(limits, default=0.0) + sum(map(_enlargement, distance_terms))
+        first_term, second_term = (_with_group(_without_enlargement(term), groups) for term in distance_terms)
+        for member, reference in ((first_term, second_term), (second_term, first_term)):
             visitors = base_of(member)
             is_now = not looks_back(member) and not looks_back(reference)
             is_bound = not isinstance(base_of(reference), Variable)

@@ -58,13 +58,13 @@ def needs_of_spec(spec: NamedSpec, object: str | None = None) -> Needs:
     """
     needs = Needs.of([Specification((replace(spec, parameter=None),), profile="")], {})
     # `Needs.of` omits objects that only `present` names; a misread log may lack them as well
-    names = {
+    object_names = {
         term.name
         for atom in iter_atoms(spec.formula)
         for term in map(base_of, atom.terms)
         if isinstance(term, TrackedName)
     }
-    return replace(needs, objects=needs.objects | names | ({object} if object is not None else set()))
+    return replace(needs, objects=needs.objects | object_names | ({object} if object is not None else set()))
 
 
 def doubts_about(needs: Needs, doubts: Iterable[Doubt], members: ClassMembers) -> tuple[Doubt, ...]:

@@ -60,8 +60,8 @@ class Needs:
 
     def choose(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
         """Return the spans of topics that carry, or may carry, a needed object or signal."""
-        unseen = self.objects.difference(*(span.objects for span in spans))
-        return [span for span in spans if self._is_needed(span, unseen)]
+        unseen_objects = self.objects.difference(*(span.objects for span in spans))
+        return [span for span in spans if self._is_needed(span, unseen_objects)]
 
     def choose_first(self, spans: Sequence[TopicSpan]) -> list[TopicSpan]:
         """Return the spans that are needed regardless of the objects that appear later.
@@ -70,19 +70,23 @@ class Needs:
         """
         patterns = {span.pattern for span in spans}
         # the pattern of a topic with one fixed object is the escaped name
-        fixed = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
-        unseen = self.objects - fixed.keys()
-        return [span for span in spans if span.pattern in fixed.values() or self._is_needed(span, unseen)]
+        fixed_patterns = {name: re.escape(name) for name in self.objects if re.escape(name) in patterns}
+        unseen_objects = self.objects - fixed_patterns.keys()
+        return [
+            span
+            for span in spans
+            if span.pattern in fixed_patterns.values() or self._is_needed(span, unseen_objects)
+        ]
 
-    def _is_needed(self, span: TopicSpan, unseen: frozenset[str]) -> bool:
+    def _is_needed(self, span: TopicSpan, unseen_objects: frozenset[str]) -> bool:
         if not (self.objects.isdisjoint(span.objects) and self.signals.isdisjoint(span.signals)):
             return True
         if span.pattern is None:
             return False
-        of_class = bool(self.classes) and (
+        may_have_class = bool(self.classes) and (
             ANY_CLASS in self.classes or span.classes is None or not self.classes.isdisjoint(span.classes)
         )
-        return of_class or any(map(span.may_have, unseen))
+        return may_have_class or any(map(span.may_have, unseen_objects))
 
 
 class RunEnds:
@@ -114,9 +118,10 @@ class RunEnds:
         within_ns: int | None = None,
     ) -> None:
         self.needs = needs
-        self._start, self._end, self._is_rest, self._within_ns = start, end, is_rest, within_ns
+        self._may_trim_start, self._may_trim_end = start, end
+        self._is_rest, self._start_limit_ns = is_rest, within_ns
         self._spans: dict[str, TopicSpan] = {}
-        self._since_ns: dict[str, int | None] = {}
+        self._ended_ns: dict[str, int | None] = {}
         self._pending_traces: list[Trace] = []
         self._released_ns = -1
         self.log_begin_ns = self._log_end_ns = 0
@@ -137,7 +142,7 @@ class RunEnds:
         One trace is returned for each added trace, perhaps later, without the samples left out.
         """
         # evaluation has begun, and no end is searched: nothing has to be recorded
-        if self.begin_ns is not None and not self._end and not self.late:
+        if self.begin_ns is not None and not self._may_trim_end and not self.late:
             return [trace]
         if len(trace):
             if self._is_empty:
@@ -176,20 +181,20 @@ class RunEnds:
             next_sample = 0 if span.last_ns is None else int(np.searchsorted(times_ns, span.last_ns, "right"))
             since_ns = int(times_ns[next_sample]) if next_sample < len(times_ns) else None
             # the topic was missing at the end of the previous trace already
-            if next_sample == 0 and earlier_span is not None and self._since_ns[span.topic] is not None:
-                since_ns = self._since_ns[span.topic]
-            self._since_ns[span.topic] = since_ns
+            if next_sample == 0 and earlier_span is not None and self._ended_ns[span.topic] is not None:
+                since_ns = self._ended_ns[span.topic]
+            self._ended_ns[span.topic] = since_ns
 
     def _limit_ns(self, span: TopicSpan) -> int:
-        return span.limit_ns if self._within_ns is None else self._within_ns
+        return span.limit_ns if self._start_limit_ns is None else self._start_limit_ns
 
     def _decide_begin(self) -> bool:
         """Begin evaluation if no needed topic is awaited; return whether it began."""
-        passed_ns = self._log_end_ns - self.log_begin_ns
+        elapsed_ns = self._log_end_ns - self.log_begin_ns
         is_waiting = self._is_empty or (
-            self._start
+            self._may_trim_start
             and any(
-                span.first_ns is None and passed_ns <= self._limit_ns(span)
+                span.first_ns is None and elapsed_ns <= self._limit_ns(span)
                 for span in self.needs.choose_first(tuple(self._spans.values()))
             )
         )
@@ -198,88 +203,96 @@ class RunEnds:
         return not is_waiting
 
     def _begin(self) -> None:
-        needed = self.needs.choose_first(tuple(self._spans.values())) if self._start else []
-        delays = [
-            (span, FOREVER if span.first_ns is None else span.first_ns - self.log_begin_ns) for span in needed
+        needed_spans = self.needs.choose_first(tuple(self._spans.values())) if self._may_trim_start else []
+        span_delays = [
+            (span, FOREVER if span.first_ns is None else span.first_ns - self.log_begin_ns)
+            for span in needed_spans
         ]
-        self.late = tuple(span.topic for span, delay in delays if delay > self._limit_ns(span))
-        in_time = [span for span, delay in delays if delay <= self._limit_ns(span)]
+        self.late = tuple(span.topic for span, delay_ns in span_delays if delay_ns > self._limit_ns(span))
+        timely_spans = [span for span, delay_ns in span_delays if delay_ns <= self._limit_ns(span)]
         # the latest topic decides
-        self.begin_ns = max((span.first_ns or 0 for span in in_time), default=self.log_begin_ns)
-        latest_span = max(in_time, key=lambda span: span.first_ns or 0, default=None)
+        self.begin_ns = max((span.first_ns or 0 for span in timely_spans), default=self.log_begin_ns)
+        latest_span = max(timely_spans, key=lambda span: span.first_ns or 0, default=None)
         if latest_span is not None and self.begin_ns > self.log_begin_ns:
             self._remark_begin(latest_span, self.begin_ns)
 
     def _remark_begin(self, span: TopicSpan, begin_ns: int) -> None:
         times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
-        left_out = times_ns[times_ns < begin_ns]
+        omitted_ns = times_ns[times_ns < begin_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} before"]
         # else the topic had messages, but no transform
-        if span.begun_ns is not None and span.begun_ns > int(left_out[-1]):
+        if span.begun_ns is not None and span.begun_ns > int(omitted_ns[-1]):
             reason = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
-        self._remark("beginning", left_out, reason)
+        self._remark("beginning", omitted_ns, reason)
 
     def _remark_late(self, span: TopicSpan) -> None:
         """Add a remark that the objects of a late topic are absent until it begins."""
         if span.pattern is None or span.begun_ns is None or span.begun_ns <= self.log_begin_ns:
             return
-        limit = format_duration(self._limit_ns(span))
-        reason = f", more than {limit} after the first sample: its objects are absent before,"
-        begun = Instant(span.begun_ns, 0)
+        limit_text = format_duration(self._limit_ns(span))
+        reason = f", more than {limit_text} after the first sample: its objects are absent before,"
+        begin_time = Instant(span.begun_ns, 0)
         self.remarks = (
             *self.remarks,
-            Sentence(f"{span.topic} begins at ", begun, reason, " also from groups"),
+            Sentence(f"{span.topic} begins at ", begin_time, reason, " also from groups"),
         )
 
     def _remark_end(self) -> None:
-        span = min(self._open_spans(), key=lambda span: self._since_ns[span.topic] or FOREVER)
+        span = min(self._open_spans(), key=lambda span: self._ended_ns[span.topic] or FOREVER)
         times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
-        left_out = times_ns[times_ns >= self.end_ns]
+        omitted_ns = times_ns[times_ns >= self.end_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} then"]
         if span.heard_ns is not None and self.end_ns - span.heard_ns > span.limit_ns:
             reason = [f"{span.topic} ends at ", Instant(span.heard_ns, 0)]
-        self._remark("end", left_out, reason)
+        self._remark("end", omitted_ns, reason)
 
-    def _remark(self, which: str, left_out: Integers, reason: Iterable[str | Instant]) -> None:
-        first, last = (Instant(int(at), 0) for at in left_out[[0, -1]])
-        count = plural(len(left_out), "sample")
-        verb = "is" if len(left_out) == 1 else "are"
-        times = ("at ", first) if len(left_out) == 1 else ("from ", first, " to ", last)
-        sentence = Sentence(f"{count} at the {which} {verb} left out, ", *times, ": ", *reason)
+    def _remark(self, place: str, omitted_ns: Integers, reason: Iterable[str | Instant]) -> None:
+        first_time, last_time = (Instant(int(time_ns), 0) for time_ns in omitted_ns[[0, -1]])
+        count_text = plural(len(omitted_ns), "sample")
+        verb = "is" if len(omitted_ns) == 1 else "are"
+        time_parts = ("at ", first_time) if len(omitted_ns) == 1 else ("from ", first_time, " to ", last_time)
+        sentence = Sentence(f"{count_text} at the {place} {verb} left out, ", *time_parts, ": ", *reason)
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:
         """Yield needed spans that ended before the newest sample, by no more than their limits."""
-        if not self._end:
+        if not self._may_trim_end:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
-            since_ns = self._since_ns[span.topic]
+            since_ns = self._ended_ns[span.topic]
             # released samples are evaluated, so they cannot be left out any more
-            before_ns = max(self._released_ns, -1 if self._is_rest else self.begin_ns or 0)
-            if since_ns is not None and since_ns > before_ns and self._log_end_ns - since_ns <= span.limit_ns:
+            earliest_ns = max(self._released_ns, -1 if self._is_rest else self.begin_ns or 0)
+            if (
+                since_ns is not None
+                and since_ns > earliest_ns
+                and self._log_end_ns - since_ns <= span.limit_ns
+            ):
                 yield span
 
     def _open_since_ns(self) -> int:
         """Return the time from which a needed topic may have ended, the earliest of them; else FOREVER."""
-        return min((self._since_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
+        return min((self._ended_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
 
     def _release(self, before_ns: int) -> list[Trace]:
         """Remove and return the pending traces that end before a time."""
-        count = 0
+        ready_count = 0
         for trace in self._pending_traces:
             # traces are released whole, because callers expect one trace for each added trace
             if len(trace) and int(trace.times_ns[-1]) >= before_ns:
                 break
             if len(trace):
                 self._released_ns = int(trace.times_ns[-1])
-            count += 1
-        released, self._pending_traces = self._pending_traces[:count], self._pending_traces[count:]
-        return [self.trim(trace) for trace in released]
+            ready_count += 1
+        ready_traces, self._pending_traces = (
+            self._pending_traces[:ready_count],
+            self._pending_traces[ready_count:],
+        )
+        return [self.trim(trace) for trace in ready_traces]
 
     def trim(self, trace: Trace) -> Trace:
         """Return the samples of a trace from `begin_ns` to before `end_ns`."""
-        counting = within(trace, self.begin_ns, self.end_ns)
-        return replace(counting, spans=()) if counting.spans else counting
+        trimmed_trace = within(trace, self.begin_ns, self.end_ns)
+        return replace(trimmed_trace, spans=()) if trimmed_trace.spans else trimmed_trace
 
 
 def trim_trace(
@@ -289,6 +302,6 @@ def trim_trace(
     if not trace.spans:
         return trace, ()
     ends = RunEnds(needs, start=start, end=end, is_rest=is_rest)
-    (counting,) = [*ends.add(trace), *ends.finish()]
+    (trimmed_trace,) = [*ends.add(trace), *ends.finish()]
     # an untrimmed trace stays the same object, so its cache of measurements stays in use
-    return (counting, ends.remarks) if ends.remarks else (trace, ())
+    return (trimmed_trace, ends.remarks) if ends.remarks else (trace, ())

@@ -29,16 +29,16 @@ class _Comparison:
     Attributes:
         first_ns: time of the first such sample.
         holds: whether the comparison holds in that sample.
-        count: number of such samples.
-        compared: number of samples that were compared.
+        decided_count: number of these samples.
+        compared_count: number of samples that were compared.
     """
 
     atom: Atom
     bound: tuple[Quantified, ...]
     first_ns: int = 0
     holds: bool = False
-    count: int = 0
-    compared: int = 0
+    decided_count: int = 0
+    compared_count: int = 0
 
 
 class HeightComparisons:
@@ -66,32 +66,35 @@ class HeightComparisons:
             if not len(samples):
                 continue
             # evenly spread: a block may hold thousands of such samples
-            trace_then = trace.take(samples[:: 1 + len(samples) // _MOST_SAMPLES]).compact()
+            compared_trace = trace.take(samples[:: 1 + len(samples) // _MOST_SAMPLES]).compact()
             scenes = (
-                TraceScene(trace_then, specification.regions),
-                TraceScene(_without_heights(trace_then), _flat(specification)),
+                TraceScene(compared_trace, specification.regions),
+                TraceScene(_without_heights(compared_trace), _flat(specification)),
             )
             for comparison in comparisons:
                 formula = over_bindings("forall", comparison.bound, comparison.atom)
                 # channel 0 is the low end, so a comparison with unknown values counts as false
-                in_space, from_above = (leaf_values(scene, [formula], {})[0, 0] >= 0 for scene in scenes)
-                differing = np.flatnonzero(in_space != from_above)
-                comparison.compared += len(in_space)
-                if len(differing) and not comparison.count:
-                    comparison.first_ns = int(trace_then.times_ns[differing[0]])
-                    comparison.holds = bool(in_space[differing[0]])
-                comparison.count += len(differing)
+                holds_in_space, holds_from_above = (
+                    leaf_values(scene, [formula], {})[0, 0] >= 0 for scene in scenes
+                )
+                differing_samples = np.flatnonzero(holds_in_space != holds_from_above)
+                comparison.compared_count += len(holds_in_space)
+                if len(differing_samples) and not comparison.decided_count:
+                    comparison.first_ns = int(compared_trace.times_ns[differing_samples[0]])
+                    comparison.holds = bool(holds_in_space[differing_samples[0]])
+                comparison.decided_count += len(differing_samples)
 
     def remarks(self) -> Iterator[Sentence]:
         """Yield a sentence on each comparison that heights decide."""
         for comparison in (comparison for _, comparisons in self._comparisons for comparison in comparisons):
-            if comparison.count:
-                holds, not_so = ("holds", "does not") if comparison.holds else ("fails", "holds")
-                share = f"in {comparison.count:,} of {plural(comparison.compared, 'sample')} looked at"
+            if comparison.decided_count:
+                holds, opposite = ("holds", "does not") if comparison.holds else ("fails", "holds")
+                samples_text = plural(comparison.compared_count, "sample")
+                share_text = f"in {comparison.decided_count:,} of {samples_text} looked at"
                 yield Sentence(
                     f"`{comparison.atom.text}` {holds} at ",
                     Instant(comparison.first_ns, 0),
-                    f" because of heights: seen from above it {not_so} ({share})",
+                    f" because of heights: seen from above it {opposite} ({share_text})",
                 )
 
 
@@ -114,17 +117,19 @@ def _samples_with_one_above(trace: Trace, specification: Specification) -> Integ
     # absent objects read the appended infinities, which decide no extremum
     rows = np.where(trace.rows >= 0, trace.rows, len(batch.bottom))
     heights = [outline.height for outline in specification.regions.values() if outline.height is not None]
-    highest = np.append(np.where(np.isnan(batch.bottom), -np.inf, batch.bottom), -np.inf)[rows].max(axis=1)
-    lowest = np.append(np.where(np.isnan(batch.top), np.inf, batch.top), np.inf)[rows].min(axis=1)
-    highest = np.maximum(highest, max((bottom for bottom, _ in heights), default=-np.inf))
-    lowest = np.minimum(lowest, min((top for _, top in heights), default=np.inf))
+    highest_bottom = np.append(np.where(np.isnan(batch.bottom), -np.inf, batch.bottom), -np.inf)[rows].max(
+        axis=1
+    )
+    lowest_top = np.append(np.where(np.isnan(batch.top), np.inf, batch.top), np.inf)[rows].min(axis=1)
+    highest_bottom = np.maximum(highest_bottom, max((bottom for bottom, _ in heights), default=-np.inf))
+    lowest_top = np.minimum(lowest_top, min((top for _, top in heights), default=np.inf))
     # if the highest bottom is above the lowest top, an object is above another
-    return np.flatnonzero(highest > lowest)
+    return np.flatnonzero(highest_bottom > lowest_top)
 
 
 def _without_heights(trace: Trace) -> Trace:
-    none = np.full(len(trace.footprints.bottom), np.nan)
-    return replace(trace, footprints=replace(trace.footprints, bottom=none, top=none))
+    no_heights = np.full(len(trace.footprints.bottom), np.nan)
+    return replace(trace, footprints=replace(trace.footprints, bottom=no_heights, top=no_heights))
 
 
 def _flat(specification: Specification) -> dict[str, Outline]:

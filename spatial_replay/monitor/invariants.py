@@ -87,9 +87,9 @@ class _Runs(NamedTuple):
     ends: Integers
 
     @classmethod
-    def of(cls, is_inside: NDArray[np.bool_]) -> _Runs:
-        turns = np.flatnonzero(np.diff(is_inside, prepend=False, append=False))
-        return cls(turns[::2], turns[1::2])
+    def of(cls, is_in_run: NDArray[np.bool_]) -> _Runs:
+        boundaries = np.flatnonzero(np.diff(is_in_run, prepend=False, append=False))
+        return cls(boundaries[::2], boundaries[1::2])
 
 
 def find_violated_invariants(
@@ -115,9 +115,9 @@ def find_violated_invariants(
     evaluate = evaluate_prefix if goes_on else evaluate_offline
     nodes = evaluate(evidence.instance.formula, evidence.instance.program.leaves, leaves, times_ns)
     for invariant in invariants:
-        violated = _intervals_of(evidence, nodes, invariant, most)
-        if violated.intervals:
-            yield violated
+        violated_invariant = _intervals_of(evidence, nodes, invariant, most)
+        if violated_invariant.intervals:
+            yield violated_invariant
 
 
 class _Invariant(NamedTuple):
@@ -147,40 +147,42 @@ class _Invariant(NamedTuple):
             (formula,), node = operands_of(formula), node + 1
         if not isinstance(formula, Temporal) or formula.operator != ("G" if sign > 0 else "F"):
             return None
-        (body,), inner = operands_of(formula), node + 1
+        (body,), body_node = operands_of(formula), node + 1
         while operator_of(body) == "spec":
-            (body,), inner = operands_of(body), inner + 1
+            (body,), body_node = operands_of(body), body_node + 1
         # ids are in the order of the text: the first operand follows its node
-        condition = inner + 1 if sign > 0 and operator_of(body) == "->" else None
+        condition = body_node + 1 if sign > 0 and operator_of(body) == "->" else None
         return cls(conjunct, formula, node + 1, condition)
 
 
 def _intervals_of(
-    evidence: Evidence, nodes: OfflineNodes, invariant: _Invariant, most: int
+    evidence: Evidence, nodes: OfflineNodes, invariant: _Invariant, most_explained: int
 ) -> ViolatedInvariant:
-    begins, ends = windows_of(invariant.operator, nodes.times_ns, np.array([0]))
-    is_asked = np.zeros(len(nodes.times_ns), np.bool_)
-    is_asked[begins[0] : ends[0]] = True
-    low, high = nodes.judged_ends(invariant.operand)
+    window_starts, window_ends = windows_of(invariant.operator, nodes.times_ns, np.array([0]))
+    is_in_window = np.zeros(len(nodes.times_ns), np.bool_)
+    is_in_window[window_starts[0] : window_ends[0]] = True
+    low_ends, high_ends = nodes.judged_ends(invariant.operand)
     # `not F p` is `G not p`, so the robustness of p is negated
-    robustness = high if invariant.end is End.HIGH else -low
-    runs = _Runs.of(is_asked & (robustness < 0.0))
-    intervals, worst = [], []
-    for start, end in zip(runs.starts.tolist(), runs.ends.tolist(), strict=True):
-        worst.append(start + int(np.argmin(robustness[start:end])))
-        first_ns, last_ns, worst_ns = nodes.times_ns[[start, end - 1, worst[-1]]].tolist()
-        least = float(robustness[worst[-1]])
-        intervals.append(ViolatedInterval(first_ns, last_ns, end - start, worst_ns, least))
-    intervals[:most] = _with_atoms(evidence, nodes, invariant, intervals[:most], worst[:most])
+    operand_robustness = high_ends if invariant.end is End.HIGH else -low_ends
+    violated_runs = _Runs.of(is_in_window & (operand_robustness < 0.0))
+    intervals, worst_samples = [], []
+    for start, end in zip(violated_runs.starts.tolist(), violated_runs.ends.tolist(), strict=True):
+        worst_samples.append(start + int(np.argmin(operand_robustness[start:end])))
+        first_ns, last_ns, worst_ns = nodes.times_ns[[start, end - 1, worst_samples[-1]]].tolist()
+        least_robustness = float(operand_robustness[worst_samples[-1]])
+        intervals.append(ViolatedInterval(first_ns, last_ns, end - start, worst_ns, least_robustness))
+    intervals[:most_explained] = _with_atoms(
+        evidence, nodes, invariant, intervals[:most_explained], worst_samples[:most_explained]
+    )
     conjunct = invariant.conjunct
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
-    condition_runs = _Runs.of(is_asked & (nodes.ends(invariant.condition)[0] >= 0.0))
+    condition_runs = _Runs.of(is_in_window & (nodes.ends(invariant.condition)[0] >= 0.0))
     # the number of starts up to a violation identifies the interval of the condition
-    missed = np.unique(np.searchsorted(condition_runs.starts, runs.starts, side="right"))
-    condition = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
-    entries = len(condition_runs.starts), len(missed)
-    return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals), condition, entries)
+    missed_entries = np.unique(np.searchsorted(condition_runs.starts, violated_runs.starts, side="right"))
+    condition_text = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
+    entry_counts = len(condition_runs.starts), len(missed_entries)
+    return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals), condition_text, entry_counts)
 
 
 def _with_atoms(
@@ -188,15 +190,17 @@ def _with_atoms(
     nodes: OfflineNodes,
     invariant: _Invariant,
     intervals: Sequence[ViolatedInterval],
-    worst: Sequence[int],
+    worst_samples: Sequence[int],
 ) -> Iterator[ViolatedInterval]:
     """Yield the intervals, each with the atom that decides its worst sample."""
     bindings, condition = evidence.instance.bindings, invariant.condition
-    paths = [deciding_path(nodes, invariant.operand, invariant.end, sample=sample) for sample in worst]
+    paths = [
+        deciding_path(nodes, invariant.operand, invariant.end, sample=sample) for sample in worst_samples
+    ]
     response_paths = [missed_response(path, nodes, bindings)[1] for path in paths]
     condition_paths = [
         path if condition is None else deciding_path(nodes, condition, End.LOW, sample=sample)
-        for path, sample in zip(paths, worst, strict=True)
+        for path, sample in zip(paths, worst_samples, strict=True)
     ]
     deciding_samples = [
         path.steps[-1].sample for path in (*paths, *response_paths, *condition_paths) if path is not None
@@ -204,21 +208,23 @@ def _with_atoms(
     # one pass over the log for all samples
     scene_at = evidence.scenes(set(nodes.times_ns[deciding_samples].tolist())).__getitem__
     for interval, path, condition_path in zip(intervals, paths, condition_paths, strict=True):
-        deciding = atom_of_path(evidence, nodes, path, scene_at)
+        deciding_atom = atom_of_path(evidence, nodes, path, scene_at)
         deciding_ns = int(nodes.times_ns[path.steps[-1].sample])
-        closest = find_missed_response(evidence, nodes, path, scene_at).closest
-        if closest is not None:
-            deciding, deciding_ns = closest
-        if deciding is None:
+        closest_atom = find_missed_response(evidence, nodes, path, scene_at).closest
+        if closest_atom is not None:
+            deciding_atom, deciding_ns = closest_atom
+        if deciding_atom is None:
             yield interval
             continue
-        place = _place_of(deciding) or _place_of(atom_of_path(evidence, nodes, condition_path, scene_at))
-        yield replace(interval, deciding=deciding, deciding_ns=deciding_ns, place=place)
+        place = _place_of(deciding_atom) or _place_of(atom_of_path(evidence, nodes, condition_path, scene_at))
+        yield replace(interval, deciding=deciding_atom, deciding_ns=deciding_ns, place=place)
 
 
 def _place_of(deciding: DecidingAtom | None) -> Point | None:
-    measured = () if deciding is None else deciding.measured
-    return next((number.contact.first for number in measured if number.contact is not None), None)
+    measurements = () if deciding is None else deciding.measured
+    return next(
+        (measurement.contact.first for measurement in measurements if measurement.contact is not None), None
+    )
 
 
 def invariant_sentences(
@@ -231,18 +237,18 @@ def invariant_sentences(
         units: declared units of the log.
     """
     intervals = invariant.intervals
-    entries, missed = invariant.entries
-    if len(intervals) == 1 and entries < 2:
+    entry_count, missed_count = invariant.entries
+    if len(intervals) == 1 and entry_count < 2:
         (interval,) = intervals
         if interval.samples > 1:
             yield Sentence("It is violated ", *_span(interval, first_ns), ".")
         return
-    often = plural(len(intervals), "interval")
+    count_text = plural(len(intervals), "interval")
     if invariant.condition is not None:
-        entries_text = f"{missed:,} of {entries:,} entries of `{invariant.condition}`"
-        often = entries_text if missed == len(intervals) else f"{often}, in {entries_text}"
+        entries_text = f"{missed_count:,} of {entry_count:,} entries of `{invariant.condition}`"
+        count_text = entries_text if missed_count == len(intervals) else f"{count_text}, in {entries_text}"
     list_note = f"; the first {LISTED} are" if len(intervals) > LISTED else ""
-    yield Sentence(f"It is violated in {often}{list_note}:")
+    yield Sentence(f"It is violated in {count_text}{list_note}:")
     for interval in intervals[:LISTED]:
         yield _interval_sentence(interval, first_ns, units)
 
@@ -253,15 +259,15 @@ def _span(interval: ViolatedInterval, first_ns: int) -> tuple[str | Instant, ...
 
 
 def _interval_sentence(interval: ViolatedInterval, first_ns: int, units: Mapping[str, str]) -> Sentence:
-    (word, *span), deciding = _span(interval, first_ns), interval.deciding
-    parts: list[str | Instant] = [str(word).capitalize(), *span]
+    (first_word, *span_parts), deciding_atom = _span(interval, first_ns), interval.deciding
+    sentence_parts: list[str | Instant] = [str(first_word).capitalize(), *span_parts]
     if interval.samples > 1:
-        parts += [", worst at ", Instant(interval.worst_ns, first_ns)]
+        sentence_parts += [", worst at ", Instant(interval.worst_ns, first_ns)]
     if interval.place is not None:
-        parts.append(f", near ({', '.join(map(number_text, interval.place))})")
-    if deciding is not None:
-        clause = " and ".join(deciding.unknown) or measurement_clause(deciding, units, first_ns)
-        parts += [": ", clause]
+        sentence_parts.append(f", near ({', '.join(map(number_text, interval.place))})")
+    if deciding_atom is not None:
+        clause = " and ".join(deciding_atom.unknown) or measurement_clause(deciding_atom, units, first_ns)
+        sentence_parts += [": ", clause]
         if interval.deciding_ns not in (None, interval.worst_ns):
-            parts += [" at ", Instant(interval.deciding_ns, first_ns)]
-    return Sentence(*parts, ".")
+            sentence_parts += [" at ", Instant(interval.deciding_ns, first_ns)]
+    return Sentence(*sentence_parts, ".")

@@ -84,11 +84,11 @@ class ThresholdRange:
     @property
     def objects(self) -> str | None:
         """Its variables and their groups, as in `d in drinks`; None without variables."""
-        over = [
+        binding_texts = [
             f"{', '.join(quantifier.variables)} in {format_term(quantifier.group).strip('()')}"
             for quantifier in self.bound
         ]
-        return ", ".join(over) or None
+        return ", ".join(binding_texts) or None
 
     @property
     def text(self) -> str:
@@ -105,21 +105,25 @@ class ThresholdRange:
 
     def __str__(self) -> str:
         is_number = self.least <= self.greatest
-        parts = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
-        unknown = self.samples - self.known - self.empty
-        for count, words in ((unknown, "is unknown"), (self.empty, self._words_of_empty)):
-            share = f"{count:,} of {plural(self.samples, 'sample')}"
-            parts += [f"{words} in {'every sample' if count == self.samples else share}"] if count else []
+        clauses = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
+        unknown_count = self.samples - self.known - self.empty
+        for count, predicate in ((unknown_count, "is unknown"), (self.empty, self._words_of_empty)):
+            share_text = f"{count:,} of {plural(self.samples, 'sample')}"
+            clauses += (
+                [f"{predicate} in {'every sample' if count == self.samples else share_text}"] if count else []
+            )
         if not self.known:
-            return f"{self.text}: {', '.join(parts)}"
-        samples = plural(self.known, "sample")
+            return f"{self.text}: {', '.join(clauses)}"
+        known_text = plural(self.known, "sample")
         if self.holds != "sometimes":
-            parts.append(f"{self.holds} holds{' in the others' if unknown or self.empty else ''}")
+            clauses.append(f"{self.holds} holds{' in the others' if unknown_count or self.empty else ''}")
         elif self.bound:
-            parts.append(f"holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}")
+            clauses.append(
+                f"holds for all in {self.holding:,} and for none in {self.failing:,} of {known_text}"
+            )
         else:
-            parts.append(f"holds in {self.holding:,} of {samples}")
-        return f"{self.text}: {', '.join(parts)}"
+            clauses.append(f"holds in {self.holding:,} of {known_text}")
+        return f"{self.text}: {', '.join(clauses)}"
 
 
 class LogNumbers:
@@ -142,9 +146,9 @@ class LogNumbers:
         self.times_ns = (0, 0)
         self._regions = specification.regions
         self._reach = look_back([spec.formula for spec in specification.results])
-        self._past: Trace | None = None
+        self._recent_trace: Trace | None = None
         self.missing: dict[NamedPart, tuple[int, int]] = {}
-        self._parts = list(
+        self._named_parts = list(
             dict.fromkeys(part for spec in specification.results for part in named_parts(spec.formula))
         )
         self._ranges = {
@@ -162,9 +166,9 @@ class LogNumbers:
         if len(vertices):
             # an upper bound: the radius of one part enlarges its own vertices only
             margin = float(trace.footprints.radius.max(initial=0.0))
-            (left, low), (right, high) = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
-            lower = (min(self.box[0], left - margin), min(self.box[1], low - margin))
-            self.box = (*lower, max(self.box[2], right + margin), max(self.box[3], high + margin))
+            (left, bottom), (right, top) = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
+            lower_corner = (min(self.box[0], left - margin), min(self.box[1], bottom - margin))
+            self.box = (*lower_corner, max(self.box[2], right + margin), max(self.box[3], top + margin))
         self.times_ns = (
             self.times_ns[0] if self.samples else int(trace.times_ns[0]),
             int(trace.times_ns[-1]),
@@ -172,17 +176,19 @@ class LogNumbers:
         self.samples += len(trace)
         self.classes.update(trace.classes[code] or "" for code in np.unique(trace.class_code).tolist())
         self._pauses.add(trace.times_ns)
-        for part in self._parts:
-            lacking = np.flatnonzero(is_missing(trace, part))
-            if len(lacking):
-                count, first_ns = self.missing.get(part, (0, int(trace.times_ns[lacking[0]])))
-                self.missing[part] = count + len(lacking), first_ns
+        for part in self._named_parts:
+            missing_samples = np.flatnonzero(is_missing(trace, part))
+            if len(missing_samples):
+                missing_count, first_ns = self.missing.get(part, (0, int(trace.times_ns[missing_samples[0]])))
+                self.missing[part] = missing_count + len(missing_samples), first_ns
         self._add_ranges(trace)
 
     def _add_ranges(self, trace: Trace) -> None:
-        earlier_samples = None if self._past is None or not self._reach else tail(self._past, self._reach)
+        earlier_samples = (
+            None if self._recent_trace is None or not self._reach else tail(self._recent_trace, self._reach)
+        )
         extended_trace = trace if earlier_samples is None else Trace.concatenate([earlier_samples, trace])
-        self._past = extended_trace
+        self._recent_trace = extended_trace
         scene = TraceScene(extended_trace, self._regions, len(extended_trace) - len(trace))
         for key, threshold_range in self._ranges.items():
             # the number of this atom is the quantity itself
@@ -198,21 +204,21 @@ class LogNumbers:
             )
             # low and high ends differ where a value is unknown, and are infinite where there is no object
             is_text = isinstance(threshold_range.atom.parameters[-1], str)
-            is_sure = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
+            is_known = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
             for ends in (all_hold, any_holds) if is_text else (least, greatest):
                 # a single channel means equal ends
-                is_sure &= ends[0] == ends[min(1, len(ends) - 1)]
+                is_known &= ends[0] == ends[min(1, len(ends) - 1)]
             # over no object, `forall` is +inf and `exists` is -inf
             is_empty = (all_hold == np.inf).all(axis=0) & (any_holds == -np.inf).all(axis=0)
-            is_sure &= ~is_empty
-            has_number = is_sure & (not is_text)
+            is_known &= ~is_empty
+            has_number = is_known & (not is_text)
             self._ranges[key] = replace(
                 threshold_range,
                 least=min(threshold_range.least, float(least[0, has_number].min(initial=inf))),
                 greatest=max(threshold_range.greatest, float(greatest[0, has_number].max(initial=-inf))),
-                known=threshold_range.known + int(is_sure.sum()),
-                holding=threshold_range.holding + int((all_hold[0, is_sure] >= 0.0).sum()),
-                failing=threshold_range.failing + int((any_holds[0, is_sure] < 0.0).sum()),
+                known=threshold_range.known + int(is_known.sum()),
+                holding=threshold_range.holding + int((all_hold[0, is_known] >= 0.0).sum()),
+                failing=threshold_range.failing + int((any_holds[0, is_known] < 0.0).sum()),
                 empty=threshold_range.empty + int(is_empty.sum()),
             )
 
@@ -253,9 +259,9 @@ def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
     for node, _ in bound_nodes(specification):
         bound = node.bound if isinstance(node, Temporal) else None
         if bound is not None and bound.unit == "samples":
-            upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
-            name = f"{node.operator if isinstance(node, Temporal) else ''}{format_bound(bound)}"
-            lines[f"{name} is {bound.lower / log.rate:.3g} s to {upper}"] = None
+            upper_text = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
+            window_text = f"{node.operator if isinstance(node, Temporal) else ''}{format_bound(bound)}"
+            lines[f"{window_text} is {bound.lower / log.rate:.3g} s to {upper_text}"] = None
     for spec in specification.results:
         reach_s, windows = _reach(spec.formula, log.rate)
         if len(windows) > 1 and any(bound.unit == "samples" for _, bound in windows):
@@ -268,16 +274,16 @@ _Windows: TypeAlias = tuple[tuple[Temporal, Bound], ...]
 
 def _reach(formula: Formula, rate: float) -> tuple[float, _Windows]:
     """Return the look-ahead of a formula in seconds, with the nested windows that add up to it."""
-    farthest = max(
+    farthest_reach = max(
         (_reach(operand, rate) for operand in operands_of(formula)), key=itemgetter(0), default=(0.0, ())
     )
     bound = formula.bound if isinstance(formula, Temporal) else None
     if not isinstance(formula, Temporal) or bound is None or formula.operator not in FUTURE_OPERATORS:
-        return farthest
+        return farthest_reach
     if bound.upper is None:
-        return farthest
-    own_s = bound.upper / rate if bound.unit == "samples" else bound.upper / 1e9
-    return own_s + farthest[0], ((formula, bound), *farthest[1])
+        return farthest_reach
+    window_s = bound.upper / rate if bound.unit == "samples" else bound.upper / 1e9
+    return window_s + farthest_reach[0], ((formula, bound), *farthest_reach[1])
 
 
 def _nesting_text(windows: _Windows) -> str:
@@ -295,38 +301,37 @@ def plausibility_warnings(
     source = SourceText.of(specification.source, specification.filename)
     warnings: dict[str, Diagnostic] = {}
     for name, outline in specification.regions.items():
-        apart = _distance(outline, log.box)
-        if 0.0 < log.extent < apart:
-            start = max(source.text.find(f"region {name}"), 0)
-            message = f"the region {name!r} is {apart:.4g} away from all that the log ever has"
+        gap = _distance(outline, log.box)
+        if 0.0 < log.extent < gap:
+            text_start = max(source.text.find(f"region {name}"), 0)
+            message = f"the region {name!r} is {gap:.4g} away from all that the log ever has"
             hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
-            span = Span(start, start + len(f"region {name}"))
+            span = Span(text_start, text_start + len(f"region {name}"))
             warnings[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
-    for part, (count, first_ns) in log.missing.items():
-        named = (atom for spec in specification.results for atom in iter_atoms(spec.formula))
-        span = next(atom.span for atom in named if part in named_parts(atom))
+    for part, (missing_count, first_ns) in log.missing.items():
+        atoms = (atom for spec in specification.results for atom in iter_atoms(spec.formula))
+        span = next(atom.span for atom in atoms if part in named_parts(atom))
         # a name that the log never has is reported by `check_names`
-        if count < log.samples:
-            at = time_text(first_ns, zero_ns)
-            message = (
-                f"{part.title} is missing in {count:,} of {plural(log.samples, 'sample')}, first at {at}"
-            )
+        if missing_count < log.samples:
+            first_time = time_text(first_ns, zero_ns)
+            share_text = f"{missing_count:,} of {plural(log.samples, 'sample')}"
+            message = f"{part.title} is missing in {share_text}, first at {first_time}"
             hint = "atoms about it are unknown there, and so may be a verdict"
             warnings[part.title] = source.diagnostic("warning", span, message, hint)
     for node, bound in bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
-        key = ""
+        warning_key = ""
         if isinstance(node, Atom):
             threshold_range = log.range_of(node, bound)
-            key, doubts = (
+            warning_key, doubts = (
                 threshold_range.text if threshold_range else node.text,
                 _doubts(node, log, threshold_range),
             )
         elif isinstance(node, Temporal) and node.bound is not None:
-            key = f"{node.operator}{format_bound(node.bound)}"
-            doubts = _doubts_of_window(key, node.bound, log)
+            warning_key = f"{node.operator}{format_bound(node.bound)}"
+            doubts = _doubts_of_window(warning_key, node.bound, log)
         for message, hint in doubts:
-            warnings.setdefault(key, source.diagnostic("warning", node.span, message, hint))
+            warnings.setdefault(warning_key, source.diagnostic("warning", node.span, message, hint))
     for node, _ in bound_nodes(specification):
         empty_class = _empty_class(node.group, log) if isinstance(node, Quantified) else None
         if empty_class is not None:
@@ -365,8 +370,13 @@ def _doubts(atom: Atom, log: LogNumbers, threshold_range: ThresholdRange | None)
         elif 0.0 < log.extent * _FAR < abs(length):
             message = f"{format_number(length)} is far more than anything in the log is apart"
             yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
-    is_there = all(log.missing.get(part, (0, 0))[0] < log.samples for part in named_parts(atom))
-    if threshold_range is not None and not threshold_range.known and atom.relation == "signal" and is_there:
+    is_ever_present = all(log.missing.get(part, (0, 0))[0] < log.samples for part in named_parts(atom))
+    if (
+        threshold_range is not None
+        and not threshold_range.known
+        and atom.relation == "signal"
+        and is_ever_present
+    ):
         hint = "put a text in quotes; `names` of a mapping give texts numbers, and numbers texts"
         yield f"`{threshold_range.text}` compares a text with a number, so it is unknown", hint
     if threshold_range is None or threshold_range.holds not in ("always", "never"):
@@ -376,19 +386,21 @@ def _doubts(atom: Atom, log: LogNumbers, threshold_range: ThresholdRange | None)
         and atom.relation == "signal"
         and (threshold_range.holds == "never") == ("==" in atom.parameters)
     ):
-        name, _, text = atom.parameters
+        name, _, compared_text = atom.parameters
         hint = "is it spelt so? with `names` in a mapping, a misspelt text is an error"
-        yield f"{name} is never {text} in this log", hint
+        yield f"{name} is never {compared_text} in this log", hint
     for limit in limits:
         if _is_far(limit, threshold_range, is_length=bool(lengths)):
             is_below = limit < threshold_range.least
-            end, side = (threshold_range.least, "below") if is_below else (threshold_range.greatest, "above")
+            range_end, side = (
+                (threshold_range.least, "below") if is_below else (threshold_range.greatest, "above")
+            )
             subject = (
                 "the distance is" if lengths else "its signal is" if atom.relation == "signal" else "it is"
             )
             message = (
                 f"`{threshold_range.text}` {threshold_range.holds} holds in this log:"
-                f" {subject} never {side} {end:.4g}"
+                f" {subject} never {side} {range_end:.4g}"
             )
             yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
 
@@ -414,29 +426,31 @@ def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -
 def _doubts_of_window(text: str, bound: Bound, log: LogNumbers) -> Iterator[tuple[str, str]]:
     if not log.samples:
         return
-    in_time = bound.unit != "samples"
-    length = log.times_ns[1] - log.times_ns[0] if in_time else log.samples - 1
-    length_text = f"{log.seconds:.3f} s" if in_time else plural(log.samples, "sample")
-    if bound.lower > length:
+    is_in_seconds = bound.unit != "samples"
+    log_length = log.times_ns[1] - log.times_ns[0] if is_in_seconds else log.samples - 1
+    length_text = f"{log.seconds:.3f} s" if is_in_seconds else plural(log.samples, "sample")
+    if bound.lower > log_length:
         yield f"no sample of this log lies in the window {text}", f"the log has {length_text}"
-    elif bound.upper is not None and bound.upper > length:
+    elif bound.upper is not None and bound.upper > log_length:
         yield f"the window {text} is longer than this log", f"the log has {length_text}, so its end decides"
 
 
 def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float:
     """Return the gap between the bounding boxes of an outline and of the log; 0 if they meet."""
     xs, ys = zip(*outline.vertices, strict=True)
-    apart_x = max(box[0] - max(xs), min(xs) - box[2], 0.0)
-    apart_y = max(box[1] - max(ys), min(ys) - box[3], 0.0)
-    return max(0.0, hypot(apart_x, apart_y) - outline.radius)
+    gap_x = max(box[0] - max(xs), min(xs) - box[2], 0.0)
+    gap_y = max(box[1] - max(ys), min(ys) - box[3], 0.0)
+    return max(0.0, hypot(gap_x, gap_y) - outline.radius)
 
 
 def _compared_quantity(atom: Atom) -> Expression | None:
     """Return the only signal or distance that an atom compares; None for other atoms."""
     if atom.relation == "sum":
         return None
-    parts = {part for part in iter_expressions(atom.expression) if isinstance(part, (Signal, Measurement))}
-    part = parts.pop() if len(parts) == 1 else None
+    quantities = {
+        part for part in iter_expressions(atom.expression) if isinstance(part, (Signal, Measurement))
+    }
+    part = quantities.pop() if len(quantities) == 1 else None
     has_limit = atom.relation == "signal" or any(
         isinstance(parameter, float) for parameter in atom.parameters
     )
@@ -479,15 +493,15 @@ def _binding(
             bound.insert(0, quantifier)
             variables = variables.difference(quantifier.variables) | _variables([quantifier.group])
     if parameter is not None and parameter in variables:
-        named = tuple(
+        named_objects = tuple(
             term for term in map(base_of, terms_of(atom.expression)) if isinstance(term, TrackedName)
         )
-        everything = Group("", class_name=ANY_CLASS, excluded=named)
-        bound.insert(0, Quantified("forall", (parameter,), everything, atom))
+        all_objects = Group("", class_name=ANY_CLASS, excluded=named_objects)
+        bound.insert(0, Quantified("forall", (parameter,), all_objects, atom))
     return tuple(bound)
 
 
 def _variables(terms: Iterable[Term]) -> frozenset[str]:
     bases = [base_of(term) for term in terms]
-    left_out = [term for base in bases if isinstance(base, Group) for term in base.excluded]
-    return frozenset(term.name for term in [*bases, *left_out] if isinstance(term, Variable))
+    excluded_terms = [term for base in bases if isinstance(base, Group) for term in base.excluded]
+    return frozenset(term.name for term in [*bases, *excluded_terms] if isinstance(term, Variable))

@@ -102,17 +102,17 @@ def conjuncts_of(formula: Formula, name: str, node: int = 0) -> tuple[Conjunct, 
         name: name of the whole formula.
         node: id of the whole formula.
     """
-    specs: dict[int, str] = {}
+    spec_by_node: dict[int, str] = {}
     conjuncts = []
-    for identifier, parent, part in iter_nodes(formula):
+    for part_id, parent, part in iter_nodes(formula):
         if parent is None:
-            specs[identifier] = name
-        elif parent in specs:
-            specs[identifier] = part.name or specs[parent]
+            spec_by_node[part_id] = name
+        elif parent in spec_by_node:
+            spec_by_node[part_id] = part.name or spec_by_node[parent]
         else:
             continue
         if operator_of(part) not in ("and", "spec"):
-            conjuncts.append(Conjunct(node + identifier, specs.pop(identifier), part))
+            conjuncts.append(Conjunct(node + part_id, spec_by_node.pop(part_id), part))
     return tuple(conjuncts)
 
 
@@ -137,16 +137,20 @@ def find_causes(
             witness of a lower robustness later.
         named: specs by name.
     """
-    failing = [conjunct for conjunct in conjuncts if _verdict(final, conjunct.node) is not Verdict.SATISFIED]
-    first: dict[str, Conjunct] = {}
-    for conjunct in sorted(failing, key=lambda conjunct: _order(conjunct.node, values, final, settled_ns)):
+    failing_conjuncts = [
+        conjunct for conjunct in conjuncts if _verdict(final, conjunct.node) is not Verdict.SATISFIED
+    ]
+    first_by_spec: dict[str, Conjunct] = {}
+    for conjunct in sorted(
+        failing_conjuncts, key=lambda conjunct: _order(conjunct.node, values, final, settled_ns)
+    ):
         # the first conjunct of each spec, in this order, is its cause
-        first.setdefault(conjunct.spec, conjunct)
+        first_by_spec.setdefault(conjunct.spec, conjunct)
     causes = []
-    for conjunct in first.values():
+    for conjunct in first_by_spec.values():
         settled_at_ns = settled_time(settled_ns, conjunct.node)
         spec = named.get(conjunct.spec)
-        witness, least = witnesses(conjunct.node, settled_at_ns)
+        witness, least_witness = witnesses(conjunct.node, settled_at_ns)
         causes.append(
             Cause(
                 conjunct.spec,
@@ -158,7 +162,7 @@ def find_causes(
                 witness,
                 None if spec is None else spec.id,
                 None if spec is None else spec.title,
-                least,
+                least_witness,
             )
         )
     return tuple(causes)
@@ -183,8 +187,8 @@ def find_least(
 
 def settled_time(settled_ns: Integers, node: int) -> int | None:
     """Return the time at which the violation of a node became certain, or None."""
-    at = int(settled_ns[node, 1])
-    return None if at == NEVER else at
+    time_ns = int(settled_ns[node, 1])
+    return None if time_ns == NEVER else time_ns
 
 
 def _verdict(final: Floats, node: int) -> Verdict:
@@ -200,8 +204,8 @@ def _number(node: int, values: Floats, final: Floats) -> float:
 def _order(node: int, values: Floats, final: Floats, settled_ns: Integers) -> tuple[int, float, int]:
     if _verdict(final, node) is not Verdict.VIOLATED:
         return 2, 0.0, node
-    at = settled_time(settled_ns, node)
-    return (1, _number(node, values, final), node) if at is None else (0, at, node)
+    settled_at_ns = settled_time(settled_ns, node)
+    return (1, _number(node, values, final), node) if settled_at_ns is None else (0, settled_at_ns, node)
 
 
 _ENDED = ", for the log has ended"
@@ -291,16 +295,16 @@ def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -
         return sentences_of(
             cause.witness, first_ns=first_ns, requirement=requirement, has_ended=has_ended, least=cause.least
         )
-    instance = f" for {object}" if object is not None else ""
-    instance += f" ({requirement})" if requirement else ""
+    instance_text = f" for {object}" if object is not None else ""
+    instance_text += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:
         return (
             _permanence_sentence(
-                f"`{cause.spec}`{instance}", cause.verdict, Instant(cause.settled_ns, first_ns)
+                f"`{cause.spec}`{instance_text}", cause.verdict, Instant(cause.settled_ns, first_ns)
             ),
         )
-    robustness = number_text(cause.robustness)
-    return (Sentence(f"`{cause.spec}`{instance} is {cause.verdict}: robustness {robustness}."),)
+    robustness_text = number_text(cause.robustness)
+    return (Sentence(f"`{cause.spec}`{instance_text} is {cause.verdict}: robustness {robustness_text}."),)
 
 
 def verdict_sentence(
@@ -352,9 +356,9 @@ def verdict_text(
     Args:
         numbers: robustness, lower end and upper end of its interval.
     """
-    doubtful = ", doubtful" if is_doubtful else ""
-    number = interval_text(*numbers, unit)
-    return f"{verdict}{_TESTED.get(tested, '')}{doubtful}, robustness {number}"
+    doubtful_text = ", doubtful" if is_doubtful else ""
+    robustness_text = interval_text(*numbers, unit)
+    return f"{verdict}{_TESTED.get(tested, '')}{doubtful_text}, robustness {robustness_text}"
 
 
 def divisor_of(atom: Formula) -> float:
@@ -386,11 +390,11 @@ def how_text(
         is_violated: whether the atom decides a violation; an atom that holds then "must not hold".
     """
     outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
-    unwanted = "must not hold, and " if is_violated and number >= 0.0 else ""
+    unwanted_text = "must not hold, and " if is_violated and number >= 0.0 else ""
     if not without_residue(number, atom):
-        return f"{unwanted}{outcome} by rounding" if number else f"{unwanted}just {outcome}"
+        return f"{unwanted_text}{outcome} by rounding" if number else f"{unwanted_text}just {outcome}"
     amount = f" by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else ""
-    return f"{unwanted}{outcome}{amount}"
+    return f"{unwanted_text}{outcome}{amount}"
 
 
 def uncertain_text(least: str) -> str:
@@ -410,8 +414,8 @@ def without_residue(number: float, atom: Formula) -> float:
 def _robustness(lower: float, upper: float, unit: str) -> str:
     if math.isnan(lower):
         return "robustness not determined"
-    low, high = with_unit(lower, unit), with_unit(upper, unit)
-    return f"robustness {low}" if lower == upper else f"robustness between {low} and {high}"
+    low_text, high_text = with_unit(lower, unit), with_unit(upper, unit)
+    return f"robustness {low_text}" if lower == upper else f"robustness between {low_text} and {high_text}"
 
 
 def _permanence_sentence(title: str, verdict: Verdict, since: Instant) -> Sentence:
@@ -421,16 +425,18 @@ def _permanence_sentence(title: str, verdict: Verdict, since: Instant) -> Senten
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
     """Return the reason of a verdict: the deciding atom or, for an unknown verdict, the unknown values."""
     deciding = witness.deciding
-    missed = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
+    response_sentences = () if witness.missed is None else missed_sentences(witness, witness.missed, first_ns)
     if deciding is None or deciding.unknown or witness.verdict is Verdict.UNKNOWN:
-        return _join(*missed, sentences_of(witness, first_ns=first_ns)[1 + len(missed)])
+        return _join(
+            *response_sentences, sentences_of(witness, first_ns=first_ns)[1 + len(response_sentences)]
+        )
     if witness.missed is not None and witness.missed.is_condition:
         # the margin of a condition that held does not explain the violation
-        return _join(*missed)
+        return _join(*response_sentences)
     outcome = _how_it_decides(witness, deciding, first_ns)
     if witness.missed is not None and witness.missed.response == deciding.text:
         return Sentence(_missed_clause(witness.missed, first_ns), ": it ", outcome)
-    return _join(*missed, Sentence(f"`{deciding.text}` ", outcome))
+    return _join(*response_sentences, Sentence(f"`{deciding.text}` ", outcome))
 
 
 def _join(first: Sentence, *others: Sentence) -> Sentence:
@@ -461,22 +467,24 @@ def _first_failure(settled: Witness, first_ns: int) -> Sentence:
 def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) -> tuple[Sentence, ...]:
     """Return sentences on a missed response: the response, its closest atom, and the condition's atom."""
     clause = _missed_clause(missed, first_ns)
-    deciding, closest = witness.deciding, []
+    deciding, closest_sentences = witness.deciding, []
     if witness.closest is not None:
-        best, best_ns = witness.closest
-        measurement = measurement_clause(best, witness.units, first_ns)
+        closest_atom, closest_ns = witness.closest
+        measurement = measurement_clause(closest_atom, witness.units, first_ns)
         # the response itself is the closest atom: one sentence suffices
-        if (best.text, best_ns) == (missed.response, missed.time_ns):
+        if (closest_atom.text, closest_ns) == (missed.response, missed.time_ns):
             clause = Sentence(clause, ": ", measurement)
         else:
-            instant = Instant(best_ns, first_ns)
-            closest = [Sentence(f"`{best.text}` came closest at ", instant, ": ", measurement, ".")]
-    sentences = [Sentence(clause, "."), *closest]
+            instant = Instant(closest_ns, first_ns)
+            closest_sentences = [
+                Sentence(f"`{closest_atom.text}` came closest at ", instant, ": ", measurement, ".")
+            ]
+    sentences = [Sentence(clause, "."), *closest_sentences]
     if missed.is_condition and deciding is not None and not deciding.unknown:
         measurement = measurement_clause(deciding, witness.units, first_ns)
         # an operator such as `Y` measures in another sample
-        own_time = () if witness.time_ns == missed.time_ns else (" at ", Instant(witness.time_ns, first_ns))
-        sentences.append(Sentence("The condition held: ", measurement, *own_time, "."))
+        time_parts = () if witness.time_ns == missed.time_ns else (" at ", Instant(witness.time_ns, first_ns))
+        sentences.append(Sentence("The condition held: ", measurement, *time_parts, "."))
     return tuple(sentences)
 
 
@@ -489,14 +497,14 @@ def _missed_clause(missed: MissedResponse, first_ns: int) -> Sentence:
 def _how_it_decides(
     witness: Witness, deciding: DecidingAtom, first_ns: int, *, is_open: bool = False
 ) -> Sentence:
-    amount, least = deciding.value, _end(deciding)
+    amount, deciding_end = deciding.value, _end(deciding)
     # with uncertainty, the deciding end may have another sign than the value
-    if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
-        amount = least
+    if math.isnan(amount) or (amount >= 0.0) != (deciding_end >= 0.0):
+        amount = deciding_end
     is_violated = witness.verdict is Verdict.VIOLATED and not is_open
     outcome = how_text(amount, deciding.atom, witness.units, is_violated=is_violated)
-    if abs(least) < abs(amount) and without_residue(amount, deciding.atom):
-        outcome += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
+    if abs(deciding_end) < abs(amount) and without_residue(amount, deciding.atom):
+        outcome += uncertain_text(amount_text(abs(deciding_end), deciding.atom, witness.units))
     window_text = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         window_text = _in_time_of_all(witness, deciding, "so far " if is_open else "")
@@ -509,8 +517,8 @@ def _how_it_decides(
 def measurement_clause(deciding: DecidingAtom, units: Mapping[str, str], first_ns: int) -> Sentence:
     """Return a clause on the measurements of an atom, without a full stop."""
     if any(is_text_number(number.value) for number in deciding.measured):
-        signal, sign, text = deciding.atom.parameters
-        is_equal = (deciding.value > 0.0) == (sign == "==")
+        signal, comparison, text = deciding.atom.parameters
+        is_equal = (deciding.value > 0.0) == (comparison == "==")
         return Sentence(f"{signal} is {text if is_equal else 'another text'}")
     clauses: list[str | Instant] = []
     for measured in deciding.measured:
@@ -524,15 +532,17 @@ def _change(measured: Measured, units: Mapping[str, str], first_ns: int) -> Sent
     """Return a clause on a change between two reports, with its amount and rate."""
     before_ns, now_ns = measured.reports_ns or (0, 0)
     names, signal_name = measured.names, measured.names[0] if measured.quantity == "rate" else ""
-    change = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(signal_name, ""))
-    rate = with_unit(abs(measured.value), per_second(units.get(signal_name, "")) or "a second")
+    change_text = with_unit(abs(measured.value) * (now_ns - before_ns) / 1e9, units.get(signal_name, ""))
+    rate_text = with_unit(abs(measured.value), per_second(units.get(signal_name, "")) or "a second")
     motion = f"{names[0]} moved"
     if signal_name:
         motion = f"{signal_name} {'rose' if measured.value > 0.0 else 'fell'}"
     elif len(names) == 2:
         motion = f"{names[0]} and {names[1]} {'approached' if measured.value > 0.0 else 'parted'}"
-    times = Instant(before_ns, first_ns), " to ", Instant(now_ns, first_ns)
-    return Sentence(f"{motion} by {change} from ", *times, f", {'by' if signal_name else 'at'} {rate}")
+    time_parts = Instant(before_ns, first_ns), " to ", Instant(now_ns, first_ns)
+    return Sentence(
+        f"{motion} by {change_text} from ", *time_parts, f", {'by' if signal_name else 'at'} {rate_text}"
+    )
 
 
 def _end(deciding: DecidingAtom) -> float:
@@ -541,16 +551,16 @@ def _end(deciding: DecidingAtom) -> float:
 
 def _in_time(witness: Witness) -> str:
     """Name the innermost temporal operator of the path, in parentheses."""
-    for place, step in reversed(list(enumerate(witness.path[:-1]))):
+    for step_index, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
-            return f" (within `{_step_title(witness, place)}`)"
+            return f" (within `{_step_title(witness, step_index)}`)"
     return ""
 
 
-def _step_title(witness: Witness, place: int) -> str:
+def _step_title(witness: Witness, step_index: int) -> str:
     """Return the name or the text of a path's step; for a long text, the innermost name around it."""
-    step = witness.path[place]
-    names = [node.name for node in witness.path[: place + 1] if node.name]
+    step = witness.path[step_index]
+    names = [node.name for node in witness.path[: step_index + 1] if node.name]
     if step.name or shortened_formula(step.text) == step.text or not names:
         return step.name or shortened_formula(step.text)
     return names[-1]
@@ -558,26 +568,26 @@ def _step_title(witness: Witness, place: int) -> str:
 
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
     """Name the operator within which an atom is greatest or least; without one, as `_in_time`."""
-    passed: set[str] = set()
+    passed_operators: set[str] = set()
     # one sample may settle a failing G or a holding F, and later ones may be more extreme
-    unsure = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
-    for place, step in reversed(list(enumerate(witness.path[:-1]))):
-        if step.operator == unsure:
+    unsure_operator = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
+    for step_index, step in reversed(list(enumerate(witness.path[:-1]))):
+        if step.operator == unsure_operator:
             break
-        window_text = f"{so_far}within `{_step_title(witness, place)}`"
-        if step.operator in ("F", "O") and passed <= {"or", "spec"}:
+        window_text = f"{so_far}within `{_step_title(witness, step_index)}`"
+        if step.operator in ("F", "O") and passed_operators <= {"or", "spec"}:
             return f" (its greatest {window_text})"
-        if step.operator in ("G", "H") and passed <= {"and", "spec"}:
+        if step.operator in ("G", "H") and passed_operators <= {"and", "spec"}:
             return f" (its least {window_text})"
         if step.operator not in ("and", "or", "spec"):
             break
-        passed.add(step.operator)
+        passed_operators.add(step.operator)
     return _in_time(witness)
 
 
 def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
-    names, value, lengths = measured.names, measured.value, units.get("", "")
-    size = with_unit(abs(value), lengths)
+    names, value, length_unit = measured.names, measured.value, units.get("", "")
+    size_text = with_unit(abs(value), length_unit)
     match measured.quantity:
         case "signed_distance" if math.isinf(value):
             return f"{names[0]} and {names[1]} are infinitely far apart, since a group is empty"
@@ -585,12 +595,12 @@ def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
             if value == 0.0:
                 return f"{names[0]} and {names[1]} touch"
             return f"{names[0]} and {names[1]} " + (
-                f"are {size} apart" if value > 0 else f"overlap by {size}"
+                f"are {size_text} apart" if value > 0 else f"overlap by {size_text}"
             )
         case "protrusion":
             if value > 0.0:
-                return f"{names[0]} sticks out of {names[1]} by {size}"
-            return f"{names[0]} lies {size} inside {names[1]}"
+                return f"{names[0]} sticks out of {names[1]} by {size_text}"
+            return f"{names[0]} lies {size_text} inside {names[1]}"
         case "misalignment":
             # misalignment is 1 minus the cosine of the angle
             degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
@@ -599,26 +609,30 @@ def _measurement_text(measured: Measured, units: Mapping[str, str]) -> str:
             return f"{names[0]} is {'' if value else 'not '}in the sample"
         case "speed" | "rate":
             signal_name = names[0] if measured.quantity == "rate" else ""
-            size = with_unit(abs(value), per_second(units.get(signal_name, "")))
+            size_text = with_unit(abs(value), per_second(units.get(signal_name, "")))
             if len(names) == 2:
-                return f"{names[0]} and {names[1]} {'approach' if value > 0.0 else 'part'} at {size}"
+                return f"{names[0]} and {names[1]} {'approach' if value > 0.0 else 'part'} at {size_text}"
             if value == 0.0:
                 return f"{names[0]} {'does not change' if signal_name else 'stands still'}"
             return f"{names[0]} " + (
-                f"{'rises' if value > 0.0 else 'falls'} by {size}" if signal_name else f"moves at {size}"
+                f"{'rises' if value > 0.0 else 'falls'} by {size_text}"
+                if signal_name
+                else f"moves at {size_text}"
             )
         case "signal":
             unit = units.get(names[0], "")
-            called = names_from_unit(unit)
-            lacks = ", which has no name" if called and value not in called.values() else ""
-            return f"{names[0]} is {with_unit(value, unit)}{lacks}"
+            number_by_name = names_from_unit(unit)
+            lack_text = (
+                ", which has no name" if number_by_name and value not in number_by_name.values() else ""
+            )
+            return f"{names[0]} is {with_unit(value, unit)}{lack_text}"
     if math.isinf(value):
         return f"no object is in {' or in '.join(names)}"
-    end = _ENDS.get(measured.quantity)
-    if end is None:
+    edge = _ENDS.get(measured.quantity)
+    if edge is None:
         quantity = measured.quantity.replace("_", " ")
-        return f"the {quantity} of {' and '.join(names)} is {with_unit(value, lengths)}"
-    return f"the {end} of {names[0]} is at {measured.quantity[-1]} = {with_unit(value, lengths)}"
+        return f"the {quantity} of {' and '.join(names)} is {with_unit(value, length_unit)}"
+    return f"the {edge} of {names[0]} is at {measured.quantity[-1]} = {with_unit(value, length_unit)}"
 
 
 def _flip(
@@ -628,31 +642,31 @@ def _flip(
         opposite = "violated" if witness.verdict is Verdict.SATISFIED else "satisfied"
         match witness.obstacle:
             case "limits" if "==" in deciding.atom.parameters:
-                band = "compare with a band, such as 0.9 <= a dist b <= 1.1"
-                return f"No number in it makes that {opposite}: its robustness is never above 0; {band}."
+                advice = "compare with a band, such as 0.9 <= a dist b <= 1.1"
+                return f"No number in it makes that {opposite}: its robustness is never above 0; {advice}."
             case "limits":
                 return f"No number that can stand in it makes that {opposite}."
             case "unknown":
                 return f"No number in it makes that {opposite}: samples that are unknown decide, too."
         return f"No number in `{deciding.text}` alone makes it {opposite}: other atoms decide it, too."
-    would = f"It would be {threshold.verdict}"
+    would_text = f"It would be {threshold.verdict}"
     if is_open:
-        would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
+        would_text = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
     elif threshold.verdict is Verdict.UNKNOWN:
-        would = "It would not have been violated then"
+        would_text = "It would not have been violated then"
     if _is_overlap(deciding, threshold):
         place = _place(deciding, threshold)
         return f"No distance {place} makes it {threshold.verdict}: the objects touch or overlap."
     if threshold.is_written:
         is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
         reason = ", as the condition would not hold there" if is_idle else ""
-        return f"{would} with {_limit(threshold)} {_place(deciding, threshold)}{reason}."
+        return f"{would_text} with {_limit(threshold)} {_place(deciding, threshold)}{reason}."
     if threshold.replacement:
-        return f"{would} with `{threshold.replacement}` instead of `{deciding.text}`."
+        return f"{would_text} with `{threshold.replacement}` instead of `{deciding.text}`."
     unit = declared_unit(deciding.atom, witness.units, is_scaled=False)
-    margin = with_unit(abs(threshold.flips_at), unit)
+    margin_text = with_unit(abs(threshold.flips_at), unit)
     direction = "more" if threshold.flips_at < 0.0 else "less"
-    return f"{would} in a log in which `{deciding.text}` holds by {margin} {direction}."
+    return f"{would_text} in a log in which `{deciding.text}` holds by {margin_text} {direction}."
 
 
 def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
@@ -664,13 +678,13 @@ def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
 
 def _limit(threshold: Threshold) -> str:
     """Return the numbers that flip a verdict instead of the written number."""
-    number, value = format_number(threshold.flips_at), format_number(threshold.value)
+    flip_text, written_text = format_number(threshold.flips_at), format_number(threshold.value)
     is_more = threshold.flips_at > threshold.value
     if threshold.is_exact:
-        return f"exactly {number} instead of {value}"
+        return f"exactly {flip_text} instead of {written_text}"
     if abs(threshold.flips_at - threshold.value) <= RESIDUE * max(abs(threshold.value), 1.0):
-        return f"any number {'above' if is_more else 'below'} {value}"
-    return f"{number} {'or more' if is_more else 'or less'} instead of {value}"
+        return f"any number {'above' if is_more else 'below'} {written_text}"
+    return f"{flip_text} {'or more' if is_more else 'or less'} instead of {written_text}"
 
 
 def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
@@ -693,34 +707,36 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     It names the options of a replay that leave the missing samples out, if there are any.
     """
     begin_ns, end_ns = gap.longest_ns
-    length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
+    length_text = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
     if gap.name is None:
         lost_text = "the connection was lost, or topics were silent"
         if not gap.is_filled and end_ns - begin_ns < 10**6:
             return Sentence("Everything is unknown at ", Instant(begin_ns, first_ns), f": {lost_text}.")
-        place = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length)
+        place_parts = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length_text)
         last_ns = end_ns - 1 if gap.is_filled else begin_ns
         elsewhere = "" if (gap.first_ns, gap.last_ns) == (begin_ns, last_ns) else ", and at other times"
         reason = "`max_gap` makes that unknown" if gap.is_filled else lost_text
-        return Sentence("The samples pause from ", *place, f"{elsewhere}: {reason}.")
+        return Sentence("The samples pause from ", *place_parts, f"{elsewhere}: {reason}.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
     count_text = f"{gap.name} is missing in {gap.missing:,} of {plural(gap.samples, 'sample')}"
     if gap.window is not None:
-        parts: list[str | Instant] = []
+        window_parts: list[str | Instant] = []
         options = []
         for word, option, at_ns in zip(("before ", "from "), ("--from", "--to"), gap.window, strict=True):
             if at_ns is not None:
-                parts += [" or " if parts else "", word, Instant(at_ns, first_ns)]
+                window_parts += [" or " if window_parts else "", word, Instant(at_ns, first_ns)]
                 # rounded down to milliseconds, so that the option does not leave the sample out
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
         onwards = " on" if gap.window[1] is not None else ""
-        return Sentence(f"{count_text}, all ", *parts, f"{onwards}: {' '.join(options)} leaves them out.")
+        return Sentence(
+            f"{count_text}, all ", *window_parts, f"{onwards}: {' '.join(options)} leaves them out."
+        )
     if gap.first_ns == gap.last_ns:
         return Sentence(f"{count_text}, at ", Instant(begin_ns, first_ns), ".")
     extent = "all" if begin_ns <= gap.first_ns and gap.last_ns <= end_ns else "the longest time"
-    begin, end = Instant(begin_ns, first_ns), Instant(end_ns, first_ns)
-    return Sentence(f"{count_text}, {extent} from ", begin, " to ", end, f"{length}.")
+    begin_time, end_time = Instant(begin_ns, first_ns), Instant(end_ns, first_ns)
+    return Sentence(f"{count_text}, {extent} from ", begin_time, " to ", end_time, f"{length_text}.")
 
 
 def open_text(witness: Witness) -> str:
@@ -732,8 +748,8 @@ def open_text(witness: Witness) -> str:
 
 
 def _between(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
-    low, high = (amount_text(end, deciding.atom, units) for end in (deciding.lower, deciding.upper))
-    return f"between {low} and {high}"
+    low_text, high_text = (amount_text(end, deciding.atom, units) for end in (deciding.lower, deciding.upper))
+    return f"between {low_text} and {high_text}"
 
 
 def _uncertain_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
@@ -750,8 +766,8 @@ def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mappin
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
         return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", instant, f", {reasons}.")
-    limits = _between(deciding, units)
-    clause = f"By how much is uncertain: the robustness of `{deciding.text}` lies {limits} at "
+    limits_text = _between(deciding, units)
+    clause = f"By how much is uncertain: the robustness of `{deciding.text}` lies {limits_text} at "
     return Sentence(clause, instant, ".")
 
 

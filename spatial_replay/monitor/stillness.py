@@ -32,17 +32,17 @@ class _Reports:
     """The reports of an object after its first report.
 
     Attributes:
-        last: (3,), numbers of the newest report.
+        last_numbers: (3,), numbers of the newest report.
     """
 
-    count: int = 0
-    changes: int = 0
+    report_count: int = 0
+    change_count: int = 0
     class_name: str | None = None
-    last: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    last_numbers: Floats = field(default_factory=lambda: np.full(3, np.nan))
 
     @property
     def mostly_changes(self) -> bool:
-        return self.count >= _LEAST_REPORTS and self.changes >= _MOSTLY * self.count
+        return self.report_count >= _LEAST_REPORTS and self.change_count >= _MOSTLY * self.report_count
 
 
 class Stillness:
@@ -61,14 +61,14 @@ class Stillness:
             rows = trace.rows[:, column]
             is_new = rows >= 0
             if trace.reported_ns is not None:
-                times = trace.reported_ns[:, column]
+                report_times_ns = trace.reported_ns[:, column]
                 # samples repeat a report until the next one comes
-                is_new &= np.concatenate([[True], times[1:] != times[:-1]])
+                is_new &= np.concatenate([[True], report_times_ns[1:] != report_times_ns[:-1]])
             rows = rows[is_new]
             if not len(rows):
                 continue
             reports = self._reports[name]
-            report_numbers = np.concatenate([reports.last[None], numbers[rows]])
+            report_numbers = np.concatenate([reports.last_numbers[None], numbers[rows]])
             # the first report of an object has no previous report to differ from
             is_first = bool(np.isnan(report_numbers[0]).all())
             # NaN differs from itself, but a missing yaw is no change
@@ -76,10 +76,10 @@ class Stillness:
                 (report_numbers[1:] != report_numbers[:-1])
                 & ~(np.isnan(report_numbers[1:]) & np.isnan(report_numbers[:-1]))
             ).any(axis=1)
-            reports.count += len(rows) - is_first
-            reports.changes += int(is_changed[is_first:].sum())
+            reports.report_count += len(rows) - is_first
+            reports.change_count += int(is_changed[is_first:].sum())
             reports.class_name = trace.classes[trace.class_code[rows[-1]]]
-            reports.last = report_numbers[-1]
+            reports.last_numbers = report_numbers[-1]
 
     def remarks(self) -> Iterator[str]:
         """Yield a sentence on each object that never changed while all others of its class mostly changed."""
@@ -89,24 +89,24 @@ class Stillness:
             if name not in self._lasting:
                 by_class[reports.class_name][name] = reports
         for class_name, objects in by_class.items():
-            still = [name for name, reports in objects.items() if not reports.changes]
-            others = [reports for name, reports in objects.items() if name not in still]
-            if len(still) != 1 or len(others) < _LEAST_OTHERS[bool(class_name)]:
+            still_names = [name for name, reports in objects.items() if not reports.change_count]
+            other_reports = [reports for name, reports in objects.items() if name not in still_names]
+            if len(still_names) != 1 or len(other_reports) < _LEAST_OTHERS[bool(class_name)]:
                 continue
-            count = objects[still[0]].count
-            if count >= _LEAST_REPORTS and all(reports.mostly_changes for reports in others):
-                kind = f"of the class {printable(class_name)!r}" if class_name else "without a class"
-                never = f"never changes by a bit in {plural(count + 1, 'report')}"
-                others_move = f"while all other objects {kind} move"
-                yield f"{printable(still[0])} {never}, {others_move}: is it still tracked?"
+            report_count = objects[still_names[0]].report_count
+            if report_count >= _LEAST_REPORTS and all(reports.mostly_changes for reports in other_reports):
+                class_text = f"of the class {printable(class_name)!r}" if class_name else "without a class"
+                stillness_text = f"never changes by a bit in {plural(report_count + 1, 'report')}"
+                others_move = f"while all other objects {class_text} move"
+                yield f"{printable(still_names[0])} {stillness_text}, {others_move}: is it still tracked?"
 
 
 def _numbers(trace: Trace) -> Floats:
     """Return the sum of the vertices and the yaw of each observation, (R, 3)."""
     batch = trace.footprints
-    places = batch.vertex_start[batch.part_start]
+    vertex_starts = batch.vertex_start[batch.part_start]
     sums = np.zeros((len(trace.yaw), 3))
     if len(trace.yaw):
-        sums[:, :2] = np.add.reduceat(batch.vertices, places[:-1].astype(np.intp))
+        sums[:, :2] = np.add.reduceat(batch.vertices, vertex_starts[:-1].astype(np.intp))
         sums[:, 2] = trace.yaw
     return sums
