@@ -37,7 +37,7 @@ class ClassMembers:
             return
         # an object with unknown position has row -2 - observation, and its class is known
         rows = np.where(trace.rows < ABSENT, -2 - trace.rows, trace.rows)
-        # an absent object has row -1, which reads the appended last code: -1, which is no class
+        # an absent object has row -1, which points to the appended code -1 of no class
         code_of_row = np.append(trace.class_code, -1)[rows]
         for code in codes:
             columns = np.flatnonzero((code_of_row == code).any(axis=0)).tolist()

@@ -1,7 +1,7 @@
-"""Find the samples of a log that are evaluated: from its begin to its end for all needed topics.
+"""Find the evaluated samples of a log: the samples at both ends without a needed topic are left out.
 
 Recorded logs, traces and running robots follow one rule. Evaluation begins at the first sample where each
-needed topic has sent a message that transforms can place. It ends at the last such sample.
+needed topic has sent a message that transforms can locate. It ends at the last such sample.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Needs:
     """The objects, signals and classes that specifications name.
 
     Attributes:
-        classes: in lower case; `ANY_CLASS` for objects of any class.
+        classes: class names in lower case; `ANY_CLASS` stands for any class.
     """
 
     objects: frozenset[str] = frozenset()
@@ -38,7 +38,7 @@ class Needs:
         """Return the needs of specifications.
 
         Args:
-            each: choice of objects for each template parameter: "all", "class:NAME" or a name.
+            each: choice of objects by template parameter: "all", "class:NAME" or an object's name.
         """
         objects: set[str] = set()
         signals: set[str] = set()
@@ -92,20 +92,21 @@ class Needs:
 class RunEnds:
     """Leaves out samples at both ends of a log, where a needed topic cannot be judged.
 
-    Samples are left out before a needed topic begins, after it ends, and where no transform places it.
-    At each end at most the topic's `limit_ns` is left out. No sample is left out for a topic that is missing
-    for longer.
+    Samples are left out before a needed topic begins, after it ends, and where no transform locates it.
+    At most the topic's `limit_ns` is left out at each end. If a topic is missing for longer, no samples are
+    left out because of that topic.
 
     Args:
         start, end: whether samples may be left out at the start, and at the end.
-        is_rest: whether earlier samples were evaluated; then all samples may be left out.
-        within_ns: limit at the start, instead of the topics' own limits.
+        is_rest: whether the log has earlier samples, which were evaluated. Then all samples may be left out.
+        within_ns: limit at the start, ns, instead of the topics' own limits.
 
     Attributes:
         log_begin_ns: time of the first sample.
         begin_ns: time of the first evaluated sample; None until it is decided.
-        end_ns: time from which samples are left out; set by `finish`.
-        late: needed topics that came too late, so that evaluation began without them.
+        end_ns: time from which on samples are left out; set by `finish`.
+        late: needed topics without which evaluation began, because they came too late.
+        remarks: sentences on the samples left out and on late topics.
     """
 
     def __init__(
@@ -133,15 +134,15 @@ class RunEnds:
 
     @property
     def has_spans(self) -> bool:
-        """Whether any sample so far came with spans of topics."""
+        """Whether any added trace has spans of topics."""
         return bool(self._spans)
 
     def add(self, trace: Trace) -> list[Trace]:
         """Add the next samples and return the samples that are ready for evaluation.
 
-        One trace is returned for each added trace, perhaps later, without the samples left out.
+        Each added trace is returned by this call or a later call, without the samples left out.
         """
-        # evaluation has begun, and no end is searched: nothing has to be recorded
+        # after the beginning, spans are needed only to find the end and for remarks on late topics
         if self.begin_ns is not None and not self._may_trim_end and not self.late:
             return [trace]
         if len(trace):
@@ -155,7 +156,7 @@ class RunEnds:
         return self._release(self._open_since_ns())
 
     def release(self) -> list[Trace]:
-        """Return the pending samples, which are all evaluated; none before evaluation begins."""
+        """Return all pending samples for evaluation; none before evaluation begins."""
         return [] if self.begin_ns is None else self._release(FOREVER)
 
     def finish(self) -> list[Trace]:
@@ -210,7 +211,7 @@ class RunEnds:
         ]
         self.late = tuple(span.topic for span, delay_ns in span_delays if delay_ns > self._limit_ns(span))
         timely_spans = [span for span, delay_ns in span_delays if delay_ns <= self._limit_ns(span)]
-        # the latest topic decides
+        # evaluation begins with the latest of these topics
         self.begin_ns = max((span.first_ns or 0 for span in timely_spans), default=self.log_begin_ns)
         latest_span = max(timely_spans, key=lambda span: span.first_ns or 0, default=None)
         if latest_span is not None and self.begin_ns > self.log_begin_ns:
@@ -220,7 +221,7 @@ class RunEnds:
         times_ns = np.concatenate([trace.times_ns for trace in self._pending_traces])
         omitted_ns = times_ns[times_ns < begin_ns]
         reason: list[str | Instant] = [f"no transform places {span.topic} before"]
-        # else the topic had messages, but no transform
+        # otherwise the topic had messages, but no transform located them
         if span.begun_ns is not None and span.begun_ns > int(omitted_ns[-1]):
             reason = [f"{span.topic} begins at ", Instant(span.begun_ns, 0)]
         self._remark("beginning", omitted_ns, reason)
@@ -255,7 +256,7 @@ class RunEnds:
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:
-        """Yield needed spans that ended before the newest sample, by no more than their limits."""
+        """Yield needed spans that ended before the newest sample, but within their limits."""
         if not self._may_trim_end:
             return
         for span in self.needs.choose(tuple(self._spans.values())):
@@ -270,11 +271,11 @@ class RunEnds:
                 yield span
 
     def _open_since_ns(self) -> int:
-        """Return the time from which a needed topic may have ended, the earliest of them; else FOREVER."""
+        """Return the earliest time at which a needed topic may have ended; FOREVER without such a topic."""
         return min((self._ended_ns[span.topic] or FOREVER for span in self._open_spans()), default=FOREVER)
 
     def _release(self, before_ns: int) -> list[Trace]:
-        """Remove and return the pending traces that end before a time."""
+        """Remove and return the pending traces that end before `before_ns`."""
         ready_count = 0
         for trace in self._pending_traces:
             # traces are released whole, because callers expect one trace for each added trace
@@ -303,5 +304,5 @@ def trim_trace(
         return trace, ()
     ends = RunEnds(needs, start=start, end=end, is_rest=is_rest)
     (trimmed_trace,) = [*ends.add(trace), *ends.finish()]
-    # an untrimmed trace stays the same object, so its cache of measurements stays in use
+    # an untrimmed trace is returned itself, so that its cache of measurements is used again
     return (trimmed_trace, ends.remarks) if ends.remarks else (trace, ())

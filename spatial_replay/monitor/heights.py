@@ -27,9 +27,9 @@ class _Comparison:
     """A comparison of a distance, with the number of samples in which heights decide it.
 
     Attributes:
-        first_ns: time of the first such sample.
+        first_ns: time of the first sample in which heights decide.
         holds: whether the comparison holds in that sample.
-        decided_count: number of these samples.
+        decided_count: number of samples in which heights decide.
         compared_count: number of samples that were compared.
     """
 
@@ -42,7 +42,7 @@ class _Comparison:
 
 
 class HeightComparisons:
-    """Counts the samples in which comparisons change their truth without heights, block by block."""
+    """Counts the samples in which a comparison has another truth value without heights, block by block."""
 
     def __init__(self, specifications: Sequence[Specification]) -> None:
         """Start before the first sample."""
@@ -65,7 +65,7 @@ class HeightComparisons:
             samples = _samples_with_one_above(trace, specification) if comparisons else np.empty(0, np.int64)
             if not len(samples):
                 continue
-            # evenly spread: a block may hold thousands of such samples
+            # a spread of few samples, because a block may have thousands of such samples
             compared_trace = trace.take(samples[:: 1 + len(samples) // _MOST_SAMPLES]).compact()
             scenes = (
                 TraceScene(compared_trace, specification.regions),
@@ -109,12 +109,12 @@ def _comparisons_of(specification: Specification) -> Iterator[_Comparison]:
 
 
 def _samples_with_one_above(trace: Trace, specification: Specification) -> Integers:
-    """Return the samples in which an object, or a region, is wholly above another."""
+    """Return the samples in which an object or region is wholly above another object or region."""
     batch = trace.footprints
     # logs without heights are not compared again
     if not len(batch.bottom) or np.isnan(batch.bottom).all():
         return np.empty(0, np.int64)
-    # absent objects read the appended infinities, which decide no extremum
+    # the row of an absent object points to the appended infinity, which is ignored by `max` and `min`
     rows = np.where(trace.rows >= 0, trace.rows, len(batch.bottom))
     heights = [outline.height for outline in specification.regions.values() if outline.height is not None]
     highest_bottom = np.append(np.where(np.isnan(batch.bottom), -np.inf, batch.bottom), -np.inf)[rows].max(

@@ -33,7 +33,7 @@ from spatial_replay.text import Instant, Sentence, number_text, plural
 LISTED: Final = 5
 """Number of intervals that an explanation lists."""
 MOST_EXPLAINED: Final = 256
-"""Limit on intervals of an invariant that get a deciding atom, because each reads its sample again."""
+"""Limit on an invariant's intervals with a deciding atom. Each such interval reads its sample again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,11 @@ class ViolatedInterval:
         samples: number of samples.
         worst_ns: time of the first sample with the least robustness.
         robustness: robustness of the operand at `worst_ns`.
-        deciding: deciding atom at `worst_ns`. For a missed response, the atom that came closest to
-            fulfilling it. None after `MOST_EXPLAINED` intervals, and if no atom decides.
+        deciding: deciding atom at `worst_ns`. For a missed response, it is the atom that came closest to
+            fulfilling the response. It is None after `MOST_EXPLAINED` intervals, and if no atom decides.
         deciding_ns: time of the sample in which this atom was measured.
-        place: contact point of the deciding atom or, if it has none, of the condition's atom; else None.
+        place: contact point of the deciding atom. If that atom has none, it is the contact point of the
+            condition's atom, or None.
     """
 
     start_ns: int
@@ -63,14 +64,15 @@ class ViolatedInterval:
 
 @dataclass(frozen=True, slots=True)
 class ViolatedInvariant:
-    """A part `G p` of a result that is violated.
+    """A violated part `G p` of a result.
 
     Attributes:
-        spec: innermost named spec that contains it.
-        node: its id.
+        spec: innermost named spec that contains the part.
+        node: node id of the part.
         intervals: violated intervals of `p`, by time.
         condition: text of the condition in `G (condition -> response)`; else None.
-        entries: number of intervals in which the condition held, and number of these with a missed response.
+        entries: number of intervals in which the condition held, and number of such intervals with a missed
+            response.
     """
 
     spec: str
@@ -107,7 +109,7 @@ def find_violated_invariants(
         leaves: (C, A, T), the instance's leaves.
         times_ns: (T,), T at least 1.
         goes_on: whether samples may follow; then only permanent violations count.
-        most: limit on intervals of each invariant that get a deciding atom, by time.
+        most: number of first intervals of each invariant that get a deciding atom.
     """
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:
@@ -125,8 +127,8 @@ class _Invariant(NamedTuple):
 
     Attributes:
         operator: `G`, or a negated `F`.
-        operand: id of its operand.
-        condition: id of the condition if the operand is an implication; else None.
+        operand: node id of the operand.
+        condition: node id of the condition if the operand is an implication; else None.
     """
 
     conjunct: Conjunct
@@ -178,7 +180,7 @@ def _intervals_of(
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
     condition_runs = _Runs.of(is_in_window & (nodes.ends(invariant.condition)[0] >= 0.0))
-    # the number of starts up to a violation identifies the interval of the condition
+    # a violation's interval of the condition is identified by the number of such intervals up to it
     missed_entries = np.unique(np.searchsorted(condition_runs.starts, violated_runs.starts, side="right"))
     condition_text = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
     entry_counts = len(condition_runs.starts), len(missed_entries)
@@ -230,7 +232,7 @@ def _place_of(deciding: DecidingAtom | None) -> Point | None:
 def invariant_sentences(
     invariant: ViolatedInvariant, first_ns: int, units: Mapping[str, str]
 ) -> Iterator[Sentence]:
-    """Yield a sentence on the number of violated intervals, and one on each of the first `LISTED`.
+    """Yield a sentence on the number of violated intervals, and a sentence on each of the first `LISTED`.
 
     Args:
         first_ns: reference time of the sentences.

@@ -73,25 +73,25 @@ def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
 
 
 @piece
-def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: Steps) -> None:
+def _run_past(code: int, first_operand: Floats, second_operand: Floats, target: Floats, steps: Steps) -> None:
     """Run an unbounded O, H or S."""
     value = np.inf if code == codes.HISTORICALLY else -np.inf
-    for i in range(steps.length):
-        k = _at(steps, i)
-        value = past_value(code, first[k], second[k], value)
-        target[k] = value
+    for step in range(steps.length):
+        sample = _at(steps, step)
+        value = past_value(code, first_operand[sample], second_operand[sample], value)
+        target[sample] = value
 
 
 @piece
 def _run_delay(
-    source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
+    source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing_value: float
 ) -> None:
     """Delay a column by `distance`: each step gets the value of the latest step that far back."""
-    back = -1
-    for i in range(steps.length):
-        while back < i and _distance(steps, unit, back + 1, i) >= distance:
-            back += 1
-        target[_at(steps, i)] = source[_at(steps, back)] if back >= 0 else missing
+    source_step = -1
+    for step in range(steps.length):
+        while source_step < step and _distance(steps, unit, source_step + 1, step) >= distance:
+            source_step += 1
+        target[_at(steps, step)] = source[_at(steps, source_step)] if source_step >= 0 else missing_value
 
 
 @piece
@@ -100,47 +100,48 @@ def _slide(
 ) -> None:
     """Compute the sliding maximum (sign 1) or minimum (sign -1) over the steps from `far` to `near` back.
 
-    Two stacks hold the window: `extrema` has the extremum from each older step up to `middle`, and `recent`
-    is the extremum from `middle` on. Each step enters each stack once, regardless of the window's width.
+    Two stacks hold the window. `extrema` has the extremum from each older step up to `middle`, and
+    `recent_extremum` is the extremum from `middle` on. Each step enters each stack once, regardless of the
+    window's width.
     """
-    first, middle, end = 0, 0, 0
-    recent = -np.inf
-    for i in range(steps.length):
-        while end <= i and _distance(steps, unit, end, i) >= near:
-            recent = max(recent, sign * source[_at(steps, end)])
-            end += 1
-        while first < end and _distance(steps, unit, first, i) > far:
-            first += 1
+    window_start, middle, window_end = 0, 0, 0
+    recent_extremum = -np.inf
+    for step in range(steps.length):
+        while window_end <= step and _distance(steps, unit, window_end, step) >= near:
+            recent_extremum = max(recent_extremum, sign * source[_at(steps, window_end)])
+            window_end += 1
+        while window_start < window_end and _distance(steps, unit, window_start, step) > far:
+            window_start += 1
         # the older stack is used up: move the recent steps into it, with running extrema from the newest down
-        if first >= middle:
+        if window_start >= middle:
             extremum = -np.inf
-            for step in range(end - 1, first - 1, -1):
-                extremum = max(extremum, sign * source[_at(steps, step)])
-                extrema[step] = extremum
-            middle = end
-            recent = -np.inf
-        inside = extrema[first] if first < middle else -np.inf
-        target[_at(steps, i)] = sign * max(inside, recent)
+            for older_step in range(window_end - 1, window_start - 1, -1):
+                extremum = max(extremum, sign * source[_at(steps, older_step)])
+                extrema[older_step] = extremum
+            middle = window_end
+            recent_extremum = -np.inf
+        older_extremum = extrema[window_start] if window_start < middle else -np.inf
+        target[_at(steps, step)] = sign * max(older_extremum, recent_extremum)
 
 
 @piece
 def _run_boolean(
-    row: Integers, columns: Floats, channel: int, mirror: int, target: Floats, begin: int, end: int
+    row: Integers, columns: Floats, channel: int, mirror_channel: int, target: Floats, begin: int, end: int
 ) -> None:
-    code, a, b = row[0], row[1], row[2]
-    first, second = columns[channel, a], columns[channel, b]
+    code, first_column, second_column = row[0], row[1], row[2]
+    first_operand, second_operand = columns[channel, first_column], columns[channel, second_column]
     if code == codes.CONSTANT:
         # rows hold integers, so an infinity is stored as its sign
         target[begin:end] = row[4] * np.inf
     elif code == codes.NOT:
-        for k in range(begin, end):
-            target[k] = -columns[mirror, a, k]
+        for sample in range(begin, end):
+            target[sample] = -columns[mirror_channel, first_column, sample]
     elif code == codes.AND:
-        for k in range(begin, end):
-            target[k] = min(first[k], second[k])
+        for sample in range(begin, end):
+            target[sample] = min(first_operand[sample], second_operand[sample])
     elif code == codes.OR:
-        for k in range(begin, end):
-            target[k] = max(first[k], second[k])
+        for sample in range(begin, end):
+            target[sample] = max(first_operand[sample], second_operand[sample])
 
 
 @kernel
@@ -156,25 +157,25 @@ def run_offline(
         columns: (C, K, T), output.
         extrema: (T,), work space.
     """
-    channels = leaves.shape[0]
-    for r in range(rows.shape[0]):
-        row = rows[r]
+    channel_count = leaves.shape[0]
+    for row_number in range(rows.shape[0]):
+        row = rows[row_number]
         code = row[0]
         is_ahead = code >= codes.AHEAD
         past_code = code - codes.AHEAD if is_ahead else code
         steps = Steps(stamps, end - 1 if is_ahead else begin, -1 if is_ahead else 1, end - begin)
-        for channel in range(channels):
+        for channel in range(channel_count):
             # a negation swaps the low and the high end (see `codes`)
-            mirror = channel ^ 1 if channels > 1 else channel
+            mirror_channel = channel ^ 1 if channel_count > 1 else channel
             target = columns[channel, row[codes.OFFLINE_TARGET]]
             if code == codes.LEAF:
                 # element by element: the error for slices of unequal length takes seconds to compile
-                for k in range(begin, end):
-                    target[k] = leaves[channel, row[1], k]
+                for sample in range(begin, end):
+                    target[sample] = leaves[channel, row[1], sample]
                 continue
             source = columns[channel, row[1]]
             if past_code < codes.ONCE:
-                _run_boolean(row, columns, channel, mirror, target, begin, end)
+                _run_boolean(row, columns, channel, mirror_channel, target, begin, end)
             elif past_code <= codes.SINCE:
                 _run_past(past_code, source, columns[channel, row[2]], target, steps)
             elif past_code == codes.DELAY:
@@ -195,11 +196,11 @@ def run_windows(
         starts: (T,), first sample of each window.
         result: (C, N, T), output for the first N columns.
     """
-    for t in range(len(stamps)):
-        run_offline(rows, leaves, stamps, starts[t], t + 1, columns, extrema)
+    for sample in range(len(stamps)):
+        run_offline(rows, leaves, stamps, starts[sample], sample + 1, columns, extrema)
         for channel in range(leaves.shape[0]):
-            for n in range(result.shape[1]):
-                result[channel, n, t] = columns[channel, n, starts[t]]
+            for node in range(result.shape[1]):
+                result[channel, node, sample] = columns[channel, node, starts[sample]]
 
 
 _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
@@ -230,17 +231,23 @@ class OfflineTable(SignalTable):
             (R, OFFLINE_WIDTH), operands first.
         """
         # reversed, so that the first of several equal nodes owns the row
-        column = {row: node for node, row in reversed(list(enumerate(nodes)))}
-        other_rows = (row for row in range(len(self._rows)) if row not in column)
-        column |= dict(zip(other_rows, count(len(nodes)), strict=False))
-        rows = []
-        for number, (code, a, b, *window) in enumerate(self._rows):
-            operands = (a, b) if code == codes.LEAF else (column[a], column[b])
-            rows.append((code, *operands, *window, column[number]))
+        column_of_row = {row: node for node, row in reversed(list(enumerate(nodes)))}
+        other_rows = (row for row in range(len(self._rows)) if row not in column_of_row)
+        column_of_row |= dict(zip(other_rows, count(len(nodes)), strict=False))
+        instruction_rows = []
+        for row_number, (code, first_operand, second_operand, *window) in enumerate(self._rows):
+            operands = (
+                (first_operand, second_operand)
+                if code == codes.LEAF
+                else (column_of_row[first_operand], column_of_row[second_operand])
+            )
+            instruction_rows.append((code, *operands, *window, column_of_row[row_number]))
         # equal nodes share a row, but each has its own column: `and` of a column with itself copies it
-        copies = [(codes.AND, column[row], column[row], 0, 0, 0, n) for n, row in enumerate(nodes)]
-        rows += [copy for copy in copies if copy[1] != copy[-1]]
-        return array_of_rows(rows, codes.OFFLINE_WIDTH)
+        copies = [
+            (codes.AND, column_of_row[row], column_of_row[row], 0, 0, 0, n) for n, row in enumerate(nodes)
+        ]
+        instruction_rows += [copy for copy in copies if copy[1] != copy[-1]]
+        return array_of_rows(instruction_rows, codes.OFFLINE_WIDTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,10 +284,10 @@ class OfflineNodes:
         condition = self.conditions.get(operand)
         if condition is None:
             return low, high
-        has_low, has_high = condition[[*low_and_high(len(condition), wide=True)]]
+        condition_low, condition_high = condition[[*low_and_high(len(condition), wide=True)]]
         if self._judged[operand].operator == "with":
-            return np.minimum(has_low, low), np.minimum(has_high, high)
-        return np.maximum(-has_high, low), np.maximum(-has_low, high)
+            return np.minimum(condition_low, low), np.minimum(condition_high, high)
+        return np.maximum(-condition_high, low), np.maximum(-condition_low, high)
 
     def is_left_out(self, operand: int, sample: int) -> bool:
         """Return whether the operator of an operand leaves a sample out."""
@@ -405,14 +412,14 @@ def _evaluate_beyond(
     order: Sequence[Atom | Quantified],
     leaves: Floats,
     times_ns: Integers,
-    beyond: Callable[[Temporal, Integers], Booleans],
+    find_open: Callable[[Temporal, Integers], Booleans],
 ) -> OfflineNodes:
-    open_formulas = _OpenFormulas(times_ns, beyond)
+    open_formulas = _OpenFormulas(times_ns, find_open)
     stand_ins = [open_formulas.of(node_formula) for node_formula in computed_formulas(formula)]
     is_open = np.array(open_formulas.columns, np.bool_).reshape(-1, len(times_ns))
-    columns = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
+    unknown_ends = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
     compiled = OfflineFormula.of(formula, (*order, *open_formulas.leaves), stand_ins)
-    return compiled.evaluate(joined_channels([leaves, columns], axis=1), times_ns)
+    return compiled.evaluate(joined_channels([leaves, unknown_ends], axis=1), times_ns)
 
 
 class _OpenFormulas:
@@ -423,11 +430,15 @@ class _OpenFormulas:
         columns: (T,) for each leaf, whether it is unknown at a sample; it is `false` at all others.
     """
 
-    def __init__(self, times_ns: Integers, beyond: Callable[[Temporal, Integers], Booleans]) -> None:
-        """Start without leaves; `beyond` returns the samples (T,) at which an operator's window is open."""
+    def __init__(self, times_ns: Integers, find_open: Callable[[Temporal, Integers], Booleans]) -> None:
+        """Start without leaves.
+
+        Args:
+            find_open: returns whether an operator's window is open at each sample, (T,).
+        """
         self.leaves: list[Atom] = []
         self.columns: list[Booleans] = []
-        self._times_ns, self._beyond = times_ns, beyond
+        self._times_ns, self._find_open = times_ns, find_open
         # formulas are stored to stay alive: a new formula could reuse the id of a freed one
         self._stand_ins: dict[int, tuple[Formula, Formula]] = {}
 
@@ -446,7 +457,7 @@ class _OpenFormulas:
         node = replace(formula, operands=tuple([self.of(operand) for operand in formula.operands]))
         if not isinstance(node, Temporal):
             return node
-        is_open = self._beyond(node, self._times_ns)
+        is_open = self._find_open(node, self._times_ns)
         if not is_open.any():
             return node
         # no specification can write this name, so the leaf equals no other leaf
@@ -460,8 +471,8 @@ class _OpenFormulas:
                 return Boolean("and", (node, Boolean("not", (leaf,))))
             case "U":
                 # a later sample may fulfil it, up to the minimum of the left operand so far
-                lasting = Temporal("G", node.operands[:1])
-                return Boolean("or", (node, Boolean("and", (leaf, lasting))))
+                left_so_far = Temporal("G", node.operands[:1])
+                return Boolean("or", (node, Boolean("and", (leaf, left_so_far))))
         return Boolean("and", (Boolean("or", (node, leaf)), Boolean("not", (leaf,))))
 
 
@@ -485,15 +496,15 @@ def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:
 
 def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
     """Return (T,), whether no later sample can fall into the window of a future operator at each sample."""
-    count = len(times_ns)
+    sample_count = len(times_ns)
     if bound is None or bound.upper is None:
-        return np.zeros(count, np.bool_)
+        return np.zeros(sample_count, np.bool_)
     if bound.unit == "samples":
         # capped, because the sum could exceed 64 bits
-        return np.arange(count) + min(bound.upper, count) < count
+        return np.arange(sample_count) + min(bound.upper, sample_count) < sample_count
     # Python integers: a time and a duration may add up to more than 64 bits
-    span_ns = int(times_ns[-1]) - bound.upper
-    return np.arange(count) < bisect_left(times_ns, span_ns + 1)
+    last_closed_ns = int(times_ns[-1]) - bound.upper
+    return np.arange(sample_count) < bisect_left(times_ns, last_closed_ns + 1)
 
 
 def windows_of(
@@ -504,25 +515,29 @@ def windows_of(
     Args:
         samples: indices of the samples whose windows are returned; None for all.
     """
-    count = len(times_ns)
-    indices = np.arange(count, dtype=np.int64)
+    sample_count = len(times_ns)
+    indices = np.arange(sample_count, dtype=np.int64)
     is_ahead = formula.operator in FUTURE_OPERATORS
     bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX", "Y") else formula.bound
     if bound is None:
         positions = indices if samples is None else samples
-        edge = np.full(len(positions), count if is_ahead else 0, np.int64)
-        return (positions, edge) if is_ahead else (edge, positions + 1)
+        log_edges = np.full(len(positions), sample_count if is_ahead else 0, np.int64)
+        return (positions, log_edges) if is_ahead else (log_edges, positions + 1)
     # sums fit 64 bits, because bounds are capped and times count from the first sample
-    places = indices if bound.unit == "samples" else times_ns - times_ns[0]
-    furthest = int(places[-1]) + 1
-    near = min(bound.lower, furthest)
-    far = furthest if bound.upper is None else min(bound.upper, furthest)
-    origins = places if samples is None else places[samples]
-    low, high = (origins + near, origins + far) if is_ahead else (origins - far, origins - near)
+    offsets = indices if bound.unit == "samples" else times_ns - times_ns[0]
+    longest_distance = int(offsets[-1]) + 1
+    near_distance = min(bound.lower, longest_distance)
+    far_distance = longest_distance if bound.upper is None else min(bound.upper, longest_distance)
+    origins = offsets if samples is None else offsets[samples]
+    first_offsets, last_offsets = (
+        (origins + near_distance, origins + far_distance)
+        if is_ahead
+        else (origins - far_distance, origins - near_distance)
+    )
     if bound.unit == "samples":
-        return np.clip(low, 0, count), np.clip(high + 1, 0, count)
-    begin = np.searchsorted(places, low, side="left").astype(np.int64)
-    return begin, np.searchsorted(places, high, side="right").astype(np.int64)
+        return np.clip(first_offsets, 0, sample_count), np.clip(last_offsets + 1, 0, sample_count)
+    first_samples = np.searchsorted(offsets, first_offsets, side="left").astype(np.int64)
+    return first_samples, np.searchsorted(offsets, last_offsets, side="right").astype(np.int64)
 
 
 def full_signal(

@@ -53,9 +53,10 @@ class ThresholdRange:
 
     Attributes:
         atom: an atom with one distance or signal.
-        bound: quantifiers that bind its variables, outermost first. A template's parameter has one, too.
-        least, greatest: range of the quantity over all objects that the variables stand for. For a text, and
-            for a quantity that is never known, least > greatest.
+        bound: quantifiers that bind the atom's variables, outermost first. A template parameter counts as a
+            variable with a quantifier.
+        least, greatest: range of the quantity over all objects that the variables stand for. It is empty,
+            least > greatest, for a text and for a quantity that is never known.
         known: number of samples in which the quantity is known.
         holding: number of samples in which the atom holds for all objects.
         failing: number of samples in which the atom fails for all objects.
@@ -83,7 +84,7 @@ class ThresholdRange:
 
     @property
     def objects(self) -> str | None:
-        """Its variables and their groups, as in `d in drinks`; None without variables."""
+        """The atom's variables and their groups, as in `d in drinks`; None without variables."""
         binding_texts = [
             f"{', '.join(quantifier.variables)} in {format_term(quantifier.group).strip('()')}"
             for quantifier in self.bound
@@ -97,7 +98,7 @@ class ThresholdRange:
 
     @property
     def _words_of_empty(self) -> str:
-        """Words for samples in which the groups are empty, with the atom's value."""
+        """Predicate of samples in which the groups are empty, with the atom's robustness there."""
         quantifiers = {quantified.quantifier for quantified in self.bound}
         if len(quantifiers) > 1:
             return "has no object"
@@ -134,7 +135,8 @@ class LogNumbers:
         samples: number of samples.
         times_ns: times of the first and the last sample.
         classes: classes of the objects; "" for objects without a class.
-        missing: number of samples without an object or signal of the specification, and time of the first.
+        missing: for an object or signal of the specification, the number of samples without it, and the time
+            of the first such sample, ns.
     """
 
     def __init__(self, specification: Specification) -> None:
@@ -191,12 +193,12 @@ class LogNumbers:
         self._recent_trace = extended_trace
         scene = TraceScene(extended_trace, self._regions, len(extended_trace) - len(trace))
         for key, threshold_range in self._ranges.items():
-            # the number of this atom is the quantity itself
+            # the robustness of this atom is the quantity itself
             quantity_atom = replace(
                 threshold_range.atom,
                 expression=_compared_quantity(threshold_range.atom) or threshold_range.atom.expression,
             )
-            # one call per formula, as in a replay: the limit of bindings counts all formulas of a call
+            # one call per formula, because the limit on bindings applies to all formulas of a call together
             least, greatest, all_hold, any_holds = (
                 leaf_values(scene, [over_bindings(quantifier, threshold_range.bound, atom)], {})[:, 0]
                 for atom in (quantity_atom, threshold_range.atom)
@@ -252,7 +254,7 @@ class LogNumbers:
 
 
 def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
-    """Return lines on windows in samples, and on nested ones, with their seconds at the log's rate."""
+    """Return a line for each window in samples, and for each nesting, with its seconds at the log's rate."""
     if log.rate is None:
         return []
     lines: dict[str, None] = {}
@@ -311,7 +313,7 @@ def plausibility_warnings(
     for part, (missing_count, first_ns) in log.missing.items():
         atoms = (atom for spec in specification.results for atom in iter_atoms(spec.formula))
         span = next(atom.span for atom in atoms if part in named_parts(atom))
-        # a name that the log never has is reported by `check_names`
+        # a name that is missing in every sample is reported by `check_names`
         if missing_count < log.samples:
             first_time = time_text(first_ns, zero_ns)
             share_text = f"{missing_count:,} of {plural(log.samples, 'sample')}"
@@ -413,7 +415,7 @@ def _is_far(limit: float, threshold_range: ThresholdRange, *, is_length: bool) -
     if is_length and limit < 0.0:
         # only overlapping footprints have a negative distance
         return True
-    # a limit is near if it is no further away than the range is wide, or its ends are large
+    # a limit is near if its distance to the range is at most the width of the range, or the size of an end
     reach = max(greatest - least, abs(least), abs(greatest))
     if limit < least - reach or limit > greatest + reach:
         return True

@@ -37,14 +37,15 @@ class Cause:
 
     Attributes:
         spec: innermost named spec that contains the conjunct.
-        node: id of the conjunct.
-        text: its canonical text.
+        node: node id of the conjunct.
+        text: canonical text of the conjunct.
         verdict: violated or unknown.
         robustness: robustness of the conjunct on the whole log; NaN if undetermined.
-        settled_ns: time at which its violation became certain; None if only the end of the log decided.
-        witness: witness of the conjunct on the samples up to `settled_ns`; without that time, on the whole
-            log. None if the leaves were not stored, and under the paper's semantics.
-        least: witness of the robustness on the whole log if that is less than at `settled_ns`; else None.
+        settled_ns: time at which the violation became certain; None if only the end of the log decided.
+        witness: witness of the conjunct on the samples up to `settled_ns`, or on the whole log if that is
+            None. The witness is None under the paper's semantics, and if leaves were not stored.
+        least: witness of the robustness on the whole log if that is less than the robustness at
+            `settled_ns`; else None.
         requirement, title: id ("REQ-12") and title of the spec's requirement, or None.
     """
 
@@ -61,7 +62,7 @@ class Cause:
 
     @property
     def robustness_witness(self) -> Witness | None:
-        """The witness of its robustness on the whole log."""
+        """Witness of the conjunct's robustness on the whole log."""
         return self.least or self.witness
 
 
@@ -70,9 +71,10 @@ class LeastPart:
     """The conjunct of a result that has the least robustness.
 
     Attributes:
-        spec: innermost named spec that contains it.
-        name: its name in sentences: the spec's name or, if the first cause has that name, its shortened text.
-        node: its id.
+        spec: innermost named spec that contains the conjunct.
+        name: the spec's name. If the first cause or the result has that name, it is the shortened text of
+            the conjunct instead.
+        node: node id of the conjunct.
     """
 
     spec: str
@@ -86,8 +88,8 @@ class Conjunct:
     """A part of a formula that has to hold for the formula to hold.
 
     Attributes:
-        node: its id.
-        spec: innermost named spec that contains it.
+        node: node id of the part.
+        spec: innermost named spec that contains the part.
     """
 
     node: int
@@ -133,8 +135,8 @@ def find_causes(
         values: (N,), value of each node on the whole log.
         final: (N, 2), ends of each node's interval on the finished log.
         settled_ns: (N, 2), see `InstanceStream`.
-        witnesses: returns two witnesses of a node, given its settling time: the deciding witness, and the
-            witness of a lower robustness later.
+        witnesses: function of a node id and its settling time. It returns the deciding witness, and the
+            witness of a later and lower robustness.
         named: specs by name.
     """
     failing_conjuncts = [
@@ -144,7 +146,7 @@ def find_causes(
     for conjunct in sorted(
         failing_conjuncts, key=lambda conjunct: _order(conjunct.node, values, final, settled_ns)
     ):
-        # the first conjunct of each spec, in this order, is its cause
+        # the first conjunct of a spec in this order is the spec's cause
         first_by_spec.setdefault(conjunct.spec, conjunct)
     causes = []
     for conjunct in first_by_spec.values():
@@ -197,7 +199,7 @@ def _verdict(final: Floats, node: int) -> Verdict:
 
 def _number(node: int, values: Floats, final: Floats) -> float:
     value = float(values[node])
-    # an undetermined number is compared by its upper end
+    # an undetermined value is compared by its upper end
     return float(final[node, 1]) if math.isnan(value) else value
 
 
@@ -234,9 +236,9 @@ def sentences_of(
 
     Args:
         first_ns: reference time of the sentences.
-        requirement: requirement of its spec in words (see `requirement_text`).
+        requirement: requirement of the node's spec in words (see `requirement_text`).
         is_open: whether the verdict is pending, so that later samples decide it.
-        has_ended: whether it was pending until the log ended, and is violated because the log ended.
+        has_ended: whether the verdict was pending until the end of the log, and is violated because of that.
         least: witness of a lower robustness after a violation had settled.
     """
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
@@ -325,13 +327,13 @@ def verdict_sentence(
         ends: ends of its interval on the finished log.
         unit: declared unit of its robustness, or "".
         certain_since: time at which the verdict became certain.
-        has_ended: whether it was pending until the log ended, and is violated because the log ended.
-        least: conjunct with the least robustness, if the first cause does not have it.
-        least_at: time at which the first cause reached its least robustness, if it had settled earlier.
+        has_ended: whether the verdict was pending until the end of the log, and is violated because of that.
+        least: conjunct with the least robustness, if that is not the first cause's conjunct.
+        least_at: time of the first cause's least robustness, if the cause had settled earlier.
     """
     since_parts = (", certain since ", certain_since) if certain_since is not None else ()
     part_text = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
-    # times are compared as the sentence shows them
+    # compared as texts, because the sentence should not show the same time twice
     is_later = least_at is not None and str(least_at) != str(certain_since)
     least_parts = (", least at ", least_at) if least_at is not None and is_later else ()
     verdict_words = f"{verdict}{_ENDED if has_ended else ''}"
@@ -383,11 +385,13 @@ def amount_text(number: float, atom: Formula, units: Mapping[str, str] = Mapping
 def how_text(
     number: float, atom: Formula, units: Mapping[str, str], *, past: bool = False, is_violated: bool = False
 ) -> str:
-    """Return how well an atom holds, as in "fails by 3.2"; other arguments as for `amount_text`.
+    """Return how well an atom holds, as in "fails by 3.2".
 
     Args:
+        number: robustness of the atom.
+        units: declared units (see `declared_unit`).
         past: whether the text is in the past tense.
-        is_violated: whether the atom decides a violation; an atom that holds then "must not hold".
+        is_violated: whether the atom decides a violation. If it does, and it holds, it "must not hold".
     """
     outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
     unwanted_text = "must not hold, and " if is_violated and number >= 0.0 else ""
@@ -444,7 +448,10 @@ def _join(first: Sentence, *others: Sentence) -> Sentence:
 
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
-    """Return sentences on a cause's robustness, and on its beginning if earlier; "" without a witness."""
+    """Return sentences on a cause's robustness, and on the first violation if that was earlier.
+
+    The result is "" without a witness.
+    """
     if cause.robustness_witness is None:
         return Sentence("")
     reason = reason_sentence(cause.robustness_witness, first_ns=first_ns)
@@ -471,7 +478,7 @@ def missed_sentences(witness: Witness, missed: MissedResponse, first_ns: int) ->
     if witness.closest is not None:
         closest_atom, closest_ns = witness.closest
         measurement = measurement_clause(closest_atom, witness.units, first_ns)
-        # the response itself is the closest atom: one sentence suffices
+        # if the response itself is the closest atom, one sentence suffices
         if (closest_atom.text, closest_ns) == (missed.response, missed.time_ns):
             clause = Sentence(clause, ": ", measurement)
         else:
@@ -550,7 +557,7 @@ def _end(deciding: DecidingAtom) -> float:
 
 
 def _in_time(witness: Witness) -> str:
-    """Name the innermost temporal operator of the path, in parentheses."""
+    """Return the innermost temporal operator of the path in parentheses; "" without such an operator."""
     for step_index, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator in ("F", "G", "U", "R", "W", "X", "WX", "O", "H", "S", "Y"):
             return f" (within `{_step_title(witness, step_index)}`)"
@@ -558,7 +565,7 @@ def _in_time(witness: Witness) -> str:
 
 
 def _step_title(witness: Witness, step_index: int) -> str:
-    """Return the name or the text of a path's step; for a long text, the innermost name around it."""
+    """Return the name or the text of a step. A long text is replaced by the innermost name around it."""
     step = witness.path[step_index]
     names = [node.name for node in witness.path[: step_index + 1] if node.name]
     if step.name or shortened_formula(step.text) == step.text or not names:
@@ -567,9 +574,12 @@ def _step_title(witness: Witness, step_index: int) -> str:
 
 
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
-    """Name the operator within which an atom is greatest or least; without one, as `_in_time`."""
+    """Return the operator in whose window an atom is greatest or least, in parentheses.
+
+    Without such an operator, the result is that of `_in_time`.
+    """
     passed_operators: set[str] = set()
-    # one sample may settle a failing G or a holding F, and later ones may be more extreme
+    # one sample may settle a failing G or a holding F, and later samples may be more extreme
     unsure_operator = {End.HIGH: "G", End.LOW: "F"}.get(deciding.end) if witness.is_settled else None
     for step_index, step in reversed(list(enumerate(witness.path[:-1]))):
         if step.operator == unsure_operator:
@@ -677,7 +687,7 @@ def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
 
 
 def _limit(threshold: Threshold) -> str:
-    """Return the numbers that flip a verdict instead of the written number."""
+    """Return a phrase on the numbers that would flip a verdict instead of the written number."""
     flip_text, written_text = format_number(threshold.flips_at), format_number(threshold.value)
     is_more = threshold.flips_at > threshold.value
     if threshold.is_exact:
@@ -688,7 +698,7 @@ def _limit(threshold: Threshold) -> str:
 
 
 def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
-    """Return the place of the number that would flip a verdict: a constant or an atom."""
+    """Return a phrase on the place of the written number: a constant or an atom."""
     return f"for `{threshold.constant}`" if threshold.constant else f"in `{deciding.text}`"
 
 
@@ -704,7 +714,7 @@ def _unknown_sentence(witness: Witness, deciding: DecidingAtom, first_ns: int) -
 def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     """Return a sentence on the missing samples of an object or signal, or on a pause of the samples.
 
-    It names the options of a replay that leave the missing samples out, if there are any.
+    The sentence names the replay options that leave out the missing samples, if such options exist.
     """
     begin_ns, end_ns = gap.longest_ns
     length_text = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"

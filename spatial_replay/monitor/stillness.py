@@ -23,7 +23,7 @@ With 20 reports and 95 %, 151 recorded logs have no remark.
 _LEAST_OTHERS: Final = {True: 1, False: 3}
 """Minimum number of other objects, by whether they have a class.
 
-Objects without a class need more: a goal or tray rests beside two moving objects, a hand and a cube.
+The number is larger without a class: a goal or a tray may rest while a hand and a cube move.
 """
 
 
@@ -32,7 +32,7 @@ class _Reports:
     """The reports of an object after its first report.
 
     Attributes:
-        last_numbers: (3,), numbers of the newest report.
+        last_numbers: (3,), numbers of the newest report, see `_numbers`.
     """
 
     report_count: int = 0

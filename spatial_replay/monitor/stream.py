@@ -123,15 +123,15 @@ def find_instances(
     }
     spans_by_parameter = _appearances(choices, traces, start_ns, end_ns) if choices else {}
     instances: list[Instance] = []
-    named = {spec.name: spec for spec in specification.specs}
+    spec_by_name = {spec.name: spec for spec in specification.specs}
     for spec in specification.results:
         program = compile_formula(spec.formula)
         if spec.parameter is None:
-            instances.append(Instance(spec, None, program, {}, start_ns, end_ns, named))
+            instances.append(Instance(spec, None, program, {}, start_ns, end_ns, spec_by_name))
             continue
         for name, (first_ns, last_ns) in sorted(spans_by_parameter[spec.parameter].items()):
             bindings = {spec.parameter: TrackedName(name)}
-            instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1, named))
+            instances.append(Instance(spec, name, program, bindings, first_ns, last_ns + 1, spec_by_name))
     return instances
 
 
@@ -160,23 +160,25 @@ def _appearances(
 ) -> dict[str | None, dict[str, tuple[int, int]]]:
     """Return the objects that fit each choice, with the times of their first and last samples."""
     spans: dict[str, tuple[int, int]] = {}
-    fitting: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
+    names_by_parameter: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
     for trace in traces:
         begin, end = window_of(trace.times_ns, start_ns, end_ns)
-        times = trace.times_ns[begin:end]
+        times_ns = trace.times_ns[begin:end]
         for name, rows in zip(trace.names, trace.rows[begin:end].T, strict=True):
             present_samples = np.flatnonzero(rows != ABSENT)
             if not len(present_samples):
                 continue
-            first_ns = spans[name][0] if name in spans else int(times[present_samples[0]])
-            spans[name] = (first_ns, int(times[present_samples[-1]]))
+            first_ns = spans[name][0] if name in spans else int(times_ns[present_samples[0]])
+            spans[name] = (first_ns, int(times_ns[present_samples[-1]]))
             # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
                 # an object may change its class: one fitting sample suffices
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
-                    fitting[parameter].add(name)
-    return {parameter: {name: spans[name] for name in names} for parameter, names in fitting.items()}
+                    names_by_parameter[parameter].add(name)
+    return {
+        parameter: {name: spans[name] for name in names} for parameter, names in names_by_parameter.items()
+    }
 
 
 NEVER = -1
@@ -272,19 +274,19 @@ class InstanceStream:
         Args:
             empty: allocator of the series.
         """
-        times = scene.trace.times_ns[scene.skip :]
-        begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
-        times = times[begin:end]
+        times_ns = scene.trace.times_ns[scene.skip :]
+        begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
+        times_ns = times_ns[begin:end]
         program = self.instance.program
-        if not len(times):
+        if not len(times_ns):
             no_series = np.empty((len(program.reports), 4, 0))
-            return SeriesBlock(times, no_series, np.empty((1, len(program.leaves), 0)))
+            return SeriesBlock(times_ns, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
         # positions in the scene suffice: it starts with the log, or as far back as any term looks
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
-        leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
-        return self.extend_leaves(leaves, times, empty)
+        leaves = self._evaluator.leaves_within_log(leaves, positions, times_ns, first_ns)
+        return self.extend_leaves(leaves, times_ns, empty)
 
     def extend_leaves(self, leaves: Floats, times: Integers, empty: Empty = np.empty) -> SeriesBlock:
         """Add one or more samples by their leaves."""
@@ -293,26 +295,26 @@ class InstanceStream:
         if self._evaluator.has_open_end:
             self._settle(times, series)
         if self.first_satisfied_ns is None:
-            satisfied = np.flatnonzero(series[0, 0] >= 0.0)
-            self.first_satisfied_ns = int(times[satisfied[0]]) if len(satisfied) else None
+            satisfied_samples = np.flatnonzero(series[0, 0] >= 0.0)
+            self.first_satisfied_ns = int(times[satisfied_samples[0]]) if len(satisfied_samples) else None
         return SeriesBlock(times, series, leaves)
 
     def _settle(self, times_ns: Integers, series: Floats) -> None:
         """Set `settled_ns` of the nodes that became certain in these samples."""
-        newest = series[:, :, -1]
-        for column, is_settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
+        newest_series = series[:, :, -1]
+        for column, is_settled in enumerate((newest_series[:, 2] >= 0.0, newest_series[:, 3] < 0.0)):
             # certainty is permanent: only nodes that are certain at the newest sample are searched, once
             for node in np.flatnonzero(is_settled & (self.settled_ns[:, column] == NEVER)):
                 self.settled_ns[node, column] = times_ns[_first_certain(series[node], column)]
 
 
-def _first_certain(series: Floats, column: int) -> int:
+def _first_certain(node_series: Floats, column: int) -> int:
     """Return the first sample at which a node is certainly satisfied (column 0) or violated (column 1).
 
     Args:
         series: (4, T), series of the node, certain at the last sample.
     """
-    ends, is_violation = series[2 + column], bool(column)
+    ends, is_violation = node_series[2 + column], bool(column)
     return bisect_left(range(len(ends)), True, key=lambda k: bool(ends[k] >= 0.0) != is_violation)
 
 
@@ -330,7 +332,7 @@ class EvaluationStream:
         self.streams = tuple(InstanceStream(instance, semantics, samples) for instance in instances)
         self._regions = regions
         self._reach = look_back([stream.instance.formula for stream in self.streams])
-        self._before: Trace | None = None
+        self._last_trace: Trace | None = None
 
     def extend(self, trace: Trace, empty: Empty = np.empty) -> list[SeriesBlock]:
         """Add the next samples; return one block for each of `streams`.
@@ -344,34 +346,35 @@ class EvaluationStream:
         if not len(trace):
             return [stream.extend(TraceScene(trace, self._regions)) for stream in self.streams]
         skip = 0
-        if self._before is not None:
-            before_ns = self._before.times_ns[-1]
-            if before_ns >= trace.times_ns[0]:
-                time, last_time = times_apart(int(trace.times_ns[0]), int(before_ns))
+        if self._last_trace is not None:
+            last_ns = self._last_trace.times_ns[-1]
+            if last_ns >= trace.times_ns[0]:
+                time_text, last_text = times_apart(int(trace.times_ns[0]), int(last_ns))
                 raise TraceError(
-                    f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
+                    f"a sample at {time_text} follows one at {last_text};"
+                    " give samples in the order of their times"
                 )
             # a term that looks back reads footprints of earlier samples
             if self._reach:
-                recent = tail(self._before, self._reach)
-                skip = len(recent)
-                trace = Trace.concatenate([recent, trace])
-        self._before = trace
+                recent_trace = tail(self._last_trace, self._reach)
+                skip = len(recent_trace)
+                trace = Trace.concatenate([recent_trace, trace])
+        self._last_trace = trace
         scene = TraceScene(trace, self._regions, skip)
         return [stream.extend(scene, empty) for stream in self.streams]
 
 
 def one_after_another(traces: Sequence[Trace]) -> Trace:
     """Join traces regardless of their times: the index of each sample becomes its time."""
-    numbered, begin = [], 0
+    renumbered_traces, first_index = [], 0
     for trace in traces:
         # times of different traces overlap, and those of one trace have to increase
-        times_ns = np.arange(begin, begin + len(trace), dtype=np.int64)
-        numbered.append(
+        times_ns = np.arange(first_index, first_index + len(trace), dtype=np.int64)
+        renumbered_traces.append(
             replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
         )
-        begin += len(trace)
-    return Trace.concatenate(numbered)
+        first_index += len(trace)
+    return Trace.concatenate(renumbered_traces)
 
 
 def run_together(
@@ -388,8 +391,8 @@ def run_together(
         for the next trace.
     """
     leaves_by_instance = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
-    longest = max(map(len, traces), default=0)
-    streams = [InstanceStream(instance, semantics, longest) for instance in instances]
+    longest_length = max(map(len, traces), default=0)
+    streams = [InstanceStream(instance, semantics, longest_length) for instance in instances]
     begin = 0
     for trace in traces:
         end = begin + len(trace)
@@ -449,10 +452,10 @@ class LiveStream:
             self._leaves.look_at(sample)
             return [None] * len(self._evaluators)
         room = self._leaves.fill_room(sample)
-        numbers: list[Floats | None] = []
+        node_numbers: list[Floats | None] = []
         for run, first_leaf in self._online_runs:
-            numbers.append(run.add_sample(room, first_leaf, time_ns))
-        return numbers
+            node_numbers.append(run.add_sample(room, first_leaf, time_ns))
+        return node_numbers
 
     def leaves(self, place: int) -> Floats:
         """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.

@@ -117,7 +117,7 @@ def idle_templates(
         each: choice of objects for each template parameter, such as "class:person".
         classes: classes of the log.
     """
-    untested, evaluated_ids = [], {id(formula) for formula in evaluated}
+    untested_parts, evaluated_ids = [], {id(formula) for formula in evaluated}
     for spec in specs:
         if spec.parameter is None or id(spec.formula) in evaluated_ids:
             continue
@@ -127,8 +127,8 @@ def idle_templates(
         if kind == "class":
             hint = nearest_hint(class_name, sorted(classes))
             message += f" The log never has the class {printable(class_name)!r}{f'; {hint}' if hint else '.'}"
-        untested.append(UntestedPart(None, text, "no instances", Sentence(message)))
-    return tuple(untested)
+        untested_parts.append(UntestedPart(None, text, "no instances", Sentence(message)))
+    return tuple(untested_parts)
 
 
 def find_vacuous(
@@ -148,22 +148,22 @@ def find_vacuous(
         return ()
     nodes = nodes_of(instance.formula)
     implications = _implications_of(instance.formula)
-    windows, holding = _Windows(times_ns), _Holding(instance, leaves, times_ns)
-    scopes = _scopes(instance.formula, windows, holding)
-    active = _scopes(implications.formula, windows, holding, is_conditional=True)
+    windows, holding_samples = _Windows(times_ns), _Holding(instance, leaves, times_ns)
+    scopes = _scopes(instance.formula, windows, holding_samples)
+    active_scopes = _scopes(implications.formula, windows, holding_samples, is_conditional=True)
     idle_parts = [
-        *_empty_windows(nodes, scopes, implications.by_node(active, len(nodes)), windows, evidence),
-        *_idle_implications(implications, active, holding, evidence),
+        *_empty_windows(nodes, scopes, implications.by_node(active_scopes, len(nodes)), windows, evidence),
+        *_idle_implications(implications, active_scopes, holding_samples, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
     if infinite is not None:
-        offline = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
-        path = deciding_path(offline, 0, infinite)
+        offline_nodes = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+        path = deciding_path(offline_nodes, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         # a missed goal (`F`) is -inf as well: -inf alone does not show that nothing was tested
         is_idle = infinite is End.LOW or (
-            _leaves_all_out(offline, path, evidence)
+            _leaves_all_out(offline_nodes, path, evidence)
             and is_tested_by_nothing(evidence, leaves, times_ns, Verdict.VIOLATED)
         )
         if is_idle and node not in {part.node for part in idle_parts}:
@@ -196,17 +196,23 @@ def _may_be_empty(node: Temporal) -> bool:
 
 
 class _Idle(NamedTuple):
-    """An untested part; `what` continues the sentence that begins with its text."""
+    """An untested part; `predicate` continues the sentence that begins with its text."""
 
     node: int
     reason: Reason
-    what: tuple[str | Instant, ...]
+    predicate: tuple[str | Instant, ...]
     time_ns: int | None = None
 
 
-def _part(idle: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
+def _part(idle_part: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
     text = format_formula(evidence.bound(node))
-    return UntestedPart(idle.node, text, idle.reason, Sentence(f"`{text}` ", *idle.what), idle.time_ns)
+    return UntestedPart(
+        idle_part.node,
+        text,
+        idle_part.reason,
+        Sentence(f"`{text}` ", *idle_part.predicate),
+        idle_part.time_ns,
+    )
 
 
 # ------------------------------------------------------------------------------------------ implications
@@ -222,9 +228,9 @@ class _Implications(NamedTuple):
     formula: Formula
     nodes: tuple[int, ...]
 
-    def by_node(self, scopes: Sequence[_Samples], count: int) -> list[_Samples]:
-        """Return for each of `count` original nodes the samples (T,) of the nodes that stand for it."""
-        samples_by_node = [np.zeros(len(scopes[0]), np.bool_) for _ in range(count)]
+    def by_node(self, scopes: Sequence[_Samples], node_count: int) -> list[_Samples]:
+        """Return for each of `node_count` original nodes the samples (T,) of the nodes that stand for it."""
+        samples_by_node = [np.zeros(len(scopes[0]), np.bool_) for _ in range(node_count)]
         for node, scope in zip(self.nodes, scopes, strict=True):
             samples_by_node[node] |= scope
         return samples_by_node
@@ -250,13 +256,13 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
         return _Implications(Boolean("not", (negation.formula,)), nodes)
     is_negated = operator == "not" and operator_of(operands[0][0]) == "and"
     if sign > 0 and (operator == "or" or is_negated):
-        parts = list(_operands_with_ids(*operands[0])) if is_negated else operands
+        disjuncts = list(_operands_with_ids(*operands[0])) if is_negated else operands
         # `not` marks the conditions of a disjunction, and the response in a negated conjunction
-        are_conditions = [(operator_of(part) == "not") is not is_negated for part, _ in parts]
+        are_conditions = [(operator_of(disjunct) == "not") is not is_negated for disjunct, _ in disjuncts]
         sides = [
             [
-                _implications_of(*_without_negation(*part), 0 if is_condition else 1)
-                for part, is_condition in zip(parts, are_conditions, strict=True)
+                _implications_of(*_without_negation(*disjunct), 0 if is_condition else 1)
+                for disjunct, is_condition in zip(disjuncts, are_conditions, strict=True)
                 if is_condition is is_chosen_side
             ]
             for is_chosen_side in (True, False)
@@ -273,9 +279,9 @@ def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implica
             return _join_implications("->", (_join_implications("or", sides[0], node), response), node)
     if not isinstance(formula, Boolean | Temporal):
         return _Implications(formula, (node,))
-    signs = [_sign_below(operator, place, sign) for place in range(len(operands))]
+    signs = [_sign_below(operator, operand_index, sign) for operand_index in range(len(operands))]
     operand_parts = [
-        _implications_of(*part, sign_below) for part, sign_below in zip(operands, signs, strict=True)
+        _implications_of(*operand, sign_below) for operand, sign_below in zip(operands, signs, strict=True)
     ]
     new_formula = replace(formula, operands=tuple(part.formula for part in operand_parts))
     return _Implications(
@@ -305,13 +311,13 @@ def _body(node: Quantified) -> Formula:
     return _implications_of(node.body, sign=int(node.quantifier == "forall")).formula
 
 
-def _sign_below(operator: str, place: int, sign: int) -> int:
+def _sign_below(operator: str, operand_index: int, sign: int) -> int:
     if operator == "not":
         return -sign
-    if operator in ("xor", "<->") or (operator, place) == ("->", 0):
+    if operator in ("xor", "<->") or (operator, operand_index) == ("->", 0):
         return 0
     # a negated goal has to fail at all samples, as in `not F`
-    is_goal = (operator, place) in _GOALS
+    is_goal = (operator, operand_index) in _GOALS
     return 0 if operator in _EVERYWHERE and is_goal is (sign > 0) else sign
 
 
@@ -357,7 +363,7 @@ class _Windows:
 
 
 def _scopes(
-    formula: Formula, windows: _Windows, holding: _Holding, *, is_conditional: bool = False
+    formula: Formula, windows: _Windows, holding_samples: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
     """Return for each node the samples (T,) at which the number of the formula depends on it.
 
@@ -371,38 +377,38 @@ def _scopes(
     scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
     # parents precede their operands, so an entry is final when the loop reaches it
     for scope, (node, operands) in zip(scopes, tree, strict=True):
-        for place, operand in enumerate(operands):
+        for operand_index, operand in enumerate(operands):
             operand_scope = scope
             if isinstance(node, Temporal):
-                operand_scope = _below(node, place, scope, windows)
-                judged_operand = judged_operator(node).operands[place]
+                operand_scope = _below(node, operand_index, scope, windows)
+                judged_operand = judged_operator(node).operands[operand_index]
                 if operator_of(judged_operand) in ("given", "with"):
-                    operand_scope = operand_scope & holding(operands_of(judged_operand)[0])
-            elif is_conditional and place and operator_of(node) == "->" and scope.any():
-                operand_scope = scope & holding(operands_of(node)[0])
+                    operand_scope = operand_scope & holding_samples(operands_of(judged_operand)[0])
+            elif is_conditional and operand_index and operator_of(node) == "->" and scope.any():
+                operand_scope = scope & holding_samples(operands_of(node)[0])
             scopes[operand] = operand_scope
     return scopes
 
 
-def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) -> _Samples:
+def _below(formula: Temporal, operand_index: int, scope: _Samples, windows: _Windows) -> _Samples:
     """Return the samples at which an operand counts, given the samples `scope` of its operator."""
-    begin, end = windows(formula)
-    counting = np.flatnonzero(scope & (begin < end))
-    begin, end = begin[counting], end[counting]
-    if place < len(formula.operands) - 1:
+    begins, ends = windows(formula)
+    counting_samples = np.flatnonzero(scope & (begins < ends))
+    begins, ends = begins[counting_samples], ends[counting_samples]
+    if operand_index < len(formula.operands) - 1:
         # the left operand counts from the operator's sample to before the right operand's sample
         if formula.operator == "S":
-            begin, end = begin + 1, counting + 1
+            begins, ends = begins + 1, counting_samples + 1
         else:
-            begin = counting
-            end = end - (formula.operator != "W")
+            begins = counting_samples
+            ends = ends - (formula.operator != "W")
     # +1 where a window begins, -1 after its end: the running sum counts the windows over a sample
-    edges = np.zeros(len(scope) + 1, np.int64)
-    is_open = begin < end
+    window_edges = np.zeros(len(scope) + 1, np.int64)
+    is_open = begins < ends
     # `add.at`, because several windows may begin or end at one sample
-    np.add.at(edges, begin[is_open], 1)
-    np.add.at(edges, end[is_open], -1)
-    is_covered: _Samples = np.cumsum(edges[:-1]) > 0
+    np.add.at(window_edges, begins[is_open], 1)
+    np.add.at(window_edges, ends[is_open], -1)
+    is_covered: _Samples = np.cumsum(window_edges[:-1]) > 0
     return is_covered
 
 
@@ -412,7 +418,7 @@ def _below(formula: Temporal, place: int, scope: _Samples, windows: _Windows) ->
 def _empty_windows(
     nodes: Sequence[Formula],
     scopes: Sequence[_Samples],
-    active: Sequence[_Samples],
+    active_scopes: Sequence[_Samples],
     windows: _Windows,
     evidence: Evidence,
 ) -> Iterator[_Idle]:
@@ -422,34 +428,37 @@ def _empty_windows(
         scopes: samples at which the robustness depends on each node.
         active: samples at which conditions hold, so that the verdict depends on each node.
     """
-    for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active, strict=True)):
+    for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active_scopes, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
-        (begin, end), times_ns = windows(node), windows.times_ns
-        counts = active_scope if active_scope.any() else scope
-        if not (begin < end)[counts].any():
-            place_text = " where it counts" if (begin < end)[scope].any() else ""
+        (begins, ends), times_ns = windows(node), windows.times_ns
+        is_relevant = active_scope if active_scope.any() else scope
+        if not (begins < ends)[is_relevant].any():
+            place_text = " where it counts" if (begins < ends)[scope].any() else ""
             predicate: tuple[str | Instant, ...] = (f"no sample of the log lies in its window{place_text}",)
-            begin_sample = int(begin[counts][0])
+            begin_sample = int(begins[is_relevant][0])
             if node.operator in _NEXT:
                 predicate = (f"the log has no {_NEXT[node.operator]}{place_text}",)
             elif 0 < begin_sample < len(times_ns):
                 instants = (
-                    Instant(int(time), evidence.first_ns())
-                    for time in times_ns[begin_sample - 1 : begin_sample + 1]
+                    Instant(int(time_ns), evidence.first_ns())
+                    for time_ns in times_ns[begin_sample - 1 : begin_sample + 1]
                 )
-                first_text = "first " if counts.sum() > 1 else ""
+                first_text = "first " if is_relevant.sum() > 1 else ""
                 predicate += (f", {first_text}between those at ", next(instants), " and ", next(instants))
             yield _Idle(identifier, "empty window", ("was never tested: ", *predicate, "."))
 
 
 def _idle_implications(
-    implications: _Implications, active: Sequence[_Samples], holding: _Holding, evidence: Evidence
+    implications: _Implications,
+    active_scopes: Sequence[_Samples],
+    holding_samples: _Holding,
+    evidence: Evidence,
 ) -> Iterator[_Idle]:
     nodes = nodes_of(implications.formula)
-    for identifier, node, scope in zip(implications.nodes, nodes, active, strict=True):
+    for identifier, node, scope in zip(implications.nodes, nodes, active_scopes, strict=True):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
-            is_held = holding(node.operands[0])
+            is_held = holding_samples(node.operands[0])
             if not is_held[scope].any():
                 yield _untested_implication(
                     identifier, node, evidence, " where it counts" if is_held.any() else ""
@@ -457,10 +466,10 @@ def _idle_implications(
 
 
 def _untested_implication(
-    identifier: int, implication: Boolean, evidence: Evidence, where: str = ""
+    identifier: int, implication: Boolean, evidence: Evidence, place_text: str = ""
 ) -> _Idle:
     antecedent = format_formula(evidence.bound(implication.operands[0]))
-    predicate = f"was never tested: `{antecedent}` never held{where}."
+    predicate = f"was never tested: `{antecedent}` never held{place_text}."
     return _Idle(identifier, "antecedent never held", (predicate,))
 
 
@@ -469,13 +478,13 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Quantified) or not scope.any():
             continue
-        inner = list(_implications(node))
-        if not inner:
+        inner_implications = list(_implications(node))
+        if not inner_implications:
             continue
-        columns = evidence.columns([evidence.bound(ever_holds) for _, ever_holds, _ in inner])
-        high = columns[low_and_high(len(columns), wide=True)[1]]
-        for (implication, _, is_nested), ends in zip(inner, high, strict=True):
-            if not (ends[scope] >= 0.0).any():
+        columns = evidence.columns([evidence.bound(ever_holds) for _, ever_holds, _ in inner_implications])
+        high_ends = columns[low_and_high(len(columns), wide=True)[1]]
+        for (implication, _, is_nested), high_end in zip(inner_implications, high_ends, strict=True):
+            if not (high_end[scope] >= 0.0).any():
                 yield _untested_implication(
                     identifier, implication, evidence, " where it counts" if is_nested else ""
                 )
@@ -487,11 +496,11 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
     The second value is the formula that its antecedent holds for some member. An implication in another one's
     consequent also needs that antecedent; the third value is then True.
     """
-    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
-    while stack:
-        current, conditions = stack.pop()
-        if isinstance(current, Quantified):
-            for implication, ever_holds, is_nested in _implications(current):
+    pending_parts: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
+    while pending_parts:
+        part, conditions = pending_parts.pop()
+        if isinstance(part, Quantified):
+            for implication, ever_holds, is_nested in _implications(part):
                 body = _all((*conditions, ever_holds))
                 yield (
                     implication,
@@ -499,12 +508,12 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
                     is_nested or bool(conditions),
                 )
             continue
-        operands = [(operand, conditions) for operand in operands_of(current)]
-        if isinstance(current, Boolean) and current.operator == "->":
-            holding = (*conditions, current.operands[0])
-            yield current, replace(node, quantifier="exists", body=_all(holding)), bool(conditions)
-            operands[1] = (current.operands[1], holding)
-        stack.extend(reversed(operands))
+        operands = [(operand, conditions) for operand in operands_of(part)]
+        if isinstance(part, Boolean) and part.operator == "->":
+            antecedents = (*conditions, part.operands[0])
+            yield part, replace(node, quantifier="exists", body=_all(antecedents)), bool(conditions)
+            operands[1] = (part.operands[1], antecedents)
+        pending_parts.extend(reversed(operands))
 
 
 def _all(formulas: tuple[Formula, ...]) -> Formula:
@@ -553,10 +562,10 @@ def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence)
         return leaves_out(formula) and deciding_atom(scene, evidence.bound(formula), path.end) is None
     if not isinstance(formula, Temporal):
         return False
-    begin, end = windows_of(formula, nodes.times_ns)
-    window = range(int(begin[sample]), int(end[sample]))
+    begins, ends = windows_of(formula, nodes.times_ns)
+    window = range(int(begins[sample]), int(ends[sample]))
     return len(window) > 0 and any(
-        all(nodes.is_left_out(operand, place) for place in window) for operand in operands
+        all(nodes.is_left_out(operand, window_sample) for window_sample in window) for operand in operands
     )
 
 
@@ -574,9 +583,9 @@ def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idl
         isinstance(part, Equality) for part in iter_parts(node)
     ):
         # an equality, as of a mode, is infinite by definition, also with members in its groups
-        count = len(node.variables) if isinstance(node, Quantified) else 1
-        members = "no object is" if count == 1 else f"fewer than {count} objects are"
-        predicate = ("decides at ", instant, f", where {members} in its group.")
+        needed_count = len(node.variables) if isinstance(node, Quantified) else 1
+        members_text = "no object is" if needed_count == 1 else f"fewer than {needed_count} objects are"
+        predicate = ("decides at ", instant, f", where {members_text} in its group.")
         yield _Idle(identifier, "no members", predicate, instant.time_ns)
 
 
@@ -584,12 +593,12 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
     """Return remarks on the goals (`F`) of a formula that already hold at the first sample."""
     order = evidence.instance.program.leaves
     sentences: list[Sentence] = []
-    waiting = [evidence.instance.formula]
-    while waiting:
-        node = waiting.pop()
+    pending_nodes = [evidence.instance.formula]
+    while pending_nodes:
+        node = pending_nodes.pop()
         if isinstance(node, Boolean) and node.operator in ("and", "spec"):
             # reversed on the stack, so that goals come in the order of the text
-            waiting += reversed(node.operands)
+            pending_nodes += reversed(node.operands)
         elif (
             isinstance(node, Temporal)
             and node.operator == "F"
@@ -625,8 +634,8 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     """
     instance = evidence.instance
     order = instance.program.leaves
-    unknown = _with_unknown_leaves(order, leaves, evidence)
-    known_leaves = leaves if verdict is Verdict.SATISFIED else unknown
+    unknown_leaves = _with_unknown_leaves(order, leaves, evidence)
+    known_leaves = leaves if verdict is Verdict.SATISFIED else unknown_leaves
     # each leaf is evaluated twice: unknown, and with its numbers for antecedents
     stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
 
@@ -654,7 +663,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
                 return stand_ins[leaf_key(formula)]
         return formula
 
-    all_leaves = joined_channels([unknown, known_leaves], axis=1)
+    all_leaves = joined_channels([unknown_leaves, known_leaves], axis=1)
     formula = with_stand_ins(_implications_of(instance.formula).formula)
     nodes = evaluate_offline(formula, (*order, *stand_ins.values()), all_leaves, times_ns)
     return final_verdict(*nodes.interval(0)) is verdict
@@ -668,18 +677,18 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
     low, high = low_and_high(len(leaves), wide=True)
     unknown_leaves = roomy((2, *leaves.shape[1:]), np.float64)
     unknown_leaves[0], unknown_leaves[1] = -np.inf, np.inf
-    for place, leaf in enumerate(order):
-        bound = evidence.bound(leaf)
-        groups = list(dict.fromkeys(_open_groups(bound)))
-        if is_about_having_rates(bound):
-            unknown_leaves[:, place] = leaves[[low, high], place]
-        elif isinstance(bound, Quantified):
-            column = evidence.columns([_without_tests(bound)])
+    for leaf_index, leaf in enumerate(order):
+        bound_leaf = evidence.bound(leaf)
+        groups = list(dict.fromkeys(_open_groups(bound_leaf)))
+        if is_about_having_rates(bound_leaf):
+            unknown_leaves[:, leaf_index] = leaves[[low, high], leaf_index]
+        elif isinstance(bound_leaf, Quantified):
+            column = evidence.columns([_without_tests(bound_leaf)])
             # the ends with uncertainty
-            unknown_leaves[:, place] = in_channels(column, 4)[2:, 0]
+            unknown_leaves[:, leaf_index] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
-            unknown_leaves[:, place, is_empty] = leaves[[low, high], place][:, is_empty]
+            unknown_leaves[:, leaf_index, is_empty] = leaves[[low, high], leaf_index][:, is_empty]
     return unknown_leaves
 
 
@@ -725,10 +734,12 @@ def find_cut_window(
         return None
     ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
-    cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
+    cut_steps = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
     # rank 1 or -1: decided by a cut window, but not by a whole one
-    decided = [step for step in cut if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}]
-    step = decided[-1] if decided else path.steps[0]
+    deciding_steps = [
+        step for step in cut_steps if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}
+    ]
+    step = deciding_steps[-1] if deciding_steps else path.steps[0]
     return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
 
 
@@ -746,17 +757,19 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
     else:
         is_time = bound.unit == "ns"
         # positions in ns or in samples: one calculation serves both units
-        place, last = (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
-        missing_length = place + bound.upper - last
+        position, last_position = (
+            (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
+        )
+        missing_length = position + bound.upper - last_position
         # a window in samples includes both ends
-        length = bound.upper - bound.lower + (not is_time)
-        seen_length = max(length - missing_length, 0)
+        window_length = bound.upper - bound.lower + (not is_time)
+        seen_length = max(window_length - missing_length, 0)
         left_text, whole_text = (
-            time_text(n) if is_time else plural(n, "sample") for n in (missing_length, length)
+            time_text(n) if is_time else plural(n, "sample") for n in (missing_length, window_length)
         )
         seen_text = time_text(seen_length) if is_time else f"{seen_length:,}"
         reach_text = f"its window ends {left_text} after the log"
-        reach_text += f" ({seen_text} of {whole_text} seen)" if length else ""
+        reach_text += f" ({seen_text} of {whole_text} seen)" if window_length else ""
     return _Idle(
         identifier,
         "cut window",
@@ -765,7 +778,9 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
     )
 
 
-def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violated: bool) -> OfflineNodes:
+def _rank_by_verdict(
+    cut_nodes: OfflineNodes, whole_nodes: OfflineNodes, *, is_violated: bool
+) -> OfflineNodes:
     """Return nodes with ranks as numbers: decided with whole windows, only with cut ones, or undecided.
 
     Minima, maxima and negations preserve the order of ranks, so their deciding path ends at a cut window.
@@ -773,7 +788,9 @@ def _rank_by_verdict(cut_nodes: OfflineNodes, whole: OfflineNodes, *, is_violate
     # 0 satisfies, so only a violation needs a strict comparison
     holds = np.greater if is_violated else np.greater_equal
     end_pairs = [
-        nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole)
+        nodes.columns[[*low_and_high(len(nodes.columns), wide=True)]] for nodes in (cut_nodes, whole_nodes)
     ]
-    low = sum(holds(low, 0.0) * 1.0 for low, _ in end_pairs)
-    return replace(cut_nodes, columns=np.stack([low, -sum(holds(-high, 0.0) * 1.0 for _, high in end_pairs)]))
+    low_ranks = sum(holds(low, 0.0) * 1.0 for low, _ in end_pairs)
+    return replace(
+        cut_nodes, columns=np.stack([low_ranks, -sum(holds(-high, 0.0) * 1.0 for _, high in end_pairs)])
+    )

@@ -12,7 +12,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.text import nearest_hint
 
 Semantics: TypeAlias = Literal["ltlf", "paper"]
-"""Finite-trace robustness, or Definition 16 of the paper."""
+"""Finite-trace robustness ("ltlf"), or Definition 16 of the paper."""
 
 FAILING_KINDS: Final = ("vacuous", "cut", "unknown", "left", "doubtful")
 """Kinds of results that `fail_on` can turn into failures."""
@@ -38,8 +38,8 @@ def checked_kinds(name: str, kinds: object, known: Sequence[str]) -> frozenset[s
 class Verdict(StrEnum):
     """The verdict of a formula.
 
-    At the end of a log it is satisfied, violated or unknown. During a run it is pending until no
-    continuation can change it.
+    At the end of a log, the verdict is satisfied, violated or unknown. During a run, it is pending until
+    no continuation can change it.
     """
 
     SATISFIED = "satisfied"
@@ -87,18 +87,21 @@ _BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdi
 
 
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
-    """Return the worst verdict: violated, unknown, pending, satisfied. Without any, it is satisfied."""
+    """Return the worst verdict, in the order violated, unknown, pending, satisfied.
+
+    Without verdicts, the result is satisfied.
+    """
     return max(verdicts, key=_BEST_FIRST.index, default=Verdict.SATISFIED)
 
 
 def require_ltlf(semantics: Semantics, what: str) -> None:
-    """Check that the semantics is "ltlf"; the paper's defines no signals, windows and witnesses.
+    """Check that the semantics is "ltlf". The paper's semantics defines no signals, windows or witnesses.
 
     Args:
         what: subject of the error message.
 
     Raises:
-        UsageError: the semantics is another one.
+        UsageError: the semantics is "paper".
     """
     if semantics != "ltlf":
         raise UsageError(f"{what} is not defined under the semantics {semantics!r}; evaluate with 'ltlf'")
