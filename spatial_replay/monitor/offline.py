@@ -1,11 +1,11 @@
-"""Offline robustness: rho(t, node) of every node at each sample t, from t to the last sample.
+"""Offline robustness: rho(t, node) of every node at each sample t, evaluated from t to the last sample.
 
 A monitor, in contrast, computes robustness only at the first and the newest sample. A sliding window is
 evaluated as a separate log at each position.
 
 The last sample is known, so each operator takes one pass, independent of the width of its window.
 A future operator is a past operator in reversed time: kernels count *steps* 0, 1, … and look back. Step i is
-sample begin + i, or sample end - 1 - i for a future operator.
+sample begin + i. For a future operator, it is sample end - 1 - i.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _run_past(code: int, first_operand: Floats, second_operand: Floats, target: 
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing_value: float
 ) -> None:
-    """Delay a column by `distance`: each step gets the value of the latest step that far back."""
+    """Delay a column: each step gets the value of the latest step that is at least `distance` earlier."""
     source_step = -1
     for step in range(steps.length):
         while source_step < step and _distance(steps, unit, source_step + 1, step) >= distance:
@@ -98,7 +98,9 @@ def _run_delay(
 def _slide(
     source: Floats, target: Floats, steps: Steps, unit: int, near: int, far: int, sign: float, extrema: Floats
 ) -> None:
-    """Compute the sliding maximum (sign 1) or minimum (sign -1) over the steps from `far` to `near` back.
+    """Compute the sliding maximum (sign 1) or minimum (sign -1) of a column.
+
+    The window of a step has the steps that are `near` to `far` earlier.
 
     Two stacks hold the window. `extrema` has the extremum from each older step up to `middle`, and
     `recent_extremum` is the extremum from `middle` on. Each step enters each stack once, regardless of the
@@ -112,7 +114,7 @@ def _slide(
             window_end += 1
         while window_start < window_end and _distance(steps, unit, window_start, step) > far:
             window_start += 1
-        # the older stack is used up: move the recent steps into it, with running extrema from the newest down
+        # the older stack is empty: move the recent steps into it, with running extrema from the newest down
         if window_start >= middle:
             extremum = -np.inf
             for older_step in range(window_end - 1, window_start - 1, -1):
@@ -148,7 +150,7 @@ def _run_boolean(
 def run_offline(
     rows: Integers, leaves: Floats, stamps: Integers, begin: int, end: int, columns: Floats, extrema: Floats
 ) -> None:
-    """Compute all rows on the samples from `begin` to before `end`, without any others.
+    """Compute all rows on the samples from `begin` to before `end` as on a separate log.
 
     Args:
         rows: (R, OFFLINE_WIDTH), operands first.
@@ -169,7 +171,7 @@ def run_offline(
             mirror_channel = channel ^ 1 if channel_count > 1 else channel
             target = columns[channel, row[codes.OFFLINE_TARGET]]
             if code == codes.LEAF:
-                # element by element: the error for slices of unequal length takes seconds to compile
+                # element by element, because a slice assignment's check of lengths takes seconds to compile
                 for sample in range(begin, end):
                     target[sample] = leaves[channel, row[1], sample]
                 continue
@@ -190,7 +192,7 @@ def run_windows(
     rows: Integers, leaves: Floats, stamps: Integers, starts: Integers, columns: Floats, extrema: Floats,
     result: Floats,
 ) -> None:  # fmt: skip
-    """Evaluate all nodes on a sliding window: at the start of the window that ends at each sample.
+    """Evaluate all nodes on a sliding window, at the start of each window. A window ends at each sample.
 
     Args:
         starts: (T,), first sample of each window.
@@ -204,7 +206,7 @@ def run_windows(
 
 
 _MIRRORED = MappingProxyType({"X": "Y", "F": "O", "G": "H", "U": "S"})
-"""Future operators, with the past operators that equal them in reversed time."""
+"""Past operators by the future operators that they equal in reversed time."""
 
 
 class OfflineTable(SignalTable):
@@ -222,7 +224,7 @@ class OfflineTable(SignalTable):
     def instructions(self, nodes: Sequence[int]) -> Integers:
         """Return instruction rows with their input and output columns.
 
-        Node n writes column n. Rows that belong to no node write the columns after these.
+        Node n writes column n. Rows without a node write the columns after the nodes' columns.
 
         Args:
             nodes: (N,), row of each node.
@@ -242,7 +244,7 @@ class OfflineTable(SignalTable):
                 else (column_of_row[first_operand], column_of_row[second_operand])
             )
             instruction_rows.append((code, *operands, *window, column_of_row[row_number]))
-        # equal nodes share a row, but each has its own column: `and` of a column with itself copies it
+        # equal nodes share a row, but each has its own column: `and` of a column with itself is a copy
         copies = [
             (codes.AND, column_of_row[row], column_of_row[row], 0, 0, 0, n) for n, row in enumerate(nodes)
         ]
@@ -257,8 +259,8 @@ class OfflineNodes:
     Attributes:
         times_ns: (T,).
         columns: (C, N, T), ends of each node's interval, in channels (see `online.codes`).
-        conditions: (C, T) by operand id, conditions that all rates of an operand have values. Only operands
-            with rates below a temporal operator have one (see `_judged_operands`).
+        conditions: (C, T) by operand id, the condition that all rates of the operand have values. Only
+            operands with rates below a temporal operator have a condition (see `_judged_operands`).
         goes_on: whether samples may follow.
     """
 
@@ -274,12 +276,16 @@ class OfflineNodes:
         return nodes_with_operands(self.formula)
 
     def ends(self, node: int, *, wide: bool = True) -> tuple[Floats, Floats]:
-        """Return the ends (T,) of a node's robustness at each sample, with uncertainty if `wide`."""
+        """Return the ends (T,) of a node's robustness at each sample.
+
+        Args:
+            wide: whether the ends include the uncertainty of objects.
+        """
         low, high = low_and_high(len(self.columns), wide=wide)
         return self.columns[low, node], self.columns[high, node]
 
     def judged_ends(self, operand: int) -> tuple[Floats, Floats]:
-        """Return the ends (T,) of an operand, neutral at samples that its operator leaves out."""
+        """Return the ends (T,) of an operand's robustness, neutral at samples that its operator omits."""
         low, high = self.ends(operand)
         condition = self.conditions.get(operand)
         if condition is None:
@@ -290,7 +296,7 @@ class OfflineNodes:
         return np.maximum(-condition_high, low), np.maximum(-condition_low, high)
 
     def is_left_out(self, operand: int, sample: int) -> bool:
-        """Return whether the operator of an operand leaves a sample out."""
+        """Return whether the operator above an operand leaves a sample out."""
         return operand in self.conditions and bool((self.conditions[operand][:, sample] == -np.inf).all())
 
     @cached_property
@@ -309,10 +315,10 @@ class OfflineFormula:
     """A formula compiled once for evaluation over several logs.
 
     Attributes:
-        table: (R, OFFLINE_WIDTH), its instruction rows.
+        table: (R, OFFLINE_WIDTH), instruction rows of the formula.
         nodes: number of nodes.
-        width: number of columns of all rows.
-        conditions: column of each operand's condition, by operand id (see `OfflineNodes`).
+        width: number of columns that the rows write.
+        conditions: column of an operand's condition, by operand id (see `OfflineNodes`).
     """
 
     formula: Formula
@@ -329,7 +335,7 @@ class OfflineFormula:
 
         Args:
             order: leaves of the formula in the order of their numbers.
-            stand_ins: formulas to compute instead of `computed_formulas(formula)`; empty for none.
+            stand_ins: formulas to compute instead of `computed_formulas(formula)`, if there are any.
         """
         table, tree = OfflineTable(order), nodes_with_operands(formula)
         rows = [table.add(computed_formula) for computed_formula in stand_ins or computed_formulas(formula)]
@@ -340,7 +346,7 @@ class OfflineFormula:
         )
 
     def evaluate(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
-        """Evaluate every node over all samples; see `evaluate_offline`."""
+        """Evaluate every node over all samples (see `evaluate_offline`)."""
         columns = roomy((len(leaves), self.width, len(times_ns)), np.float64)
         extrema = np.empty(len(times_ns))
         stamps = writable(times_ns)
@@ -350,7 +356,7 @@ class OfflineFormula:
 
 
 def computed_formulas(formula: Formula) -> list[Formula]:
-    """Return the nodes of a formula, by id, then the rate conditions of `_judged_operands`."""
+    """Return the nodes of a formula in the order of their ids, then the conditions of `_judged_operands`."""
     tree = nodes_with_operands(formula)
     return [
         *(node for node, _ in tree),
@@ -359,10 +365,11 @@ def computed_formulas(formula: Formula) -> list[Formula]:
 
 
 def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boolean]:
-    """Return the operands with rates below temporal operators, by id.
+    """Return the operands of temporal operators that contain rates, by id, as `given` or `with` formulas.
 
-    Such an operator leaves out samples without a rate, so its operand is read as `given` or `with`: first the
-    condition that all rates have values, then the operand itself.
+    A temporal operator leaves out samples in which a rate of its operand has no value. The operand is
+    therefore judged as `given` or `with`. Its first operand is the condition that all rates have values, and
+    its second is the operand itself.
     """
     return {
         identifier: operand
@@ -389,10 +396,11 @@ def evaluate_offline(
 def evaluate_prefix(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> OfflineNodes:
-    """Evaluate every node over samples that others may follow; arguments are as for `evaluate_offline`.
+    """Evaluate every node over samples that further samples may follow.
 
-    Values after the last sample are unknown, [-inf, +inf], so the numbers at the first sample equal a
-    monitor's. Their deciding path ends at the atom that settled a verdict before the log ended.
+    Values after the last sample are unknown, [-inf, +inf], so the robustness at the first sample equals a
+    monitor's. Its deciding path ends at the atom that settled a verdict before the log ended. Arguments are
+    as for `evaluate_offline`.
     """
     return replace(_evaluate_beyond(formula, order, leaves, times_ns, _is_open), goes_on=True)
 
@@ -402,7 +410,7 @@ def evaluate_with_whole_windows(
 ) -> OfflineNodes:
     """Evaluate every node over a finished log, as if cut windows continued with unknown values.
 
-    Arguments are as for `evaluate_offline`; for cut windows see `is_cut`.
+    Windows are cut as in `is_cut`. Arguments are as for `evaluate_offline`.
     """
     return _evaluate_beyond(formula, order, leaves, times_ns, is_cut)
 
@@ -426,8 +434,8 @@ class _OpenFormulas:
     """Formulas with an extra leaf for the unknown values in each open window.
 
     Attributes:
-        leaves: one for each operator whose window is open at some sample.
-        columns: (T,) for each leaf, whether it is unknown at a sample; it is `false` at all others.
+        leaves: one leaf for each operator whose window is open at some sample.
+        columns: (T,) for each leaf, whether the leaf is unknown at a sample. At other samples it is `false`.
     """
 
     def __init__(self, times_ns: Integers, find_open: Callable[[Temporal, Integers], Booleans]) -> None:
@@ -470,17 +478,17 @@ class _OpenFormulas:
             case "G":
                 return Boolean("and", (node, Boolean("not", (leaf,))))
             case "U":
-                # a later sample may fulfil it, up to the minimum of the left operand so far
+                # a later sample may fulfil the `U`, up to the minimum of the left operand so far
                 left_so_far = Temporal("G", node.operands[:1])
                 return Boolean("or", (node, Boolean("and", (leaf, left_so_far))))
         return Boolean("and", (Boolean("or", (node, leaf)), Boolean("not", (leaf,))))
 
 
 def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
-    """Return (T,), whether the end of a log cuts the window of an operator short at each sample.
+    """Return for each sample whether the end of a log cuts an operator's window short, (T,).
 
     An operator without an upper bound ends with the log and is not cut. WX is not cut, because it is defined
-    at the last sample. One exception: a log of one sample cuts every G, because it shows no duration.
+    at the last sample. As an exception, a log of one sample cuts every G, because it shows no duration.
     """
     bound = formula.bound
     is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
@@ -489,18 +497,18 @@ def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
 
 
 def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:
-    """Return (T,), whether later samples can fall into the window of an operator at each sample."""
+    """Return for each sample whether later samples can fall into an operator's window there, (T,)."""
     bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX") else formula.bound
     return ~is_closed(bound, times_ns) & (formula.operator in FUTURE_OPERATORS)
 
 
 def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
-    """Return (T,), whether no later sample can fall into the window of a future operator at each sample."""
+    """Return for each sample whether no later sample can fall into a future operator's window there, (T,)."""
     sample_count = len(times_ns)
     if bound is None or bound.upper is None:
         return np.zeros(sample_count, np.bool_)
     if bound.unit == "samples":
-        # capped, because the sum could exceed 64 bits
+        # the bound is capped, because the sum could exceed 64 bits
         return np.arange(sample_count) + min(bound.upper, sample_count) < sample_count
     # Python integers: a time and a duration may add up to more than 64 bits
     last_closed_ns = int(times_ns[-1]) - bound.upper
@@ -510,7 +518,7 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
 def windows_of(
     formula: Temporal, times_ns: Integers, samples: Integers | None = None
 ) -> tuple[Integers, Integers]:
-    """Return the bounds (T,) of an operator's window at each sample: first sample, last sample plus one.
+    """Return the first sample (T,) of an operator's window at each sample, and the last sample plus one (T,).
 
     Args:
         samples: indices of the samples whose windows are returned; None for all.
@@ -544,7 +552,7 @@ def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """Return each node's robustness (N, T) from each sample to the end of the log; NaN if undetermined."""
-    # nominal ends only: uncertainty does not count for a curve of robustness
+    # only the nominal ends, because a curve of robustness ignores uncertainty
     return _determined_numbers(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 
@@ -554,7 +562,7 @@ def window_signal(
     """Return the robustness (N, T) of each node over the window (t - width, t] of each sample t.
 
     Each window is evaluated at its first sample as a separate log, so past operators start there.
-    Undetermined values are NaN. The time of each window is proportional to its samples.
+    Undetermined values are NaN. The computing time of a window is proportional to its number of samples.
 
     Raises:
         UsageError: the width is not a positive number of ns.
@@ -580,7 +588,7 @@ def new_leaves(formula: Formula, order: Sequence[Atom | Quantified]) -> list[Ato
 
 
 def _determined_numbers(ends: Floats) -> Floats:
-    """Reduce the ends (C, N, T) to determined numbers (N, T), in place.
+    """Return the robustness (N, T) from its ends (C, N, T), in place; NaN where the ends differ.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers have equal bits.
     """

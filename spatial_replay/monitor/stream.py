@@ -1,7 +1,7 @@
-"""Instances of specifications evaluated over samples: one per spec, or per object of a template.
+"""Evaluate instances of specifications over samples: one per spec, and one per object of a template.
 
-A monitor adds single samples, a replay adds blocks, and `evaluate` adds a whole trace. All three compute the
-same bits.
+A monitor adds single samples, a replay adds blocks, and `evaluate` adds a whole trace. Their results are
+identical to the bit.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Instance:
 
     Attributes:
         spec: `spec` statement of the formula.
-        object: object of a template's instance; else None.
-        bindings: that object, by the name of the template's parameter.
-        start_ns, end_ns: evaluated samples, from `start_ns` to before `end_ns`.
-        named: all specs of its file, by name.
+        object: object for which a template is evaluated; None for other specs.
+        bindings: the object by the name of the template's parameter; empty for other specs.
+        start_ns, end_ns: samples from `start_ns` to before `end_ns` are evaluated.
+        named: all specs of the spec's file, by name.
     """
 
     spec: NamedSpec
@@ -60,7 +60,7 @@ class Instance:
 
     @cached_property
     def reach(self) -> Reach:
-        """How far its terms look back."""
+        """How far the formula's terms look back."""
         return look_back([self.formula])
 
 
@@ -69,8 +69,8 @@ class Choice:
     """The objects that a template is evaluated for: all objects, a class, or one named object.
 
     Attributes:
-        class_name: class of the objects, in any case; None for any class.
-        name: name of the one object; None for any name.
+        class_name: class of the objects, compared without case; None for any class.
+        name: name of the single object; None for any name.
     """
 
     class_name: str | None
@@ -106,11 +106,11 @@ def find_instances(
 ) -> list[Instance]:
     """Return the instances of a specification over the samples from `start_ns` to before `end_ns`.
 
-    A template has one instance per chosen object, in order of names. It covers the samples from the object's
-    first to its last appearance.
+    A template has one instance per chosen object, in order of names. The instance covers the samples from the
+    object's first to its last appearance.
 
     Args:
-        each: choice of objects for each template parameter: "all", "class:NAME" or a name.
+        each: choice of objects by template parameter: "all", "class:NAME" or an object's name.
         traces: the samples, in blocks; read only for templates.
 
     Raises:
@@ -136,7 +136,7 @@ def find_instances(
 
 
 def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
-    """Check that every template parameter has a choice of objects, and that no other name has one."""
+    """Check that every template parameter, and no other name, has a choice of objects."""
     for spec in templates:
         if spec.parameter not in each:
             raise UsageError(
@@ -158,7 +158,7 @@ def check_parameters(templates: list[NamedSpec], each: Mapping[str, str]) -> Non
 def _appearances(
     choices: Mapping[str | None, Choice], traces: Iterable[Trace], start_ns: int, end_ns: int
 ) -> dict[str | None, dict[str, tuple[int, int]]]:
-    """Return the objects that fit each choice, with the times of their first and last samples."""
+    """Return by parameter the objects that fit its choice, with the times of their first and last samples."""
     spans: dict[str, tuple[int, int]] = {}
     names_by_parameter: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
     for trace in traces:
@@ -173,7 +173,7 @@ def _appearances(
             # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
             codes = np.unique(trace.class_code[np.where(rows < ABSENT, -2 - rows, rows)[present_samples]])
             for parameter, choice in choices.items():
-                # an object may change its class: one fitting sample suffices
+                # an object may change its class, and a single fitting sample suffices
                 if any(choice.fits(name, trace.classes[code]) for code in codes.tolist()):
                     names_by_parameter[parameter].add(name)
     return {
@@ -192,7 +192,7 @@ class SeriesBlock:
     Attributes:
         times_ns: (T,) int64; T may be 0.
         series: (N, 4, T): value, now, lower and upper of each node.
-        leaves: (C, A, T), `leaf_values` of the same samples, from which the series is computed.
+        leaves: (C, A, T), `leaf_values` of these samples, from which the series is computed.
     """
 
     times_ns: Integers
@@ -221,9 +221,9 @@ class InstanceStream:
 
     Attributes:
         semantics: semantics of the evaluation.
-        first_satisfied_ns: time of the first sample with a root value of at least 0, or None.
-        settled_ns: (N, 2), times at which each node's satisfaction and violation became certain. `NEVER` if
-            only the end of the log decides, and under the paper's semantics.
+        first_satisfied_ns: time of the first sample at which the root's value is at least 0, or None.
+        settled_ns: (N, 2), times at which each node's satisfaction and violation became certain. The time is
+            `NEVER` if only the end of the log decides, and under the paper's semantics.
         robustness: (N,), value of each node on the samples so far.
     """
 
@@ -231,7 +231,7 @@ class InstanceStream:
         """Start before the first sample.
 
         Args:
-            samples: number of samples in all, if known.
+            samples: number of all samples of the run, if known.
         """
         self.instance = instance
         self.semantics: Semantics = semantics
@@ -241,7 +241,7 @@ class InstanceStream:
         self._begin()
 
     def restart(self) -> None:
-        """Restart before the first sample; `final` of the previous run is lost."""
+        """Restart before the first sample. The previous run's `final` is lost."""
         if isinstance(self._run, OnlineRun):
             self._run.restart()
         else:
@@ -249,7 +249,7 @@ class InstanceStream:
         self._begin()
 
     def _begin(self) -> None:
-        # new arrays: results of the previous run still refer to the old ones
+        # new arrays, because results of the previous run still refer to the old arrays
         self.first_satisfied_ns: int | None = None
         self.robustness = np.full(len(self.instance.program.reports), np.nan)
         self.settled_ns = np.full((len(self.instance.program.reports), 2), NEVER, np.int64)
@@ -269,7 +269,7 @@ class InstanceStream:
         return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
 
     def extend(self, scene: TraceScene, empty: Empty = np.empty) -> SeriesBlock:
-        """Add the samples of a scene that fall into the instance's window.
+        """Add the samples of a scene from the instance's `start_ns` to before its `end_ns`.
 
         Args:
             empty: allocator of the series.
@@ -282,7 +282,7 @@ class InstanceStream:
             no_series = np.empty((len(program.reports), 4, 0))
             return SeriesBlock(times_ns, no_series, np.empty((1, len(program.leaves), 0)))
         leaves = leaf_values(scene, program.leaves, self.instance.bindings)[:, :, begin:end]
-        # positions in the scene suffice: it starts with the log, or as far back as any term looks
+        # positions in the scene suffice, because it starts with the log or as far back as any term looks
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times_ns, first_ns)
@@ -303,7 +303,7 @@ class InstanceStream:
         """Set `settled_ns` of the nodes that became certain in these samples."""
         newest_series = series[:, :, -1]
         for column, is_settled in enumerate((newest_series[:, 2] >= 0.0, newest_series[:, 3] < 0.0)):
-            # certainty is permanent: only nodes that are certain at the newest sample are searched, once
+            # certainty is permanent, so only nodes that are certain at the newest sample are searched, once
             for node in np.flatnonzero(is_settled & (self.settled_ns[:, column] == NEVER)):
                 self.settled_ns[node, column] = times_ns[_first_certain(series[node], column)]
 
@@ -312,7 +312,7 @@ def _first_certain(node_series: Floats, column: int) -> int:
     """Return the first sample at which a node is certainly satisfied (column 0) or violated (column 1).
 
     Args:
-        series: (4, T), series of the node, certain at the last sample.
+        node_series: (4, T), series of the node, which is certain at the last sample.
     """
     ends, is_violation = node_series[2 + column], bool(column)
     return bisect_left(range(len(ends)), True, key=lambda k: bool(ends[k] >= 0.0) != is_violation)
@@ -328,14 +328,18 @@ class EvaluationStream:
         semantics: Semantics = "ltlf",
         samples: int | None = None,
     ) -> None:
-        """Start before the first sample; for `samples` see `InstanceStream`."""
+        """Start before the first sample.
+
+        Args:
+            samples: number of all samples of the run, if known.
+        """
         self.streams = tuple(InstanceStream(instance, semantics, samples) for instance in instances)
         self._regions = regions
         self._reach = look_back([stream.instance.formula for stream in self.streams])
         self._last_trace: Trace | None = None
 
     def extend(self, trace: Trace, empty: Empty = np.empty) -> list[SeriesBlock]:
-        """Add the next samples; return one block for each of `streams`.
+        """Add the next samples, and return one block for each of `streams`.
 
         Args:
             empty: allocator of the series.
@@ -365,10 +369,10 @@ class EvaluationStream:
 
 
 def one_after_another(traces: Sequence[Trace]) -> Trace:
-    """Join traces regardless of their times: the index of each sample becomes its time."""
+    """Join traces regardless of their times. The time of a sample is replaced by its index."""
     renumbered_traces, first_index = [], 0
     for trace in traces:
-        # times of different traces overlap, and those of one trace have to increase
+        # times of different traces overlap, but the times of a trace must increase
         times_ns = np.arange(first_index, first_index + len(trace), dtype=np.int64)
         renumbered_traces.append(
             replace(trace, times_ns=times_ns, reported_ns=None, signals_reported_ns={}, spans=(), doubts=())
@@ -380,15 +384,15 @@ def one_after_another(traces: Sequence[Trace]) -> Trace:
 def run_together(
     instances: Sequence[Instance], scene: TraceScene, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[tuple[list[InstanceStream], list[SeriesBlock]]]:
-    """Evaluate instances over many traces; the leaves of all traces are measured together.
+    """Evaluate instances over many traces. The leaves of all traces are measured together.
 
     Args:
         instances: instances without bindings, whose terms do not look back.
         scene: scene of the joined traces (see `one_after_another`).
 
     Yields:
-        the streams at the end of each trace, and one block of numbers per stream. The same streams restart
-        for the next trace.
+        the streams at the end of each trace, and one block of numbers per stream. The streams restart for the
+        next trace.
     """
     leaves_by_instance = [leaf_values(scene, instance.program.leaves, {}) for instance in instances]
     longest_length = max(map(len, traces), default=0)
@@ -399,7 +403,7 @@ def run_together(
         for stream in streams if begin else ():
             stream.restart()
         blocks = [
-            # measured together, leaves may have more channels than this trace needs
+            # leaves that are measured together may have more channels than this trace needs
             stream.extend_leaves(distinct_channels(leaves[:, :, begin:end]), trace.times_ns)
             for stream, leaves in zip(streams, leaves_by_instance, strict=True)
         ]
@@ -424,7 +428,7 @@ class LiveStream:
         self._leaf_ranges = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
         first_leaves = [leaf_range.start for leaf_range in self._leaf_ranges]
-        # paired here, because `extend` reads them at every sample; unused under the paper's semantics
+        # paired once, because `extend` reads the pairs at every sample; unused under the paper's semantics
         self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None
@@ -432,9 +436,9 @@ class LiveStream:
 
     @property
     def finals(self) -> list[Floats | None]:
-        """For each formula (N, 2), lower and upper end of each node's value if the log ends here.
+        """Lower and upper end of each node's value if the log ends here, (N, 2) for each formula.
 
-        None before the first evaluated sample.
+        The entry of a formula is None before the first evaluated sample.
         """
         return [run.final if len(run) else None for run in self._runs]
 
@@ -442,8 +446,8 @@ class LiveStream:
         """Add the next sample, which is later than the previous one.
 
         Returns:
-            (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns` it is None,
-            or NaN under the paper's semantics.
+            (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns`, the entry of
+            a formula is None. Under the paper's semantics, its numbers are NaN then.
         """
         if not self._is_online:
             return self._extend_apart(sample)
@@ -460,6 +464,9 @@ class LiveStream:
     def leaves(self, place: int) -> Floats:
         """Return the leaves (C, A, 1) of a formula in the newest evaluated sample.
 
+        Args:
+            place: index of the formula among the specification's results.
+
         Raises:
             UsageError: no sample has been evaluated, or the semantics is the paper's.
         """
@@ -475,7 +482,7 @@ class LiveStream:
         if sample.time_ns < self._start_ns:
             self._leaves.look_at(sample)
             return [np.full((len(evaluator.program.reports), 4), np.nan) for evaluator in self._evaluators]
-        # `PaperRun` needs positions in the log, since it leaves out leaves that look beyond its start
+        # `PaperRun` needs positions in the log, because it excludes leaves that look beyond the log's start
         values = self._leaves.fill_room(sample).measure()
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
         results: list[Floats | None] = []

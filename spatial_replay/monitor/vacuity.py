@@ -1,4 +1,4 @@
-"""Find untested parts of a formula, and windows that the end of the log cuts short."""
+"""Find untested parts of a formula, and windows that the end of a log cuts short."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ from spatial_replay.text import (
 )
 
 Tested: TypeAlias = Literal["full", "cut", "nothing"]
-"""By how much of the log a verdict was tested (see `SpecResult.tested`)."""
+"""Whether the log tested a verdict, see `SpecResult.tested`."""
 Reason: TypeAlias = Literal[
     "empty window",
     "antecedent never held",
@@ -82,19 +82,19 @@ _NEXT = {"X": "next sample", "WX": "next sample", "Y": "sample before"}
 
 @dataclass(frozen=True, slots=True)
 class UntestedPart:
-    """A part of a formula that was not tested, or only in part.
+    """A part of a formula that was not tested, or was tested only in part.
 
     Attributes:
-        node: its id; None for a template without instances.
-        text: its canonical text.
-        reason: "empty window": wherever the operator counts, its window has no sample.
+        node: node id of the part; None for a template without instances.
+        text: canonical text of the part.
+        reason: "empty window": the operator's window has no sample wherever the result depends on it.
             "antecedent never held": the part is an implication, in any spelling. "no members": an open group
             is empty. "past the end": the result is infinite, because the deciding part looks beyond the log.
             "no rate": the result is infinite, because the deciding part leaves all samples or members out.
             "no instances": no object fits a template. "cut window": the part decides at a sample whose window
             ends after the log.
         message: a sentence.
-        time_ns: time of the sample at which it decides; None if it decides at no sample.
+        time_ns: time of the sample at which the part decides; None without such a sample.
     """
 
     node: int | None
@@ -110,11 +110,11 @@ def idle_templates(
     each: Mapping[str, str],
     classes: Collection[str],
 ) -> tuple[UntestedPart, ...]:
-    """Return the templates without instances: no object fits them, so they decided nothing.
+    """Return the templates that decided nothing, because no object fits them.
 
     Args:
         evaluated: formulas that have a result.
-        each: choice of objects for each template parameter, such as "class:person".
+        each: choice of objects by template parameter, such as "class:person".
         classes: classes of the log.
     """
     untested_parts, evaluated_ids = [], {id(formula) for formula in evaluated}
@@ -140,8 +140,8 @@ def find_vacuous(
         evidence: evidence of the instance.
         leaves: (C, A, T), leaves of the instance.
         times_ns: (T,), T at least 1.
-        infinite: deciding end of an infinite robustness: the lower end for inf, the upper end for -inf. None
-            for a finite robustness.
+        infinite: deciding end of an infinite robustness: the lower end for inf, the upper end for -inf. It is
+            None for a finite robustness.
     """
     instance = evidence.instance
     if infinite is None and not _may_decide_nothing(instance):
@@ -161,7 +161,7 @@ def find_vacuous(
         offline_nodes = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
         path = deciding_path(offline_nodes, 0, infinite)
         node, sample = path.steps[-1].node, path.steps[-1].sample
-        # a missed goal (`F`) is -inf as well: -inf alone does not show that nothing was tested
+        # a missed goal (`F`) is -inf as well, so -inf alone does not show that nothing was tested
         is_idle = infinite is End.LOW or (
             _leaves_all_out(offline_nodes, path, evidence)
             and is_tested_by_nothing(evidence, leaves, times_ns, Verdict.VIOLATED)
@@ -174,10 +174,10 @@ def find_vacuous(
     )
 
 
-# cached, because a batch asks for the same instances at each of its logs
+# cached, because a batch evaluates the same instances on each of its logs
 @lru_cache(maxsize=256)
 def _may_decide_nothing(instance: Instance) -> bool:
-    """Return whether a part of a formula can be untested in some log.
+    """Return whether a part of an instance's formula can be untested in some log.
 
     Such a formula has a window that may be empty, an implication, a quantifier, or an open group.
     """
@@ -196,7 +196,7 @@ def _may_be_empty(node: Temporal) -> bool:
 
 
 class _Idle(NamedTuple):
-    """An untested part; `predicate` continues the sentence that begins with its text."""
+    """An untested part. Its message is its text followed by `predicate`."""
 
     node: int
     reason: Reason
@@ -219,10 +219,10 @@ def _part(idle_part: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
 
 
 class _Implications(NamedTuple):
-    """A formula in which each implication is written with `->`, with the same numbers.
+    """A formula in which each implication is written with `->`. Its robustness is that of the original.
 
     Attributes:
-        nodes: for each of its nodes, the id of the original node that it stands for.
+        nodes: for each node of this formula, the id of the original node that it stands for.
     """
 
     formula: Formula
@@ -239,13 +239,14 @@ class _Implications(NamedTuple):
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
     """Write `->` for each implication of a formula.
 
-    `not a or b` and `not (a and not b)` become `a -> b`. In `not (a and b)` each part is a condition for the
-    other, so it becomes `(a or b) -> not (a and b)`. `not F p` is treated like `G not p`.
+    `not a or b` and `not (a and not b)` become `a -> b`. In `not (a and b)`, each operand is a condition for
+    the other operand, so the formula becomes `(a or b) -> not (a and b)`. `not F p` is treated like
+    `G not p`.
 
     Args:
         node: id of the original formula.
         sign: 1 if the formula has to hold, -1 if it must not hold, 0 for neither, as in a goal. With sign 0,
-            no disjunction or conjunction is read as an implication.
+            disjunctions and conjunctions are not read as implications.
     """
     operands = list(_operands_with_ids(formula, node))
     operator = operator_of(formula)
@@ -302,7 +303,7 @@ def _without_negation(formula: Formula, node: int) -> tuple[Formula, int]:
 
 
 _GOALS = frozenset({("F", 0), ("O", 0), ("U", 1), ("S", 1), ("W", 1), ("R", 0)})
-"""Operators and places of operands that have to hold at one sample only."""
+"""Operators with the index of an operand that has to hold at one sample only."""
 _EVERYWHERE = frozenset({"F", "G", "U", "R", "W", "O", "H", "S"})
 """Operators whose windows have several samples."""
 
@@ -331,7 +332,7 @@ def _join_implications(
 
 
 class _Holding:
-    """The samples (T,) at which each condition may hold, computed once."""
+    """Function of a condition: the samples (T,) at which it may hold, computed once per condition."""
 
     def __init__(self, instance: Instance, leaves: Floats, times_ns: Integers) -> None:
         self._order = instance.program.leaves
@@ -349,7 +350,7 @@ class _Holding:
 
 
 class _Windows:
-    """The window of each operator at each sample, computed once (see `windows_of`)."""
+    """Function of an operator: its windows at all samples (see `windows_of`), computed once per operator."""
 
     def __init__(self, times_ns: Integers) -> None:
         self.times_ns = times_ns
@@ -365,7 +366,7 @@ class _Windows:
 def _scopes(
     formula: Formula, windows: _Windows, holding_samples: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
-    """Return for each node the samples (T,) at which the number of the formula depends on it.
+    """Return for each node the samples (T,) at which the formula's robustness depends on it.
 
     Samples are excluded if an operator leaves them out because a rate has no value.
 
@@ -373,7 +374,7 @@ def _scopes(
         is_conditional: whether consequents count only at samples where their antecedents may hold.
     """
     tree = nodes_with_operands(formula)
-    # the verdict is the number of the root at the first sample
+    # the verdict is decided by the robustness of the root at the first sample
     scopes = [np.arange(len(windows.times_ns)) == 0] * len(tree)
     # parents precede their operands, so an entry is final when the loop reaches it
     for scope, (node, operands) in zip(scopes, tree, strict=True):
@@ -391,7 +392,7 @@ def _scopes(
 
 
 def _below(formula: Temporal, operand_index: int, scope: _Samples, windows: _Windows) -> _Samples:
-    """Return the samples at which an operand counts, given the samples `scope` of its operator."""
+    """Return the samples (T,) at which an operand counts, if its operator counts at the samples `scope`."""
     begins, ends = windows(formula)
     counting_samples = np.flatnonzero(scope & (begins < ends))
     begins, ends = begins[counting_samples], ends[counting_samples]
@@ -402,7 +403,7 @@ def _below(formula: Temporal, operand_index: int, scope: _Samples, windows: _Win
         else:
             begins = counting_samples
             ends = ends - (formula.operator != "W")
-    # +1 where a window begins, -1 after its end: the running sum counts the windows over a sample
+    # +1 where a window begins, -1 after its end: the running sum is the number of windows at a sample
     window_edges = np.zeros(len(scope) + 1, np.int64)
     is_open = begins < ends
     # `add.at`, because several windows may begin or end at one sample
@@ -426,7 +427,7 @@ def _empty_windows(
 
     Args:
         scopes: samples at which the robustness depends on each node.
-        active: samples at which conditions hold, so that the verdict depends on each node.
+        active_scopes: samples at which the verdict depends on each node, because conditions hold there.
     """
     for identifier, (node, scope, active_scope) in enumerate(zip(nodes, scopes, active_scopes, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
@@ -474,7 +475,7 @@ def _untested_implication(
 
 
 def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence) -> Iterator[_Idle]:
-    """Find implications in bodies of quantifiers whose antecedent never held for any member."""
+    """Find implications in quantifiers' bodies with an antecedent that never held for any member."""
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Quantified) or not scope.any():
             continue
@@ -491,10 +492,10 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
-    """Yield each implication in a quantifier's body.
+    """Yield each implication in a quantifier's body, a formula, and whether the implication is nested.
 
-    The second value is the formula that its antecedent holds for some member. An implication in another one's
-    consequent also needs that antecedent; the third value is then True.
+    The formula is that the antecedent holds for some member. A nested implication is in the consequent of
+    another implication, and its formula also requires the antecedent of that implication.
     """
     pending_parts: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]
     while pending_parts:
@@ -542,7 +543,7 @@ def _empty_groups(
 
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
-    """Yield the open groups of a leaf, without excluded variables, because these differ by binding."""
+    """Yield the open groups of a leaf. Excluded variables are dropped, because they differ by binding."""
     for term in map(standing, iter_terms([formula])):
         group = term.term if isinstance(term, Earlier) else term
         if isinstance(group, Group) and group.members is None:
@@ -570,7 +571,7 @@ def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence)
 
 
 def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idle]:
-    """Yield the reason of an infinite result, from its deciding node."""
+    """Yield why a result is infinite, by the formula of its deciding node, if that tested nothing."""
     if leaves_out(node):
         member = "object in its group" if isinstance(node, Quantified) else "sample in its window"
         predicate = ("decides at ", instant, f", where no {member} has a rate.")
@@ -582,7 +583,7 @@ def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idl
     elif isinstance(node, Atom | Quantified) and not any(
         isinstance(part, Equality) for part in iter_parts(node)
     ):
-        # an equality, as of a mode, is infinite by definition, also with members in its groups
+        # an equality with a text is infinite by definition, also with members in its groups
         needed_count = len(node.variables) if isinstance(node, Quantified) else 1
         members_text = "no object is" if needed_count == 1 else f"fewer than {needed_count} objects are"
         predicate = ("decides at ", instant, f", where {members_text} in its group.")
@@ -621,12 +622,12 @@ _UNKNOWN: Final = Atom("", "signal", Signal("\0"))
 
 
 def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict) -> bool:
-    """Return whether a verdict is the same for all values of the leaves.
+    """Return whether a verdict is independent of the values of the leaves.
 
-    Some leaves keep their numbers:
+    Some leaves keep their values:
 
     - leaves in antecedents of a satisfied formula, because nothing is tested if no antecedent holds;
-    - leaves over an open group at samples where it is empty;
+    - leaves over an open group, at samples where the group is empty;
     - conditions that a rate has a value, because samples that are left out test nothing.
 
     Args:
@@ -636,7 +637,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
     order = instance.program.leaves
     unknown_leaves = _with_unknown_leaves(order, leaves, evidence)
     known_leaves = leaves if verdict is Verdict.SATISFIED else unknown_leaves
-    # each leaf is evaluated twice: unknown, and with its numbers for antecedents
+    # each leaf is evaluated twice: unknown, and with its values for antecedents
     stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
 
     def with_stand_ins(formula: Formula, *, in_antecedent: bool = False) -> Formula:
@@ -670,9 +671,9 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 
 
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
-    """Return unknown leaves (2, A, T).
+    """Return leaves (2, A, T) with unknown values.
 
-    Only antecedents in quantifiers, leaves of empty groups and rate conditions are known.
+    Only antecedents in quantifiers, leaves over empty groups, and conditions on rates keep their values.
     """
     low, high = low_and_high(len(leaves), wide=True)
     unknown_leaves = roomy((2, *leaves.shape[1:]), np.float64)
@@ -684,7 +685,7 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
             unknown_leaves[:, leaf_index] = leaves[[low, high], leaf_index]
         elif isinstance(bound_leaf, Quantified):
             column = evidence.columns([_without_tests(bound_leaf)])
-            # the ends with uncertainty
+            # channels 2 and 3 are the ends with uncertainty
             unknown_leaves[:, leaf_index] = in_channels(column, 4)[2:, 0]
         elif groups:
             is_empty = ~evidence.members(groups).all(axis=0)
@@ -714,10 +715,10 @@ def _without_tests(formula: Formula) -> Formula:
 def find_cut_window(
     evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict
 ) -> UntestedPart | None:
-    """Return the operator whose cut window decides a verdict; None if no cut window does.
+    """Return the operator whose cut window decides a verdict; None if no cut window decides it.
 
-    Windows with an upper bound, and that of X, may see any samples beyond the end of the log. All other
-    operators end with the log.
+    A window with an upper bound, and the window of X, may contain samples beyond the end of the log. All
+    other windows end with the log.
 
     Args:
         leaves: (C, A, T), the leaves of the instance's formula.
@@ -735,7 +736,7 @@ def find_cut_window(
     ranks = _rank_by_verdict(cut_nodes, whole_nodes, is_violated=verdict is Verdict.VIOLATED)
     path = deciding_path(ranks, 0, End.of(verdict))
     cut_steps = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
-    # rank 1 or -1: decided by a cut window, but not by a whole one
+    # rank 1 or -1: decided by a cut window, but not by a whole window
     deciding_steps = [
         step for step in cut_steps if {1.0, -1.0} & {*ranks.columns[:, step.node, step.sample].tolist()}
     ]
@@ -756,7 +757,7 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
         reach_text = "the log has no next sample"
     else:
         is_time = bound.unit == "ns"
-        # positions in ns or in samples: one calculation serves both units
+        # positions are in ns or in samples, so that one calculation serves both units
         position, last_position = (
             (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
         )
@@ -781,9 +782,10 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
 def _rank_by_verdict(
     cut_nodes: OfflineNodes, whole_nodes: OfflineNodes, *, is_violated: bool
 ) -> OfflineNodes:
-    """Return nodes with ranks as numbers: decided with whole windows, only with cut ones, or undecided.
+    """Return nodes with ranks as robustness.
 
-    Minima, maxima and negations preserve the order of ranks, so their deciding path ends at a cut window.
+    The ranks are: decided with whole windows, decided only with cut windows, and undecided. Minima, maxima
+    and negations preserve the order of ranks, so the deciding path of ranks ends at a cut window.
     """
     # 0 satisfies, so only a violation needs a strict comparison
     holds = np.greater if is_violated else np.greater_equal
