@@ -179,9 +179,9 @@ class Update:
     def specs(self) -> tuple[SpecUpdate, ...]:
         """One update for each result spec, in the order of the text."""
         if self._specs is None:
-            of_specs = zip(self._monitored.specs, self.numbers, strict=True)
+            spec_rows = zip(self._monitored.specs, self.numbers, strict=True)
             self._specs = tuple(
-                [SpecUpdate(spec, rows, names, unit) for (spec, names, unit), rows in of_specs]
+                [SpecUpdate(spec, rows, names, unit) for (spec, names, unit), rows in spec_rows]
             )
         return self._specs
 
@@ -225,8 +225,8 @@ class Update:
         """
         if name not in self.places:
             raise UsageError(no_such_node(name, sorted(self.places)))
-        spec, identifier = self.places[name]
-        return self.specs[spec].node(identifier)
+        spec_index, identifier = self.places[name]
+        return self.specs[spec_index].node(identifier)
 
 
 class Ending(NamedTuple):
@@ -293,14 +293,14 @@ class Monitor:
                 names that are not texts, or a template, whose objects are not known yet.
         """
         require_specification(specification)
-        checked = checked_semantics(semantics, [specification])
+        known_semantics = checked_semantics(semantics, [specification])
         require_time(start_ns, "start_ns")
         declared_units = checked_units(units)
         specification = with_numbers(specification, declared_units)
         templates = [spec for spec in specification.results if spec.parameter is not None]
         if templates:
-            names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
-            raise UsageError(f"{names} is a template; name its object, or evaluate it over a log")
+            template_names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
+            raise UsageError(f"{template_names} is a template; name its object, or evaluate it over a log")
         self._specs = specification.results
         node_names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
         self._units = tuple(declared_unit(spec.formula, declared_units) for spec in self._specs)
@@ -308,25 +308,25 @@ class Monitor:
             tuple(zip(self._specs, node_names, self._units, strict=True)), _places_of_names(node_names)
         )
         # the two semantics have different kernels to compile
-        task = "paper" if checked == "paper" else "monitor"
-        compiled.start(task, partial(_run_trial, specification, checked), wait=wait)
+        task = "paper" if known_semantics == "paper" else "monitor"
+        compiled.start(task, partial(_run_trial, specification, known_semantics), wait=wait)
         first_ns = start_ns or 0
-        self._begin = partial(LiveStream, specification, checked, first_ns)
+        self._new_stream = partial(LiveStream, specification, known_semantics, first_ns)
         # no violation is permanent under the paper's semantics
-        self._remember: Callable[[], ViolationLog | None] = lambda: None
-        if checked == "ltlf":
-            self._remember = partial(ViolationLog, specification, first_ns, declared_units)
-        self._await = partial(_AwaitedNames, specification, missing_after, strict=strict_names)
-        self._wait = partial(_Start, wait_for, start_within)
+        self._new_violation_log: Callable[[], ViolationLog | None] = lambda: None
+        if known_semantics == "ltlf":
+            self._new_violation_log = partial(ViolationLog, specification, first_ns, declared_units)
+        self._new_awaited_names = partial(_AwaitedNames, specification, missing_after, strict=strict_names)
+        self._new_start = partial(_Start, wait_for, start_within)
         self.reset()
 
     def reset(self) -> None:
         """Begin another run, like a new monitor; the next sample is its first."""
         # 0.55 ms; a new monitor, which compiles and rehearses, takes 7.5 ms
-        self._live = self._begin()
-        self._violations = self._remember()
-        self._awaited = self._await()
-        self._start = self._wait()
+        self._live = self._new_stream()
+        self._violations = self._new_violation_log()
+        self._awaited = self._new_awaited_names()
+        self._start = self._new_start()
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
         self._settlement = Settlement()
@@ -375,8 +375,8 @@ class Monitor:
         """
         if name not in self.names:
             raise UsageError(no_such_node(name, sorted(self.names)))
-        spec, identifier = self._monitored.places[name]
-        final = self._live.finals[spec]
+        spec_index, identifier = self._monitored.places[name]
+        final = self._live.finals[spec_index]
         if final is None:
             return float("-inf"), float("inf")
         lower, upper = final[identifier].tolist()
@@ -404,9 +404,9 @@ class Monitor:
         require_sample(sample)
         time_ns = sample.time_ns
         if time_ns <= self._last_ns:
-            time, last_time = times_apart(time_ns, self._last_ns)
+            new_text, last_text = times_apart(time_ns, self._last_ns)
             raise TraceError(
-                f"a sample at {time} follows one at {last_time}; give samples in the order of their times"
+                f"a sample at {new_text} follows one at {last_text}; give samples in the order of their times"
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
         # the same tuple comes back until a name arrives, so identity suffices
@@ -415,9 +415,9 @@ class Monitor:
         self._last_ns = time_ns
         if self._start.begin_ns is not None or self._start.has_begun(sample):
             self._numbers = self._live.extend(sample)
-            log = self._violations
-            if log is not None and log.extend(sample, self._numbers):
-                self._settlement = Settlement(log.settled, log.satisfied, remarks)
+            violation_log = self._violations
+            if violation_log is not None and violation_log.extend(sample, self._numbers):
+                self._settlement = Settlement(violation_log.settled, violation_log.satisfied, remarks)
         return Update(time_ns, self._numbers, self._monitored, self._settlement)
 
 
@@ -461,23 +461,24 @@ class _AwaitedNames:
         if not (is_count or after is None or isinstance(after, str)):
             remedy = "give a time such as '5s', or a number of samples"
             raise UsageError(f"missing_after is {shortened(after)}; {remedy}")
-        self._specification, self._strict = specification, strict
-        self._after = duration_ns_from_text(after) if isinstance(after, str) else after
-        self._is_time = isinstance(after, str)
+        self._specification, self._is_strict = specification, strict
+        self._limit = duration_ns_from_text(after) if isinstance(after, str) else after
+        self._is_limit_time = isinstance(after, str)
         self._first_ns: int | None = None
-        self._samples = 0
-        self._objects, self._signals = set(object_names(specification)), set(signal_names(specification))
+        self._sample_count = 0
+        self._missing_objects = set(object_names(specification))
+        self._missing_signals = set(signal_names(specification))
         self._names_so_far: tuple[set[str], set[str], set[str]] = (set(), set(), set())
         self._remarks: tuple[Diagnostic, ...] = ()
-        self.is_open = after is not None and bool(self._objects or self._signals)
+        self.is_open = after is not None and bool(self._missing_objects or self._missing_signals)
         """Whether any name is still missing."""
 
     def extend(self, sample: Sample) -> tuple[Diagnostic, ...]:
         """Return a warning for each name that is missing after the time limit; none before it."""
-        self._samples += 1
+        self._sample_count += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
-        missing = len(self._objects) + len(self._signals)
+        missing_count = len(self._missing_objects) + len(self._missing_signals)
         # an object with unknown position has come as well
         objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
         self._learn(
@@ -485,15 +486,15 @@ class _AwaitedNames:
             signals,
             {tracked.class_name for tracked in sample.objects.values() if tracked.class_name},
         )
-        self._objects -= objects
-        self._signals -= signals
-        self.is_open = bool(self._objects or self._signals)
-        elapsed = sample.time_ns - self._first_ns if self._is_time else self._samples
-        if self._after is None or elapsed < self._after:
+        self._missing_objects -= objects
+        self._missing_signals -= signals
+        self.is_open = bool(self._missing_objects or self._missing_signals)
+        elapsed = sample.time_ns - self._first_ns if self._is_limit_time else self._sample_count
+        if self._limit is None or elapsed < self._limit:
             return ()
-        if not self._remarks or len(self._objects) + len(self._signals) < missing:
+        if not self._remarks or len(self._missing_objects) + len(self._missing_signals) < missing_count:
             self._remarks = self._diagnose_missing_names()
-        if self._strict and self._remarks:
+        if self._is_strict and self._remarks:
             raise SpecificationError(self._remarks)
         return self._remarks
 
@@ -506,18 +507,18 @@ class _AwaitedNames:
                     names_so_far.update(new_names)
 
     def _diagnose_missing_names(self) -> tuple[Diagnostic, ...]:
-        limit = self._after or 0
-        during = time_text(limit) if self._is_time else plural(limit, "sample")
+        limit = self._limit or 0
+        limit_text = time_text(limit) if self._is_limit_time else plural(limit, "sample")
         objects, signals, classes = self._names_so_far
         diagnostics = check_names(
             self._specification,
-            sorted(objects.union(object_names(self._specification)) - self._objects),
-            sorted(signals.union(signal_names(self._specification)) - self._signals),
+            sorted(objects.union(object_names(self._specification)) - self._missing_objects),
+            sorted(signals.union(signal_names(self._specification)) - self._missing_signals),
             where="run",
-            during=f"in its first {during}",
+            during=f"in its first {limit_text}",
             classes=sorted(classes),
         )
-        severity: Literal["error", "warning"] = "error" if self._strict else "warning"
+        severity: Literal["error", "warning"] = "error" if self._is_strict else "warning"
         return tuple(
             replace(diagnostic, severity=severity)
             for diagnostic in diagnostics
@@ -528,10 +529,10 @@ class _AwaitedNames:
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
     """Map each name to the index of its spec and its node id; a repeated name keeps the first."""
     places: dict[str, tuple[int, int]] = {}
-    for index, of_spec in enumerate(names):
-        for identifier, name in enumerate(of_spec):
+    for spec_index, spec_names in enumerate(names):
+        for identifier, name in enumerate(spec_names):
             if name is not None:
-                places.setdefault(name, (index, identifier))
+                places.setdefault(name, (spec_index, identifier))
     return MappingProxyType(places)
 
 
@@ -605,16 +606,18 @@ class Violation:
 
     def __str__(self) -> str:
         if self.atom is None or self.witness is None:
-            since = Instant(self.time_ns, self.first_ns)
-            return f"`{self.spec}` is violated since {since}, by {with_unit(-self.robustness, self.unit)}"
-        missed = self.witness.missed
-        if missed is not None and missed.is_condition:
-            return " ".join(missed_sentences(self.witness, missed, self.first_ns)).removesuffix(".")
-        number = _settling_number(self.atom)
-        amount = abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
+            since_time = Instant(self.time_ns, self.first_ns)
+            return (
+                f"`{self.spec}` is violated since {since_time}, by {with_unit(-self.robustness, self.unit)}"
+            )
+        missed_response = self.witness.missed
+        if missed_response is not None and missed_response.is_condition:
+            return " ".join(missed_sentences(self.witness, missed_response, self.first_ns)).removesuffix(".")
+        settling_number = _settling_number(self.atom)
+        amount = abs(without_residue(settling_number, self.atom.atom)) * divisor_of(self.atom.atom)
         unit = declared_unit(self.atom.atom, self.witness.units, is_scaled=False)
-        short = _short(self.atom, self.spec, with_unit(amount, unit) if amount else "just")
-        return f"{short}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
+        description = _short(self.atom, self.spec, with_unit(amount, unit) if amount else "just")
+        return f"{description}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
 
 
 def _has_factor(atom: Atom) -> bool:
@@ -636,19 +639,19 @@ def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
 
 def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     """Return a short description of a violation, such as "cup is 0.03 m too close to edge"."""
-    signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
+    signed_parts = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if _has_factor(atom.atom):
-        signed = []
+        signed_parts = []
     # only a single distance or signal is too small or too great
-    if len(signed) == 1 and len(atom.measured) == 1:
-        (sign, part), *_ = signed
+    if len(signed_parts) == 1 and len(atom.measured) == 1:
+        (sign, part), *_ = signed_parts
         (measurement,) = atom.measured
         # an atom that fails (high end) has to rise; one that must not hold has to fall
         needs_more = (sign > 0) == (atom.end is End.HIGH)
         if measurement.quantity == "signed_distance":
-            first, second = measurement.names
-            misplacement = f"too close to {second}" if needs_more else f"too far from {second}"
-            return f"{first} is {amount} {misplacement}"
+            first_name, second_name = measurement.names
+            misplacement = f"too close to {second_name}" if needs_more else f"too far from {second_name}"
+            return f"{first_name} is {amount} {misplacement}"
         # an equality is infinite, so it has no amount
         if measurement.quantity == "signal" and not isfinite(_settling_number(atom)):
             return measurement_clause(atom, {}, 0)
@@ -718,26 +721,26 @@ class Settled:
 
     def _begins(self) -> Iterator[int]:
         """Yield samples at which to begin the evaluation, the latest first: few samples often suffice."""
-        count = len(self.samples)
-        if self.is_whole and count - self.start <= _AT_ONCE:
+        sample_count = len(self.samples)
+        if self.is_whole and sample_count - self.start <= _AT_ONCE:
             yield self.start
             return
         # an obligation that holds at every sample has the same atom wherever the evaluation starts
-        for newest in (1, 8, _AT_ONCE, REMEMBERED // 2):
-            if newest < count - self.start:
-                yield count - newest
+        for newest_count in (1, 8, _AT_ONCE, REMEMBERED // 2):
+            if newest_count < sample_count - self.start:
+                yield sample_count - newest_count
         yield self.start
 
     def _witness_from(self, begin: int) -> Witness:
-        samples, duration_ns, to_reports = look_back([self.spec.formula])
+        reach_samples, reach_ns, reach_reports = look_back([self.spec.formula])
         start_ns = self.samples[begin].time_ns
-        first = max(begin - max(samples, to_reports), 0)
+        first_sample = max(begin - max(reach_samples, reach_reports), 0)
         # samples repeat reports, so the previous report may be any number of samples back
-        if to_reports and any(sample.reported_ns for sample in self.samples):
-            first = 0
-        while duration_ns and first > 0 and self.samples[first].time_ns > start_ns - duration_ns:
-            first -= 1
-        trace = Trace.from_samples(self.samples[first:])
+        if reach_reports and any(sample.reported_ns for sample in self.samples):
+            first_sample = 0
+        while reach_ns and first_sample > 0 and self.samples[first_sample].time_ns > start_ns - reach_ns:
+            first_sample -= 1
+        trace = Trace.from_samples(self.samples[first_sample:])
         instance = Instance(self.spec, None, self.program, {}, start_ns, FOREVER)
         evidence = Evidence(instance, self.specification.regions, lambda: [trace], self.units)
         leaves = evidence.columns(self.program.leaves)
@@ -785,7 +788,7 @@ class ViolationLog:
         self._start_ns = start_ns
         self._samples: deque[Sample] = deque(maxlen=REMEMBERED)
         self._first_ns: int | None = None
-        self._open = [
+        self._open_specs = [
             (index, spec, list(conjuncts_of(spec.formula, spec.name)))
             for index, spec in enumerate(specification.results)
         ]
@@ -798,8 +801,8 @@ class ViolationLog:
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         self._samples.append(sample)
-        settled, satisfied = self.settled, self.satisfied
-        for index, spec, conjuncts in self._open:
+        earlier_settled, earlier_satisfied = self.settled, self.satisfied
+        for index, spec, conjuncts in self._open_specs:
             spec_numbers = numbers[index]
             if spec_numbers is None:
                 continue
@@ -812,7 +815,7 @@ class ViolationLog:
                     spec, conjunct, Verdict.SATISFIED, float(spec_numbers[0, 2])
                 )
                 self.satisfied = (*self.satisfied, newly_satisfied)
-        return self.settled is not settled or self.satisfied is not satisfied
+        return self.settled is not earlier_settled or self.satisfied is not earlier_satisfied
 
     def unknown(self, spec: NamedSpec) -> Settled:
         """Return the unknown verdict of a spec for a run that ends with the newest sample."""

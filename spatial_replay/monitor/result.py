@@ -310,11 +310,11 @@ class SpecResult(Displayed):
     def _violated_invariants(
         self, conjuncts: Sequence[Conjunct], *, goes_on: bool = False, most: int = MOST_EXPLAINED
     ) -> Iterator[ViolatedInvariant]:
-        violated = [part for part in conjuncts if self.final[part.node, 1] < 0.0]
-        if self.leaves is None or not self.can_explain or not violated:
+        violated_conjuncts = [conjunct for conjunct in conjuncts if self.final[conjunct.node, 1] < 0.0]
+        if self.leaves is None or not self.can_explain or not violated_conjuncts:
             return iter(())
         return find_violated_invariants(
-            self.evidence, self.leaves, self.times_ns, violated, goes_on=goes_on, most=most
+            self.evidence, self.leaves, self.times_ns, violated_conjuncts, goes_on=goes_on, most=most
         )
 
     def _conjuncts_of(self, node: int) -> Sequence[Conjunct]:
@@ -331,9 +331,9 @@ class SpecResult(Displayed):
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
         # the name of a result may begin with the stem of its file
-        named = {**self.evidence.instance.named, self.name: self.spec}
+        spec_by_name = {**self.evidence.instance.named, self.name: self.spec}
         return find_causes(
-            self._conjuncts_of(node), self.values, self.final, self.settled_ns, witnesses, named
+            self._conjuncts_of(node), self.values, self.final, self.settled_ns, witnesses, spec_by_name
         )
 
     def to_pandas(self) -> Any:
@@ -408,10 +408,15 @@ class SpecResult(Displayed):
     @property
     def remarks(self) -> tuple[Sentence, ...]:
         """Sentences on doubts, untested parts, a cut window, and goals that hold at the first sample."""
-        doubts = [Sentence("The verdict is doubtful: ", doubt.text, ".") for doubt in self.doubts]
-        parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
+        doubt_remarks = [Sentence("The verdict is doubtful: ", doubt.text, ".") for doubt in self.doubts]
+        untested_parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
         untested_remarks = [_UNTESTED] if self._is_untested else []
-        return (*doubts, *untested_remarks, *(part.message for part in parts), *self.goals_at_the_start)
+        return (
+            *doubt_remarks,
+            *untested_remarks,
+            *(part.message for part in untested_parts),
+            *self.goals_at_the_start,
+        )
 
     @cached_property
     def goals_at_the_start(self) -> tuple[Sentence, ...]:
@@ -527,14 +532,14 @@ class SpecResult(Displayed):
         Args:
             goes_on: whether samples may follow the evaluated ones.
         """
-        conjuncts = {part.node: part for part in self._conjuncts_of(node)}
+        conjunct_of_node = {conjunct.node: conjunct for conjunct in self._conjuncts_of(node)}
         sentences = [self._headline(node, causes, first_ns)]
         for cause in causes:
             cause_lines = cause_sentences(cause, first_ns=first_ns, object=self.object)
             # the headline replaces the first sentence of a cause that is the node itself
             sentences += cause_lines if cause.node != node else cause_lines[1:]
-            part = [conjuncts[cause.node]]
-            for invariant in self._violated_invariants(part, goes_on=goes_on, most=LISTED):
+            cause_conjuncts = [conjunct_of_node[cause.node]]
+            for invariant in self._violated_invariants(cause_conjuncts, goes_on=goes_on, most=LISTED):
                 sentences += invariant_sentences(invariant, first_ns, self.evidence.units)
         if not causes and self.can_explain:
             witness = self.worst if node == 0 and not self.causes else self.worst_of(node, causes)
@@ -542,21 +547,21 @@ class SpecResult(Displayed):
         return tuple(sentences)
 
     def _headline(self, node: int, causes: Sequence[Cause], first_ns: int) -> Sentence:
-        instance = f" for {self.object}" if self.object is not None else ""
+        object_text = f" for {self.object}" if self.object is not None else ""
         lower, upper = self.final[node].tolist()
         settled_ns = self.certain_ns(node)
         verdict = final_verdict(lower, upper)
-        least = self._least(node, causes)
-        at_ns = self._least_at_ns(causes) if least is None else None
+        least_part = self._least(node, causes)
+        least_at_ns = self._least_at_ns(causes) if least_part is None else None
         return verdict_sentence(
-            f"`{self._name_of(node)}`{instance}",
+            f"`{self._name_of(node)}`{object_text}",
             verdict,
             (lower, upper),
             unit=self.unit if node == 0 else "",
             has_ended=settled_ns is None and verdict is Verdict.VIOLATED and self.can_explain,
             certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
-            least=least,
-            least_at=None if at_ns is None else Instant(at_ns, first_ns),
+            least=least_part,
+            least_at=None if least_at_ns is None else Instant(least_at_ns, first_ns),
         )
 
     def _least(self, node: int, causes: Sequence[Cause]) -> LeastPart | None:
@@ -574,12 +579,12 @@ class SpecResult(Displayed):
             or first_cause.settled_ns is None
         ):
             return None
-        least = float(self.final[first_cause.node, 1])
-        if not least < first_cause.witness.upper:
+        least_robustness = float(self.final[first_cause.node, 1])
+        if not least_robustness < first_cause.witness.upper:
             return None
         instance = self.evidence.instance
         return time_of_least(
-            instance, self.leaves, self.times_ns, first_cause.node, first_cause.settled_ns, least
+            instance, self.leaves, self.times_ns, first_cause.node, first_cause.settled_ns, least_robustness
         )
 
     def _name_of(self, node: int) -> str:
@@ -591,39 +596,41 @@ class SpecResult(Displayed):
             return None
         if settled_ns is None:
             return self.witness(node)
-        count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
-        leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
+        sample_count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
+        leaves, times_ns = self.leaves[:, :, :sample_count], self.times_ns[:sample_count]
         whole_log = (self.leaves, self.times_ns)
         return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole_log)
 
     def _witnesses(self, node: int, settled_ns: int | None) -> tuple[Witness | None, Witness | None]:
         """Return the settling witness of a node and, if its violation grew later, the final witness."""
-        settling = self._settled_witness(node, settled_ns)
+        settling_witness = self._settled_witness(node, settled_ns)
         if (
             self.leaves is None
-            or settling is None
+            or settling_witness is None
             or settled_ns is None
-            or not self.final[node, 1] < settling.upper
+            or not self.final[node, 1] < settling_witness.upper
         ):
-            return settling, None
+            return settling_witness, None
         least_witness = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
         # the first missed response explains more than a later one
         is_atom = least_witness.deciding is not None and not least_witness.deciding.unknown
         return (
-            settling,
-            least_witness if is_atom and settling.missed is None and least_witness.missed is None else None,
+            settling_witness,
+            least_witness
+            if is_atom and settling_witness.missed is None and least_witness.missed is None
+            else None,
         )
 
-    def _leaves(self, what: str) -> Floats:
-        require_ltlf(self.semantics, what)
+    def _leaves(self, purpose: str) -> Floats:
+        require_ltlf(self.semantics, purpose)
         if self.leaves is None:
-            raise UsageError(f"{what} needs the leaves of every sample, which were not stored")
+            raise UsageError(f"{purpose} needs the leaves of every sample, which were not stored")
         return self.leaves
 
     def __repr__(self) -> str:
-        instance = f" for {self.object}" if self.object is not None else ""
-        number = interval_text(self.robustness, self.lower, self.upper)
-        return f"<{self.name}{instance}: {self.verdict}, robustness {number}>"
+        object_text = f" for {self.object}" if self.object is not None else ""
+        robustness_text = interval_text(self.robustness, self.lower, self.upper)
+        return f"<{self.name}{object_text}: {self.verdict}, robustness {robustness_text}>"
 
 
 def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
@@ -642,9 +649,9 @@ def worst_first(results: Sequence[SpecResult]) -> list[int]:
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 
-    def key(place: int) -> tuple[int, int]:
-        violated_ns = results[place].violated_at_ns
-        return severity.get(results[place].verdict, 2), LATEST_NS if violated_ns is None else violated_ns
+    def key(index: int) -> tuple[int, int]:
+        violated_ns = results[index].violated_at_ns
+        return severity.get(results[index].verdict, 2), LATEST_NS if violated_ns is None else violated_ns
 
     return sorted(range(len(results)), key=key)
 
@@ -682,8 +689,8 @@ class Evaluation(Displayed):
         diagnostics = check_names(
             self.specification, self.objects, self.signals, classes=self.classes, each=self.each
         )
-        names = (replace(remark, severity="warning") for remark in diagnostics)
-        return (*self.specification.warnings, *names)
+        name_warnings = (replace(remark, severity="warning") for remark in diagnostics)
+        return (*self.specification.warnings, *name_warnings)
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:
@@ -708,21 +715,21 @@ class Evaluation(Displayed):
         Raises:
             UsageError: no result fits, or several results fit.
         """
-        fitting = [
+        fitting_results = [
             result
             for result in self.results
             if name in (None, result.name) and (object is None or object == result.object)
         ]
-        if len(fitting) == 1:
-            return fitting[0]
+        if len(fitting_results) == 1:
+            return fitting_results[0]
         titles = ", ".join(
             result.name if result.object is None else f"{result.name} for {result.object}"
             for result in self.results
         )
         is_part = any(node.name == name for result in self.results for node in result.nodes if node.name)
-        hint = f"; {name!r} is part of a result: node({name!r})" if is_part and not fitting else ""
+        hint = f"; {name!r} is part of a result: node({name!r})" if is_part and not fitting_results else ""
         raise UsageError(
-            f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {titles}{hint}"
+            f"{len(fitting_results)} results fit name={name!r}, object={object!r}; there are {titles}{hint}"
         )
 
     def to_pandas(self) -> Any:
@@ -747,9 +754,9 @@ class Evaluation(Displayed):
             if node.name == name
         ]
         if not nodes:
-            names = {node.name for result in self.results for node in result.nodes if node.name}
+            node_names = {node.name for result in self.results for node in result.nodes if node.name}
             for_object = "" if object is None else f" for object {object!r}"
-            raise UsageError(no_such_node(name, sorted(names), for_object))
+            raise UsageError(no_such_node(name, sorted(node_names), for_object))
         objects = {result.object for result in self.results if object in (None, result.object)}
         if len(objects) > 1 and object is None and len(nodes) > 1:
             raise UsageError(f"{len(nodes)} nodes are named {name!r}; say of which object: object=…")
@@ -773,8 +780,8 @@ class Evaluation(Displayed):
         if not results:
             for_object = "" if object is None else f" for {object!r}"
             raise UsageError(f"there is no result{for_object} to explain")
-        worst = worst_verdict(result.verdict for result in results)
-        return next(result for result in results if result.verdict is worst).witness(node)
+        verdict = worst_verdict(result.verdict for result in results)
+        return next(result for result in results if result.verdict is verdict).witness(node)
 
     def explain(self) -> str:
         """Explain every verdict in sentences, as the command `explain` does (see `SpecResult.explain`)."""
@@ -897,20 +904,20 @@ def evaluate_many(
         UsageError: as for `evaluate`, and for a trace without samples.
     """
     require_specification(specification)
-    is_apart = any(spec.parameter is not None for spec in specification.results) or bool(
+    is_separate = any(spec.parameter is not None for spec in specification.results) or bool(
         look_back([spec.formula for spec in specification.results])
     )
     group: list[Trace] = []
     for trace in traces:
         _require_trace(trace)
-        if is_apart or not len(trace) or len(trace) >= _MOST_TOGETHER:
+        if is_separate or not len(trace) or len(trace) >= _MOST_TOGETHER:
             # evaluations come in the order of the traces, so the group is first
             yield from _evaluate_group(specification, group, semantics)
             group = []
             yield evaluate(specification, trace, semantics=semantics)
             continue
-        samples = sum(map(len, group)) + len(trace)
-        if group and (samples > _MOST_TOGETHER or trace.units != group[0].units):
+        sample_count = sum(map(len, group)) + len(trace)
+        if group and (sample_count > _MOST_TOGETHER or trace.units != group[0].units):
             yield from _evaluate_group(specification, group, semantics)
             group = []
         group.append(trace)
@@ -925,13 +932,13 @@ def _evaluate_group(
         return
     checked_semantics(semantics, [specification])
     needs = Needs.of([specification], {})
-    trimmed = [trim_trace(trace, needs, start=True, end=True) for trace in traces]
+    trimmed_traces = [trim_trace(trace, needs, start=True, end=True) for trace in traces]
     specification = with_numbers(specification, traces[0].units)
     instances = find_instances(specification, {}, (), 0, FOREVER)
-    counting = [trace for trace, _ in trimmed]
-    scene = TraceScene(one_after_another(counting), specification.regions)
+    evaluated_traces = [trace for trace, _ in trimmed_traces]
+    scene = TraceScene(one_after_another(evaluated_traces), specification.regions)
     for full_trace, (trace, left_out), (streams, blocks) in zip(
-        traces, trimmed, run_together(instances, scene, counting, semantics), strict=True
+        traces, trimmed_traces, run_together(instances, scene, evaluated_traces, semantics), strict=True
     ):
         first_ns = int(full_trace.times_ns[0])
         evaluation = _evaluation_of(specification, semantics, trace, first_ns, streams, blocks)
@@ -952,17 +959,17 @@ def _require_names(specification: Specification, trace: Trace, each: Mapping[str
     remarks = check_names(
         specification, trace.names, tuple(trace.signals), where="trace", classes=_classes(trace), each=each
     )
-    missing = [remark for remark in remarks if remark.severity == "error"]
-    if missing:
-        raise SpecificationError(missing)
+    name_errors = [remark for remark in remarks if remark.severity == "error"]
+    if name_errors:
+        raise SpecificationError(name_errors)
 
 
 def _nothing_in_window(trace: Trace, start_ns: int | None, end_ns: int | None) -> str:
     if not len(trace):
         return "the trace has no sample; there is nothing to evaluate"
-    first, last = trace.times_ns[[0, -1]].tolist()
-    end = "the end" if end_ns is None else f"{end_ns} ns"
+    first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
+    end_text = "the end" if end_ns is None else f"{end_ns} ns"
     return (
-        f"no sample lies from {first if start_ns is None else start_ns} ns to before {end}; "
-        f"the trace runs from {first} to {last} ns"
+        f"no sample lies from {first_ns if start_ns is None else start_ns} ns to before {end_text}; "
+        f"the trace runs from {first_ns} to {last_ns} ns"
     )
