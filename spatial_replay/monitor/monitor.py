@@ -64,7 +64,7 @@ from spatial_replay.trace.trace import (
 )
 
 _MOST_KNOWN: Final = 1000
-"""Limit on names of each kind that are stored as spelling hints."""
+"""Maximum number of names of each kind that are stored for spelling hints."""
 
 
 class NodeUpdate(NamedTuple):
@@ -79,7 +79,7 @@ class NodeUpdate(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Satisfied or violated if no continuation can change it; else pending."""
+        """Satisfied or violated if no continuation can change that; else pending."""
         return online_verdict(self.lower, self.upper)
 
 
@@ -90,7 +90,7 @@ class SpecUpdate:
     Attributes:
         numbers: (N, 4), value, now, lower and upper of each node; None before the monitor's start.
         names: name of each node, or None.
-        unit: declared unit of its robustness, or "".
+        unit: declared unit of the spec's robustness, or "".
     """
 
     spec: NamedSpec
@@ -107,7 +107,11 @@ class SpecUpdate:
         return tuple(map(NodeUpdate._make, columns))
 
     def node(self, identifier: int) -> NodeUpdate:
-        """Return the node with an id, once the monitor has started."""
+        """Return the node with an id.
+
+        Raises:
+            UsageError: the monitor has not evaluated a sample.
+        """
         if self.numbers is None:
             raise UsageError(
                 f"{self.spec.name!r} has no numbers before the monitor's start; add more samples"
@@ -123,10 +127,10 @@ class SpecUpdate:
 
 
 class Monitored(NamedTuple):
-    """The specifications of a monitor, the same after every sample.
+    """The specs of a monitor, which are the same after every sample.
 
     Attributes:
-        specs: the result specs, with the names of their nodes and the unit of each.
+        specs: each result spec with the names of its nodes and the unit of its robustness.
         places: index in `specs` and node id, by the name of the node.
     """
 
@@ -135,7 +139,7 @@ class Monitored(NamedTuple):
 
 
 class Settlement(NamedTuple):
-    """The state of a monitor apart from its numbers; most samples do not change it.
+    """The state of a monitor apart from its numbers. Most samples do not change this state.
 
     Attributes:
         settled: settled verdicts from which `Update.violations` is computed.
@@ -169,7 +173,7 @@ class Update:
 
     @property
     def numbers(self) -> Sequence[Floats | None]:
-        """For each result spec (N, 4), as in `SpecUpdate`; read-only."""
+        """The numbers (N, 4) of each result spec, as in `SpecUpdate`; read-only."""
         for numbers in self._numbers:
             if numbers is not None:
                 numbers.setflags(write=False)
@@ -194,19 +198,19 @@ class Update:
     def violations(self) -> tuple[Violation, ...]:
         """Permanent violations, in the order in which they became certain; computed on demand.
 
-        Each conjunct is reported separately. There are none under the paper's semantics, because later
+        Each conjunct is reported separately. The paper's semantics has no permanent violations, because later
         samples may change every verdict.
         """
         return tuple([settled.violation for settled in self._settlement.settled])
 
     @property
     def satisfied(self) -> tuple[Settled, ...]:
-        """The permanently satisfied specs; their `reason` is computed on demand."""
+        """The permanently satisfied specs. A `reason` is computed on demand."""
         return self._settlement.satisfied
 
     @property
     def remarks(self) -> tuple[Diagnostic, ...]:
-        """Warnings of objects and signals of the specification that have been missing for too long."""
+        """Warnings about objects and signals of the specification that have been missing for too long."""
         return self._settlement.remarks
 
     @property
@@ -230,12 +234,12 @@ class Update:
 
 
 class Ending(NamedTuple):
-    """The result of one spec if a run ends with its newest sample; a replay of its log gives the same.
+    """The result of one spec if a run ends with its newest sample, as in a replay of the run's log.
 
     Attributes:
         robustness: value of the root on the samples so far; NaN if undetermined.
         lower, upper: ends of the value's interval over the finished log.
-        unit: declared unit of these numbers, or "".
+        unit: declared unit of the three numbers, or "".
         reason: explanation of an unknown verdict; "" for other verdicts, and without `note_unknown`.
         doubts: assumptions that the verdict depends on, and that the run contradicts.
     """
@@ -252,7 +256,7 @@ class Ending(NamedTuple):
 
 @named_arguments
 class Monitor:
-    """Evaluates a specification sample by sample, with the same bits as a replay of the log.
+    """Evaluates a specification sample by sample. The numbers are bit by bit those of a replay of the log.
 
     Time per sample and memory depend on the samples in windows and delays (`a[-3]`), not on the length of the
     run. The paper's semantics is an exception: its nested temporal operators read all samples again.
@@ -273,16 +277,16 @@ class Monitor:
     ) -> None:
         """Start before the first sample.
 
-        On first use on a machine, a child process compiles the code; until then updates are interpreted.
+        On first use on a machine, a child process compiles the code. Updates are interpreted until then.
 
         Args:
             start_ns: time of the first evaluated sample; terms may look back (`a[-3]`) at earlier samples.
-            units: declared units for sentences: of signals by name, of lengths under "".
+            units: declared units for sentences: units of signals by name, the unit of lengths under "".
             missing_after: time ("5s") or number of samples after which updates warn of each object and
                 signal that has not come yet. None for no warnings.
             strict_names: whether `update` raises an error for a missing name instead of a warning.
-            wait_for: names of objects and signals. Evaluation begins at the first sample by which all of
-                them have come; earlier samples are not evaluated.
+            wait_for: names of objects and signals. Evaluation begins at the first sample by which all these
+                names have come. Earlier samples are not evaluated.
             start_within: longest wait for these names after the first sample ("1s"). Evaluation then begins
                 without the missing names (`late`). None for no limit.
             wait: whether to compile in this process before the first sample, for loops above 500 Hz. On first
@@ -321,8 +325,8 @@ class Monitor:
         self.reset()
 
     def reset(self) -> None:
-        """Begin another run, like a new monitor; the next sample is its first."""
-        # 0.55 ms; a new monitor, which compiles and rehearses, takes 7.5 ms
+        """Begin another run, like a new monitor. The next sample is the first sample of that run."""
+        # this takes 0.55 ms; a new monitor, which compiles and rehearses, takes 7.5 ms
         self._live = self._new_stream()
         self._violations = self._new_violation_log()
         self._awaited = self._new_awaited_names()
@@ -354,7 +358,7 @@ class Monitor:
         return tuple(sorted(self._start.missing)) if self._start.begin_ns is not None else ()
 
     def endings(self) -> tuple[Ending, ...]:
-        """Return the result of each spec if the run ends here; unknown before the first sample."""
+        """Return the result of each spec if the run ends here. It is unknown before an evaluated sample."""
         results = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
         endings = (_ending(spec, final, numbers, unit) for spec, final, numbers, unit in results)
         return tuple(
@@ -383,7 +387,7 @@ class Monitor:
         return lower, upper
 
     def leaves(self, place: int = 0) -> Floats:
-        """Return the leaves (C, A, 1) of the newest sample; `SpecResult.leaves` of its log has the same.
+        """Return the leaves (C, A, 1) of the newest sample, as in `SpecResult.leaves` of the run's log.
 
         Args:
             place: index of the spec in `Update.specs`.
@@ -397,7 +401,7 @@ class Monitor:
         """Add the next sample and return its numbers and verdicts.
 
         Raises:
-            TraceError: the sample is not later than the previous one.
+            TraceError: the sample is not later than the previous sample.
             UsageError: not a sample, or more objects in open groups than can be bound.
             SpecificationError: with `strict_names`, a name has been missing for too long.
         """
@@ -409,7 +413,7 @@ class Monitor:
                 f"a sample at {new_text} follows one at {last_text}; give samples in the order of their times"
             )
         remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
-        # the same tuple comes back until a name arrives, so identity suffices
+        # `extend` returns the same tuple until a name arrives, so identity suffices
         if remarks is not self._settlement.remarks:
             self._settlement = self._settlement._replace(remarks=remarks)
         self._last_ns = time_ns
@@ -442,7 +446,7 @@ class _Start:
         self._first_ns: int | None = None
 
     def has_begun(self, sample: Sample) -> bool:
-        """Return whether evaluation has begun, given the next sample."""
+        """Return whether evaluation has begun or begins with the next sample, which is given."""
         if self.begin_ns is not None:
             return True
         self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
@@ -474,12 +478,12 @@ class _AwaitedNames:
         """Whether any name is still missing."""
 
     def extend(self, sample: Sample) -> tuple[Diagnostic, ...]:
-        """Return a warning for each name that is missing after the time limit; none before it."""
+        """Add a sample, and return a warning for each missing name; none before the limit."""
         self._sample_count += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         missing_count = len(self._missing_objects) + len(self._missing_signals)
-        # an object with unknown position has come as well
+        # an object with unknown position is not missing
         objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
         self._learn(
             objects,
@@ -501,7 +505,7 @@ class _AwaitedNames:
     def _learn(self, *names: Collection[str]) -> None:
         """Store names as candidates for spelling hints."""
         if not self._remarks:
-            # bounded: a run may bring a new track name at every sample
+            # limited, because a run may bring a new track name at every sample
             for names_so_far, new_names in zip(self._names_so_far, names, strict=True):
                 if len(names_so_far) < _MOST_KNOWN:
                     names_so_far.update(new_names)
@@ -527,7 +531,7 @@ class _AwaitedNames:
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
-    """Map each name to the index of its spec and its node id; a repeated name keeps the first."""
+    """Map each name to the index of its spec and its node id. A repeated name maps to its first node."""
     places: dict[str, tuple[int, int]] = {}
     for spec_index, spec_names in enumerate(names):
         for identifier, name in enumerate(spec_names):
@@ -551,21 +555,21 @@ def _robustness(numbers: Floats | None) -> float:
 REMEMBERED = 1024
 """Number of newest samples that a monitor stores to find the deciding atom of a violation."""
 _AT_ONCE = 64
-"""Limit on samples that are searched at once; longer runs are searched from the newest sample back."""
+"""Limit on samples that are searched at once. Longer runs are searched from the newest sample back."""
 
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """A part of a specification that is permanently violated. `str()` is a sentence on it.
+    """A part of a specification that is permanently violated. `str()` is a sentence on the violation.
 
     Attributes:
-        spec: innermost named spec that contains it.
-        node: its id in the tree of the result.
-        text: its canonical text.
-        time_ns: time of the sample that made it certain.
+        spec: innermost named spec that contains the part.
+        node: node id of the part in the tree of the result.
+        text: canonical text of the part.
+        time_ns: time of the sample that made the violation certain.
         robustness: upper bound of the part's robustness over all continuations; below 0.
-        witness: the atom that settled it, and the change that would flip it. None if the atom is older than
-            the samples that the monitor stores.
+        witness: the atom that settled the violation, and the change that would flip the verdict. None if the
+            atom is older than the samples that the monitor stores.
         first_ns: reference time of the sentences, the time of the monitor's first sample.
         unit: declared unit of `robustness`, or "".
     """
@@ -581,7 +585,7 @@ class Violation:
 
     @property
     def atom(self) -> DecidingAtom | None:
-        """The atom that settled it, with its objects, value and measurements."""
+        """The atom that settled the violation, with its objects, value and measurements."""
         return None if self.witness is None else self.witness.deciding
 
     @property
@@ -596,7 +600,7 @@ class Violation:
 
     @property
     def threshold(self) -> Threshold | None:
-        """The change of the atom's number that would have prevented the violation, if there is one."""
+        """The change of the atom's number that would have prevented the violation; None without one."""
         return None if self.witness is None else self.witness.threshold
 
     @property
@@ -642,17 +646,17 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     signed_parts = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if _has_factor(atom.atom):
         signed_parts = []
-    # only a single distance or signal is too small or too great
+    # only a single distance or signal can be called too small or too great
     if len(signed_parts) == 1 and len(atom.measured) == 1:
         (sign, part), *_ = signed_parts
         (measurement,) = atom.measured
-        # an atom that fails (high end) has to rise; one that must not hold has to fall
+        # an atom that fails (high end) has to rise; an atom that must not hold has to fall
         needs_more = (sign > 0) == (atom.end is End.HIGH)
         if measurement.quantity == "signed_distance":
             first_name, second_name = measurement.names
             misplacement = f"too close to {second_name}" if needs_more else f"too far from {second_name}"
             return f"{first_name} is {amount} {misplacement}"
-        # an equality is infinite, so it has no amount
+        # an equality with a text has infinite robustness, so it has no amount
         if measurement.quantity == "signal" and not isfinite(_settling_number(atom)):
             return measurement_clause(atom, {}, 0)
         if isinstance(part, Signal):
@@ -665,11 +669,11 @@ class Settled:
     """A verdict of a monitor, with the samples in which its deciding atom is searched.
 
     Attributes:
-        verdict: permanently satisfied or violated; or unknown, for a run that ends there.
+        verdict: permanently satisfied, permanently violated, or unknown at the end of a run.
         number: end of the interval that settles the verdict: the lower end of a satisfied part, the upper end
-            of a violated one.
+            of a violated part.
         samples: newest samples of the run.
-        start: index of the first evaluated sample.
+        start: index in `samples` of the first evaluated sample.
         is_whole: whether `samples` begins with the first sample of the run.
     """
 
@@ -700,7 +704,7 @@ class Settled:
 
     @property
     def reason(self) -> str:
-        """The deciding atom and its margin in words; "" if it was not found."""
+        """The deciding atom and its margin in words; "" if the atom was not found."""
         witness = self.witness
         if witness is not None and self.verdict is Verdict.UNKNOWN:
             return str(reason_sentence(witness, first_ns=self.first_ns))
@@ -710,7 +714,10 @@ class Settled:
 
     @cached_property
     def witness(self) -> Witness | None:
-        """The witness on the newest samples. It uses few samples if these give the part the same number."""
+        """The witness on the newest samples, or None.
+
+        The fewest samples that give the part the same verdict and number are used.
+        """
         for begin in self._begins():
             witness = self._witness_from(begin)
             number = witness.upper if self.verdict is Verdict.VIOLATED else witness.lower
@@ -720,7 +727,7 @@ class Settled:
         return None
 
     def _begins(self) -> Iterator[int]:
-        """Yield samples at which to begin the evaluation, the latest first: few samples often suffice."""
+        """Yield first samples for the evaluation, the latest first, because few samples often suffice."""
         sample_count = len(self.samples)
         if self.is_whole and sample_count - self.start <= _AT_ONCE:
             yield self.start
@@ -759,14 +766,14 @@ def rehearse(specification: Specification) -> None:
             trial = Settled(
                 spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0, {}
             )
-            # both are computed when they are read
+            # `sentences` and `reason` are computed when they are read
             _ = trial.violation.sentences, trial.reason
 
 
 def _run_trial(specification: Specification, semantics: Semantics) -> None:
     """Load every kernel before the first sample."""
     trial = LiveStream(specification, semantics, 0)
-    # the second sample takes branches that the first one does not
+    # the second sample takes branches that the first sample does not take
     for time_ns in range(2):
         trial.extend(Sample(time_ns))
     if semantics == "ltlf":
@@ -797,7 +804,7 @@ class ViolationLog:
         self.satisfied: tuple[Settled, ...] = ()
 
     def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> bool:
-        """Add a sample and the numbers (N, 4) of each result after it; return whether a verdict settled."""
+        """Add a sample and the numbers (N, 4) of each result after it. Return whether a verdict settled."""
         if self._first_ns is None:
             self._first_ns = sample.time_ns
         self._samples.append(sample)
@@ -828,7 +835,7 @@ class ViolationLog:
             if upper < 0.0:
                 conjuncts.remove(conjunct)
                 newly_violated = self._verdict_with_samples(spec, conjunct, Verdict.VIOLATED, upper)
-                # a new tuple, because earlier updates keep the old one
+                # a new tuple, because earlier updates refer to the old tuple
                 self.settled = (*self.settled, newly_violated)
 
     def _verdict_with_samples(

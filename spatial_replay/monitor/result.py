@@ -1,4 +1,4 @@
-"""Evaluate a specification over a trace: results of its specs, signals and witnesses on request."""
+"""Evaluate a specification over a trace: results of its specs, with signals and witnesses on request."""
 
 from __future__ import annotations
 
@@ -88,14 +88,15 @@ class NodeResult:
     """One node of a specification's tree over the evaluated samples.
 
     Attributes:
-        id: its number in the order of the text; 0 for the root.
-        parent: id of its parent; None for the root.
+        id: number of the node in the order of the text; 0 for the root.
+        parent: id of the parent; None for the root.
         operator: "and", "F", a relation's name, …
-        name: name of the spec whose root it is, or None.
-        text: its canonical text.
+        name: name of the spec whose root is the node, or None.
+        text: canonical text of the node.
         requirement, title: id ("REQ-12") and title of the requirement of that spec, or None.
-        value: (T,), robustness at the first sample, given the samples up to each; NaN if undetermined.
-        now: (T,), robustness at each sample, given the samples up to that one.
+        value: (T,), for each sample the robustness at the first sample, given the samples so far; NaN if
+            undetermined.
+        now: (T,), robustness at each sample, given the samples so far.
         lower, upper: (T,), bounds of `value` over all continuations and unknown values.
         robustness: `value` on the whole log; NaN if undetermined.
         final_lower, final_upper: bounds of the robustness on the finished log.
@@ -126,17 +127,17 @@ class SpecResult(Displayed):
     """One spec evaluated over a log, or one object's instance of a template.
 
     Attributes:
-        name: name of the spec, after the stem of its file if two files have a spec of that name.
-        object: object of a template's instance; else None.
+        name: name of the spec. If two files have a spec of that name, the name begins with the file's stem.
+        object: object for which a template was evaluated; else None.
         values: (N,), value of each node on the whole log.
         final: (N, 2), lower and upper end of each node's value on the finished log.
-        first_satisfied_ns: time of the first sample with a value of at least 0, or None. Later values may be
-            below 0.
+        first_satisfied_ns: time of the first sample at which the root's value is at least 0, or None. Later
+            values may be below 0.
         settled_ns: (N, 2), see `InstanceStream`.
         times_ns: (T,) int64, times of the evaluated samples; empty if no numbers of samples were stored.
         series: (N, 4, T), value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
         leaves: (C, A, T), leaves of the instance, which witnesses and signals need; None if not stored.
-        evidence: access to the samples, to read them again.
+        evidence: access to the samples of the log.
         doubts: assumptions that the verdict depends on, and that the log contradicts.
     """
 
@@ -170,10 +171,10 @@ class SpecResult(Displayed):
         """Collect the result of a stream that has seen all samples.
 
         Args:
-            block: stored numbers of every sample, if any.
-            name: name of the result; by default that of the instance.
-            has_series, has_leaves: whether the block holds the series, and the leaves.
-            doubts: doubts that affect its verdict.
+            block: stored numbers of every sample, or None.
+            name: name of the result; by default the name of the instance.
+            has_series, has_leaves: whether the block holds the series, and whether it holds the leaves.
+            doubts: doubts that affect the verdict.
         """
         instance = stream.instance
         has_series = has_series and block is not None
@@ -260,7 +261,7 @@ class SpecResult(Displayed):
 
     @property
     def unit(self) -> str:
-        """The declared unit of its robustness; "" if its atoms have several units or none is declared."""
+        """The declared unit of the robustness; "" if the atoms have several units or no declared unit."""
         return declared_unit(self.formula, self.evidence.units)
 
     @property
@@ -274,7 +275,10 @@ class SpecResult(Displayed):
         return self.certain_ns() if self.verdict is Verdict.VIOLATED else None
 
     def certain_ns(self, node: int = 0) -> int | None:
-        """Return the time at which a node's verdict became certain; None if unknown or decided by the end."""
+        """Return the time at which a node's verdict became certain.
+
+        The result is None for an unknown verdict, and if only the end of the log decided.
+        """
         verdict = final_verdict(*self.final[node].tolist())
         settled_ns = (
             NEVER if verdict is Verdict.UNKNOWN else self.settled_ns[node, int(verdict is Verdict.VIOLATED)]
@@ -283,7 +287,7 @@ class SpecResult(Displayed):
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
-        """The causes of a violated or unknown verdict, one for each named spec that fails in it.
+        """The causes of a violated or unknown verdict, one for each named spec that is not satisfied.
 
         Causes that settled before the end come first, by time. Causes that only the end of the log decided
         follow, the least robustness first. Unknown causes come last.
@@ -291,7 +295,7 @@ class SpecResult(Displayed):
         return self.causes_of(0)
 
     def causes_of(self, node: int) -> tuple[Cause, ...]:
-        """Return the causes of a node's verdict, as `causes` does for the root."""
+        """Return the causes of a node's verdict (see `causes`)."""
         return self._causes(node, self._witnesses)
 
     @cached_property
@@ -300,10 +304,10 @@ class SpecResult(Displayed):
         return self.violated_invariants_of(0)
 
     def violated_invariants_of(self, node: int, *, goes_on: bool = False) -> tuple[ViolatedInvariant, ...]:
-        """Return the violated parts `G p` of a node, as `violated_invariants` does for the root.
+        """Return the violated parts `G p` of a node (see `violated_invariants`).
 
         Args:
-            goes_on: whether samples may follow the evaluated ones.
+            goes_on: whether further samples may follow.
         """
         return tuple(self._violated_invariants(self._conjuncts_of(node), goes_on=goes_on))
 
@@ -318,7 +322,6 @@ class SpecResult(Displayed):
         )
 
     def _conjuncts_of(self, node: int) -> Sequence[Conjunct]:
-        """Return the conjuncts of a node."""
         return conjuncts_of(nodes_of(self.formula)[node], self._name_of(node), node)
 
     def first_cause(self, node: int) -> Cause | None:
@@ -353,19 +356,19 @@ class SpecResult(Displayed):
 
     @property
     def least(self) -> LeastPart | None:
-        """The conjunct with the least robustness; None if the first cause has it."""
+        """The conjunct with the least robustness; None if that is the conjunct of the first cause."""
         return self._least(0, self.causes)
 
     @property
     def least_at_ns(self) -> int | None:
-        """Time at which the first cause reached its least robustness; None if that settled it."""
+        """Time of the first cause's least robustness; None unless that is later than its settling time."""
         return self._least_at_ns(self.causes)
 
     @cached_property
     def worst(self) -> Witness | None:
         """The witness of the first cause, or of a satisfied result.
 
-        None if the leaves were not stored, and under the paper's semantics.
+        The witness is None under the paper's semantics, and if the leaves were not stored.
         """
         return self.worst_of(0, self.causes)
 
@@ -382,17 +385,17 @@ class SpecResult(Displayed):
         leaves, times_ns = self._stored
         lower, upper = self.final[0].tolist()
         infinite_end = End.LOW if lower == np.inf else End.HIGH if upper == -np.inf else None
-        # NaN marks leaves that the paper's semantics leaves out: no path leads through them
+        # NaN marks leaves that the paper's semantics excludes, which have no deciding path
         infinite_end = None if np.isnan(leaves).any() else infinite_end
         return find_vacuous(self.evidence, leaves, times_ns, infinite=infinite_end)
 
     @property
     def tested(self) -> Tested:
-        """By how much of the log the verdict was tested: "full", "cut" or "nothing".
+        """Whether the log tested the verdict: "full", "cut" or "nothing".
 
         "nothing": the verdict is the same for all values of the atoms. (In a satisfied formula, antecedents
-        keep their values.) "cut": the verdict may change if the log continues to the ends of its windows.
-        "full": all other verdicts, unknown ones included.
+        keep their values.) "cut": the verdict may change if the log continues to the ends of the formula's
+        windows. "full": all other verdicts, unknown verdicts included.
         """
         if self._is_untested:
             return "nothing"
@@ -432,7 +435,7 @@ class SpecResult(Displayed):
     @cached_property
     def _cut_window(self) -> UntestedPart | None:
         if self.certain_ns() is not None:
-            # the verdict was certain before the end: no later sample could have changed it
+            # the verdict was certain before the end, so no later sample could have changed it
             return None
         return find_cut_window(self.evidence, *self._stored, self.verdict)
 
@@ -445,11 +448,11 @@ class SpecResult(Displayed):
 
     @property
     def can_explain(self) -> bool:
-        """Whether it can have a witness: the leaves are stored, and the semantics is "ltlf"."""
+        """Whether the result can have a witness: leaves are stored, and the semantics is "ltlf"."""
         return self.leaves is not None and self.semantics == "ltlf"
 
     def full_signal(self) -> Floats:
-        """Return each node's robustness (N, T) from each sample to the end; NaN if undetermined.
+        """Return each node's robustness (N, T) from each sample to the end of the log; NaN if undetermined.
 
         Raises:
             UsageError: the semantics is the paper's, or the leaves were not stored.
@@ -470,7 +473,7 @@ class SpecResult(Displayed):
         return window_signal(self.formula, order, leaves, self.times_ns, width_ns)
 
     def witness(self, node: str | int | None = None) -> Witness:
-        """Return the witness of a node's verdict, by name or id; by default of the root's.
+        """Return the witness of the verdict of a node, given by name or id. The default is the root.
 
         Raises:
             UsageError: no such node, the semantics is the paper's, or the leaves were not stored.
@@ -482,7 +485,7 @@ class SpecResult(Displayed):
         return find_witness(self.evidence, leaves, self.times_ns, identifier)
 
     def deciding_node(self) -> int:
-        """Return the id of the node that decides the verdict; cheaper than `witness`.
+        """Return the id of the node that decides the verdict. This is cheaper than `witness`.
 
         Raises:
             UsageError: the semantics is the paper's, or the leaves were not stored.
@@ -492,7 +495,7 @@ class SpecResult(Displayed):
         return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
-        """Return sentences on the robustness, and on the beginning of a violation if it was earlier.
+        """Return sentences on the robustness, and on the first violation if that was earlier.
 
         The text is "" without a witness (see `worst`).
         """
@@ -500,7 +503,7 @@ class SpecResult(Displayed):
             return cause_reason(self.causes[0], first_ns)
         if self.worst is None or self.leaves is None:
             return Sentence("")
-        # a settled witness explains an earlier robustness than that of the whole log
+        # a settled witness explains the robustness at its settling time, not on the whole log
         is_settled = self.worst.is_settled
         whole_witness = (
             find_witness(self.evidence, self.leaves, self.times_ns, flips=False) if is_settled else self.worst
@@ -508,7 +511,7 @@ class SpecResult(Displayed):
         return reason_sentence(whole_witness, first_ns=first_ns)
 
     def explain(self, *, first_ns: int | None = None) -> str:
-        """Explain the verdict in sentences, one a line, as the command `explain` prints them.
+        """Explain the verdict in sentences, one per line, as the command `explain` prints them.
 
         A result that is not satisfied lists each cause, its deciding atom, and the change that would flip it.
         A satisfied result names its deciding atom. Remarks follow (see `remarks`).
@@ -520,7 +523,7 @@ class SpecResult(Displayed):
         return "\n".join(self.sentences(first_ns))
 
     def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
-        """Return the sentences of `explain`, which count time from `first_ns`."""
+        """Return the sentences of `explain`, with times counted from `first_ns`."""
         sentences = self.sentences_about(0, self.causes, first_ns)
         return (*sentences, *counted_from(self.remarks, first_ns))
 
@@ -530,7 +533,7 @@ class SpecResult(Displayed):
         """Return the sentences on the verdict of a node, given its causes.
 
         Args:
-            goes_on: whether samples may follow the evaluated ones.
+            goes_on: whether further samples may follow.
         """
         conjunct_of_node = {conjunct.node: conjunct for conjunct in self._conjuncts_of(node)}
         sentences = [self._headline(node, causes, first_ns)]
@@ -591,7 +594,7 @@ class SpecResult(Displayed):
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
 
     def _settled_witness(self, node: int, settled_ns: int | None) -> Witness | None:
-        """Return the witness of a node's verdict at its settling time; on the whole log if that is None."""
+        """Return the witness of a node's verdict at `settled_ns`, or on the whole log if that is None."""
         if self.leaves is None or not self.can_explain:
             return None
         if settled_ns is None:
@@ -612,7 +615,7 @@ class SpecResult(Displayed):
         ):
             return settling_witness, None
         least_witness = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
-        # the first missed response explains more than a later one
+        # the first missed response explains more than a later missed response
         is_atom = least_witness.deciding is not None and not least_witness.deciding.unknown
         return (
             settling_witness,
@@ -634,7 +637,7 @@ class SpecResult(Displayed):
 
 
 def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
-    """Return the message for an unknown node, with the nearest name and all names."""
+    """Return the message for an unknown node, with the nearest existing name and all names."""
     existing_names = tuple(names)
     listing = f"there are {', '.join(existing_names)}" if existing_names else "there are none yet"
     hint = nearest_hint(name, existing_names) if isinstance(name, str) else ""
@@ -644,8 +647,9 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
     """Return the indices of results, worst first: violated, then unknown, then others.
 
-    Violated results are in the order of their settling times; those decided only by the end come last.
-    Otherwise results keep the order of the files. Robustness is not compared, because units may differ.
+    Violated results are sorted by settling time. A violation that only the end of the log decided counts as
+    the latest. Otherwise results keep the order of the files. Robustness is not compared, because units may
+    differ.
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 
@@ -658,14 +662,14 @@ def worst_first(results: Sequence[SpecResult]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation(Displayed):
-    """One result per spec, and per object for a template.
+    """The results of a specification: one per spec, or one per object of a template.
 
     Attributes:
         specification: the evaluated specification.
         objects, signals, classes: names in the trace.
-        each: choice of objects for each template parameter.
+        each: choice of objects by template parameter.
         left_out: sentences on samples that were left out at the ends.
-        doubts: assumptions that the log contradicts; each result has the doubts that affect it.
+        doubts: assumptions that the log contradicts. A result has the doubts that affect its verdict.
     """
 
     results: tuple[SpecResult, ...]
@@ -682,10 +686,11 @@ class Evaluation(Displayed):
     def remarks(self) -> tuple[Diagnostic, ...]:
         """Warnings about the specification's text (see `Specification.warnings`) and its names in this trace.
 
-        Objects and signals that the trace never has get a warning: they are unknown in every sample. Warnings
-        also name classes of templates without an object, and objects hidden by a definition of the same name.
+        An object or signal that the trace never has gets a warning, because it is unknown in every sample.
+        Warnings also name classes of templates without an object, and objects hidden by a definition of the
+        same name.
         """
-        # computed on demand: it takes as long as the evaluation itself
+        # computed on demand, because it takes as long as the evaluation itself
         diagnostics = check_names(
             self.specification, self.objects, self.signals, classes=self.classes, each=self.each
         )
@@ -694,7 +699,7 @@ class Evaluation(Displayed):
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:
-        """The templates without instances: no object fits them, so they decided nothing.
+        """The templates that decided nothing, because no object fits them.
 
         `SpecResult.vacuous` has the parts of a result that decided nothing.
         """
@@ -733,7 +738,7 @@ class Evaluation(Displayed):
         )
 
     def to_pandas(self) -> Any:
-        """Return the results as a pandas DataFrame: a row for each, with its verdict, numbers and times.
+        """Return the results as a pandas DataFrame: one row per result, with verdict, numbers and times.
 
         Raises:
             UsageError: pandas is not installed.
@@ -805,21 +810,22 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate every result spec of a specification on every prefix of a trace.
 
-    The trace caches measurements between footprints: evaluating an edited specification over the same trace
-    reuses them.
+    The trace caches measurements between footprints, so an edited specification over the same trace reuses
+    them.
 
     Args:
         semantics: "ltlf" for finite-trace robustness, or "paper" for Definition 16 of the paper.
-        start_ns, end_ns: evaluated samples, from start to before end. Terms (`a[-3]`) may look before the
-            start. By default, a mapped log is trimmed where a needed topic has not begun, or has ended
-            (`ends: trim` of the mapping); `Evaluation.left_out` names the trimmed samples.
-        each: choice of objects for each template parameter: "all", "class:NAME" or a name.
-        strict_names: whether names that the trace never has are errors. Otherwise `Evaluation.remarks` warns:
-            such objects and signals are unknown, and a template has no result for such a class.
+        start_ns, end_ns: samples from `start_ns` to before `end_ns` are evaluated. Terms (`a[-3]`) may look
+            before the start. By default, a mapped log is trimmed where a needed topic has not begun or has
+            ended (`ends: trim` of the mapping). `Evaluation.left_out` names the trimmed samples.
+        each: choice of objects by template parameter: "all", "class:NAME" or an object's name.
+        strict_names: whether names that the trace never has are errors. By default, `Evaluation.remarks` has
+            a warning. Missing objects and signals are unknown, and a template has no result for a missing
+            class.
 
     Raises:
-        SpecificationError: a name that no number of a signal has, if the trace declares such names. With
-            `strict_names`, also names that the trace never has.
+        SpecificationError: a text that names no number of its signal, if the trace declares names of numbers.
+            With `strict_names`, also a name that the trace never has.
         UsageError: no sample in the window, a template without its objects, unknown semantics, an
             operator that the semantics does not define, or an argument of another type.
     """
@@ -832,7 +838,7 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
-    # before trimming: sentences count time from the first sample of the log
+    # before trimming, because sentences count time from the first sample of the log
     first_ns, needs = int(trace.times_ns[0]), Needs.of([specification], each or {})
     trace, left_out = trim_trace(trace, needs, start=not window[0], end=window[1] >= FOREVER)
     specification = with_numbers(specification, trace.units)
@@ -895,9 +901,9 @@ _MOST_TOGETHER: Final = 2**14
 def evaluate_many(
     specification: Specification, traces: Iterable[Trace], *, semantics: Semantics = "ltlf"
 ) -> Iterator[Evaluation]:
-    """Evaluate a specification on each of many traces; each evaluation equals that of `evaluate`.
+    """Evaluate a specification on each of many traces, with the results of `evaluate`.
 
-    Short traces are measured together. Specifications with templates, and those whose terms look back, are
+    Short traces are measured together. A specification with a template, or with a term that looks back, is
     evaluated trace by trace.
 
     Raises:
