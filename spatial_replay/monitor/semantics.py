@@ -72,174 +72,214 @@ class PaperMemory(NamedTuple):
 
 
 @piece
-def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: Flags) -> None:
+def _set_now(rows: Integers, operands: Integers, node: int, numbers: Floats, lost_flags: Flags) -> None:
     """Compute a node on the newest sample alone, from its operands there."""
-    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    code, operand_start, operand_end = rows[node, CODE], rows[node, FIRST], rows[node, END]
     # such a window needs later samples: on the newest sample alone, the node is left out
-    if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
-        numbers[n], lost[n] = np.nan, 0
+    if code == NEXT or (code > NEXT and rows[node, LOW] > 0):
+        numbers[node], lost_flags[node] = np.nan, 0
         return
-    left = operands[first]
+    left_node = operands[operand_start]
     if code in (EVENTUALLY, ALWAYS):
-        numbers[n], lost[n] = numbers[left], lost[left]
+        numbers[node], lost_flags[node] = numbers[left_node], lost_flags[left_node]
         return
     if code > ALWAYS:
-        right = operands[end - 1]
-        numbers[n], lost[n] = least(numbers[left], numbers[right]), lost[left] | lost[right]
+        right_node = operands[operand_end - 1]
+        numbers[node], lost_flags[node] = (
+            least(numbers[left_node], numbers[right_node]),
+            lost_flags[left_node] | lost_flags[right_node],
+        )
         return
-    _fold(code, operands[first:end], numbers, lost, n)
+    _fold(code, operands[operand_start:operand_end], numbers, lost_flags, node)
 
 
 @piece
-def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -> None:
+def _fold(code: int, operands: Integers, numbers: Floats, lost_flags: Flags, node: int) -> None:
     """Compute a Boolean node from its operands."""
-    number, is_lost = numbers[operands[0]], lost[operands[0]]
+    number, is_lost = numbers[operands[0]], lost_flags[operands[0]]
     number = combine(code, number, number) if len(operands) == 1 else number
     for operand in operands[1:]:
         number = combine(code, number, numbers[operand])
-        is_lost |= lost[operand]
-    numbers[n], lost[n] = number, is_lost
+        is_lost |= lost_flags[operand]
+    numbers[node], lost_flags[node] = number, is_lost
 
 
 @piece
-def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+def _set_column(rows: Integers, operands: Integers, node: int, last_sample: int, memory: PaperMemory) -> None:
     """Compute a Boolean node at every sample, from its operands."""
-    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
-    row = rows[n, COLUMN]
-    target, target_lost = memory.columns[row], memory.lost_columns[row]
-    source_row = rows[operands[first], COLUMN]
+    code, operand_start, operand_end = rows[node, CODE], rows[node, FIRST], rows[node, END]
+    target_row = rows[node, COLUMN]
+    target, target_lost = memory.columns[target_row], memory.lost_columns[target_row]
+    source_row = rows[operands[operand_start], COLUMN]
     source, source_lost = memory.columns[source_row], memory.lost_columns[source_row]
-    for t in range(last + 1):
-        target[t] = combine(code, source[t], source[t]) if end - first == 1 else source[t]
-        target_lost[t] = source_lost[t]
-    for place in range(first + 1, end):
-        source_row = rows[operands[place], COLUMN]
+    for sample in range(last_sample + 1):
+        target[sample] = (
+            combine(code, source[sample], source[sample])
+            if operand_end - operand_start == 1
+            else source[sample]
+        )
+        target_lost[sample] = source_lost[sample]
+    for operand_index in range(operand_start + 1, operand_end):
+        source_row = rows[operands[operand_index], COLUMN]
         source, source_lost = memory.columns[source_row], memory.lost_columns[source_row]
-        for t in range(last + 1):
-            target[t] = combine(code, target[t], source[t])
-            target_lost[t] |= source_lost[t]
+        for sample in range(last_sample + 1):
+            target[sample] = combine(code, target[sample], source[sample])
+            target_lost[sample] |= source_lost[sample]
 
 
 @piece
-def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: PaperMemory) -> bool:
+def _window_at_first(rows: Integers, node: int, last_sample: int, time_ns: int, memory: PaperMemory) -> bool:
     """Return whether the last sample is in the first sample's window; record the start of that window."""
-    passed = time_ns - memory.stamps[0] if rows[n, IS_IN_NS] else last
-    if memory.starts[n] < 0 and passed >= rows[n, LOW]:
-        memory.starts[n] = last
-    return bool(memory.starts[n] >= 0 and (rows[n, HIGH] < 0 or passed <= rows[n, HIGH]))
+    elapsed = time_ns - memory.stamps[0] if rows[node, IS_IN_NS] else last_sample
+    if memory.starts[node] < 0 and elapsed >= rows[node, LOW]:
+        memory.starts[node] = last_sample
+    return bool(memory.starts[node] >= 0 and (rows[node, HIGH] < 0 or elapsed <= rows[node, HIGH]))
 
 
 @piece
 def _step_first(
-    rows: Integers, operands: Integers, n: int, last: int, time_ns: int, memory: PaperMemory
+    rows: Integers, operands: Integers, node: int, last_sample: int, time_ns: int, memory: PaperMemory
 ) -> None:
     """Update a temporal node that is needed only at the first sample."""
-    code, value, lost = rows[n, CODE], memory.value, memory.lost_value
-    right = operands[rows[n, END] - 1]
-    right_row = rows[right, COLUMN]
-    is_plain = rows[right, IS_PLAIN] != 0
+    code, value, lost_value = rows[node, CODE], memory.value, memory.lost_value
+    right_node = operands[rows[node, END] - 1]
+    right_row = rows[right_node, COLUMN]
+    is_plain = rows[right_node, IS_PLAIN] != 0
     if code == NEXT:
-        if is_plain and last == 1:
-            value[n], lost[n] = memory.now[right], memory.lost_now[right]
-        if not is_plain and last >= 1:
-            value[n], lost[n] = memory.columns[right_row, 1], memory.lost_columns[right_row, 1]
+        if is_plain and last_sample == 1:
+            value[node], lost_value[node] = memory.now[right_node], memory.lost_now[right_node]
+        if not is_plain and last_sample >= 1:
+            value[node], lost_value[node] = memory.columns[right_row, 1], memory.lost_columns[right_row, 1]
         return
-    if not _window_at_first(rows, n, last, time_ns, memory):
+    if not _window_at_first(rows, node, last_sample, time_ns, memory):
         return
-    start = memory.starts[n]
+    start = memory.starts[node]
     if code in (EVENTUALLY, ALWAYS):
         # the number of a plain operand at a sample never changes: a running extremum suffices
         if is_plain:
-            value[n] = pick(code == ALWAYS, value[n], memory.now[right])
-            lost[n] |= memory.lost_now[right]
+            value[node] = pick(code == ALWAYS, value[node], memory.now[right_node])
+            lost_value[node] |= memory.lost_now[right_node]
         else:
-            numbers, marks = memory.columns[right_row], memory.lost_columns[right_row]
-            value[n], lost[n] = total(code == ALWAYS, numbers, marks, start, last)
+            operand_numbers, operand_lost = memory.columns[right_row], memory.lost_columns[right_row]
+            value[node], lost_value[node] = total(
+                code == ALWAYS, operand_numbers, operand_lost, start, last_sample
+            )
         return
-    left = operands[rows[n, FIRST]]
-    if rows[left, IS_PLAIN]:
-        memory.left[n] = least(memory.left[n], memory.now[left])
-        memory.lost_left[n] |= memory.lost_now[left]
+    left_node = operands[rows[node, FIRST]]
+    if rows[left_node, IS_PLAIN]:
+        memory.left[node] = least(memory.left[node], memory.now[left_node])
+        memory.lost_left[node] |= memory.lost_now[left_node]
     else:
-        left_row = rows[left, COLUMN]
-        numbers, marks = memory.columns[left_row], memory.lost_columns[left_row]
-        memory.left[n], memory.lost_left[n] = total(True, numbers, marks, start, last)
+        left_row = rows[left_node, COLUMN]
+        operand_numbers, operand_lost = memory.columns[left_row], memory.lost_columns[left_row]
+        memory.left[node], memory.lost_left[node] = total(
+            True, operand_numbers, operand_lost, start, last_sample
+        )
     if is_plain:
-        value[n] = most(value[n], least(memory.now[right], memory.left[n]))
-        lost[n] |= memory.lost_now[right] | memory.lost_left[n]
+        value[node] = most(value[node], least(memory.now[right_node], memory.left[node]))
+        lost_value[node] |= memory.lost_now[right_node] | memory.lost_left[node]
         return
-    inner = rows[n, INNER]
-    memory.columns[inner, last], memory.lost_columns[inner, last] = memory.left[n], memory.lost_left[n]
-    value[n], lost[n] = np.nan, 0
-    for t in range(start, last + 1):
-        value[n] = most(value[n], least(memory.columns[right_row, t], memory.columns[inner, t]))
-        lost[n] |= memory.lost_columns[right_row, t] | memory.lost_columns[inner, t]
+    inner_column = rows[node, INNER]
+    memory.columns[inner_column, last_sample], memory.lost_columns[inner_column, last_sample] = (
+        memory.left[node],
+        memory.lost_left[node],
+    )
+    value[node], lost_value[node] = np.nan, 0
+    for sample in range(start, last_sample + 1):
+        value[node] = most(
+            value[node], least(memory.columns[right_row, sample], memory.columns[inner_column, sample])
+        )
+        lost_value[node] |= memory.lost_columns[right_row, sample] | memory.lost_columns[inner_column, sample]
 
 
 @piece
-def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory) -> int:
+def _apart(rows: Integers, node: int, earlier: int, later: int, memory: PaperMemory) -> int:
     """Return the distance of two samples, in the unit of a node's window."""
-    return memory.stamps[later] - memory.stamps[earlier] if rows[n, IS_IN_NS] else later - earlier
+    return memory.stamps[later] - memory.stamps[earlier] if rows[node, IS_IN_NS] else later - earlier
 
 
 @piece
-def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+def _step_column(
+    rows: Integers, operands: Integers, node: int, last_sample: int, memory: PaperMemory
+) -> None:
     """Update a temporal node that is needed at every sample; only samples with open windows change."""
-    code = rows[n, CODE]
-    row, inner = rows[n, COLUMN], rows[n, INNER]
-    target, target_lost = memory.columns[row], memory.lost_columns[row]
-    right_row = rows[operands[rows[n, END] - 1], COLUMN]
-    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    code = rows[node, CODE]
+    target_column, inner_column = rows[node, COLUMN], rows[node, INNER]
+    target, target_lost = memory.columns[target_column], memory.lost_columns[target_column]
+    right_row = rows[operands[rows[node, END] - 1], COLUMN]
+    right_numbers, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
     if code == NEXT:
-        for t in range(last):
-            target[t], target_lost[t] = right[t + 1], right_lost[t + 1]
-        target[last], target_lost[last] = np.nan, 0
+        for sample in range(last_sample):
+            target[sample], target_lost[sample] = right_numbers[sample + 1], right_lost[sample + 1]
+        target[last_sample], target_lost[last_sample] = np.nan, 0
         return
-    low, high = rows[n, LOW], rows[n, HIGH]
-    while high >= 0 and _apart(rows, n, memory.opens[n], last, memory) > high:
-        memory.opens[n] += 1
-    start = max(memory.starts[n], memory.opens[n])
-    while start <= last and _apart(rows, n, memory.opens[n], start, memory) < low:
+    window_low, window_high = rows[node, LOW], rows[node, HIGH]
+    while window_high >= 0 and _apart(rows, node, memory.opens[node], last_sample, memory) > window_high:
+        memory.opens[node] += 1
+    start = max(memory.starts[node], memory.opens[node])
+    while start <= last_sample and _apart(rows, node, memory.opens[node], start, memory) < window_low:
         start += 1
-    memory.starts[n] = start
-    if start <= last:
-        _scan_node(rows, operands, n, start, last, memory)
-    if inner == row:
+    memory.starts[node] = start
+    if start <= last_sample:
+        _scan_node(rows, operands, node, start, last_sample, memory)
+    if inner_column == target_column:
         return
-    for t in range(memory.opens[n], last + 1):
-        while start <= last and _apart(rows, n, t, start, memory) < low:
+    for sample in range(memory.opens[node], last_sample + 1):
+        while start <= last_sample and _apart(rows, node, sample, start, memory) < window_low:
             start += 1
-        if start <= last:
-            target[t], target_lost[t] = memory.columns[inner, start], memory.lost_columns[inner, start]
+        if start <= last_sample:
+            target[sample], target_lost[sample] = (
+                memory.columns[inner_column, start],
+                memory.lost_columns[inner_column, start],
+            )
         else:
-            target[t], target_lost[t] = np.nan, 0
+            target[sample], target_lost[sample] = np.nan, 0
 
 
 @piece
 def _scan_node(
-    rows: Integers, operands: Integers, n: int, start: int, last: int, memory: PaperMemory
+    rows: Integers, operands: Integers, node: int, start: int, last_sample: int, memory: PaperMemory
 ) -> None:
     """Compute the unbounded operator from each sample to the last one, for the samples from `start` on."""
-    code, inner = rows[n, CODE], rows[n, INNER]
-    target, target_lost = memory.columns[inner], memory.lost_columns[inner]
-    right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]
+    code, inner_column = rows[node, CODE], rows[node, INNER]
+    target, target_lost = memory.columns[inner_column], memory.lost_columns[inner_column]
+    right_node, left_node = operands[rows[node, END] - 1], operands[rows[node, FIRST]]
     right_row, left_row = rows[right_node, COLUMN], rows[left_node, COLUMN]
-    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
-    left, left_lost = memory.columns[left_row], memory.lost_columns[left_row]
+    right_numbers, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    left_numbers, left_lost = memory.columns[left_row], memory.lost_columns[left_row]
     if code in (EVENTUALLY, ALWAYS):
-        scan(code == ALWAYS, right, right_lost, start, last, target, target_lost)
+        scan(code == ALWAYS, right_numbers, right_lost, start, last_sample, target, target_lost)
     elif rows[left_node, IS_PLAIN]:
-        scan_until(left, left_lost, right, right_lost, start, last, target, target_lost)
+        scan_until(
+            left_numbers, left_lost, right_numbers, right_lost, start, last_sample, target, target_lost
+        )
     elif rows[right_node, IS_PLAIN]:
-        scan_until_by_last(left, left_lost, right[last], right_lost[last], start, last, target, target_lost)
+        scan_until_by_last(
+            left_numbers,
+            left_lost,
+            right_numbers[last_sample],
+            right_lost[last_sample],
+            start,
+            last_sample,
+            target,
+            target_lost,
+        )
     else:
-        pair_starts, end = memory.pair_starts[rows[n, PAIRS]], memory.pair_end[0]
-        pair_starts[last] = end - start
-        memory.pair_end[0] = end + last + 1 - start
-        row, lost_row = memory.pairs[end:], memory.lost_pairs[end:]
-        scan(True, left[start:], left_lost[start:], 0, last - start, row, lost_row)
+        pair_starts, pair_end = memory.pair_starts[rows[node, PAIRS]], memory.pair_end[0]
+        pair_starts[last_sample] = pair_end - start
+        memory.pair_end[0] = pair_end + last_sample + 1 - start
+        pair_row, lost_pair_row = memory.pairs[pair_end:], memory.lost_pairs[pair_end:]
+        scan(True, left_numbers[start:], left_lost[start:], 0, last_sample - start, pair_row, lost_pair_row)
         scan_until_by_pairs(
-            memory.pairs, memory.lost_pairs, pair_starts, right, right_lost, start, last, target, target_lost
+            memory.pairs,
+            memory.lost_pairs,
+            pair_starts,
+            right_numbers,
+            right_lost,
+            start,
+            last_sample,
+            target,
+            target_lost,
         )
 
 
@@ -255,46 +295,46 @@ def step_paper(
         lost_leaves: (A, T), 1 where a leaf is unknown.
         series: (N, 4, T), output: value, now, lower and upper of each node.
     """
-    nodes = rows.shape[0]
-    for k in range(t, t + count):
-        last = position + k - t
+    node_count = rows.shape[0]
+    for sample in range(t, t + count):
+        last_sample = position + sample - t
         # without columns, only the first time is stored
-        if last < memory.stamps.shape[0]:
-            memory.stamps[last] = times_ns[k]
+        if last_sample < memory.stamps.shape[0]:
+            memory.stamps[last_sample] = times_ns[sample]
         # operands have greater ids than their parents
-        for n in range(nodes - 1, -1, -1):
-            code, is_plain = rows[n, CODE], rows[n, IS_PLAIN] != 0
+        for node in range(node_count - 1, -1, -1):
+            code, is_plain = rows[node, CODE], rows[node, IS_PLAIN] != 0
             if code == LEAF_NODE:
-                leaf = rows[n, LEAF]
-                memory.now[n], memory.lost_now[n] = leaves[leaf, k], lost_leaves[leaf, k]
+                leaf = rows[node, LEAF]
+                memory.now[node], memory.lost_now[node] = leaves[leaf, sample], lost_leaves[leaf, sample]
             elif code == TRUTH:
-                memory.now[n] = np.inf * rows[n, LEAF]
+                memory.now[node] = np.inf * rows[node, LEAF]
             else:
-                _set_now(rows, operands, n, memory.now, memory.lost_now)
-            column = rows[n, COLUMN]
+                _set_now(rows, operands, node, memory.now, memory.lost_now)
+            column = rows[node, COLUMN]
             if is_plain:
                 if column >= 0:
-                    memory.columns[column, last] = memory.now[n]
-                    memory.lost_columns[column, last] = memory.lost_now[n]
-                if last == 0:
-                    memory.value[n], memory.lost_value[n] = memory.now[n], memory.lost_now[n]
+                    memory.columns[column, last_sample] = memory.now[node]
+                    memory.lost_columns[column, last_sample] = memory.lost_now[node]
+                if last_sample == 0:
+                    memory.value[node], memory.lost_value[node] = memory.now[node], memory.lost_now[node]
             elif column >= 0:
                 if code >= NEXT:
-                    _step_column(rows, operands, n, last, memory)
+                    _step_column(rows, operands, node, last_sample, memory)
                 else:
-                    _set_column(rows, operands, n, last, memory)
-                memory.value[n] = memory.columns[column, 0]
-                memory.lost_value[n] = memory.lost_columns[column, 0]
+                    _set_column(rows, operands, node, last_sample, memory)
+                memory.value[node] = memory.columns[column, 0]
+                memory.lost_value[node] = memory.lost_columns[column, 0]
             elif code >= NEXT:
-                _step_first(rows, operands, n, last, times_ns[k], memory)
+                _step_first(rows, operands, node, last_sample, times_ns[sample], memory)
             else:
-                node_operands = operands[rows[n, FIRST] : rows[n, END]]
-                _fold(code, node_operands, memory.value, memory.lost_value, n)
+                node_operands = operands[rows[node, FIRST] : rows[node, END]]
+                _fold(code, node_operands, memory.value, memory.lost_value, node)
             # adding zero turns -0.0 into 0.0, so that equal numbers have equal bits
-            series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
-            series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
+            series[node, 0, sample] = np.nan if memory.lost_value[node] else memory.value[node] + 0.0
+            series[node, 1, sample] = np.nan if memory.lost_now[node] else memory.now[node] + 0.0
             # Def. 16 has no continuations, so both bounds are the value
-            series[n, 2, k] = series[n, 3, k] = series[n, 0, k]
+            series[node, 2, sample] = series[node, 3, sample] = series[node, 0, sample]
 
 
 # columns of the table
@@ -334,20 +374,20 @@ class PaperTable:
 def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
     """Compile a formula of `OPERATORS` over these leaves."""
     nodes = nodes_with_operands(formula)
-    numbers: dict[object, int] = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
+    number_of_leaf: dict[object, int] = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     is_plain = [is_spatial(node) for node, _ in nodes]
     has_column = _columns(nodes, is_plain)
     rows = np.zeros((len(nodes), WIDTH), np.int64)
-    columns = pairs = begin = 0
+    column_count = pair_table_count = operand_start = 0
     for identifier, (node, operand_ids) in enumerate(nodes):
         row = rows[identifier]
-        row[[CODE, LEAF]] = _code(node, numbers)
-        row[[FIRST, END]] = begin, begin + len(operand_ids)
+        row[[CODE, LEAF]] = _code(node, number_of_leaf)
+        row[[FIRST, END]] = operand_start, operand_start + len(operand_ids)
         row[IS_PLAIN] = is_plain[identifier]
         row[[HIGH, COLUMN, INNER, PAIRS]] = NOTHING
-        begin += len(operand_ids)
+        operand_start += len(operand_ids)
         if has_column[identifier]:
-            row[COLUMN], columns = columns, columns + 1
+            row[COLUMN], column_count = column_count, column_count + 1
         if isinstance(node, Temporal):
             if node.bound is not None:
                 upper = NOTHING if node.bound.upper is None else node.bound.upper
@@ -357,14 +397,14 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
             if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
                 row[INNER] = row[COLUMN]
             elif has_column[identifier] or is_until_nested:
-                row[INNER], columns = columns, columns + 1
+                row[INNER], column_count = column_count, column_count + 1
             if has_column[identifier] and is_until_nested and not is_plain[operand_ids[0]]:
-                row[PAIRS], pairs = pairs, pairs + 1
+                row[PAIRS], pair_table_count = pair_table_count, pair_table_count + 1
     return PaperTable(
         rows,
         np.array([operand_id for _, operand_ids in nodes for operand_id in operand_ids], np.int64),
-        columns,
-        pairs,
+        column_count,
+        pair_table_count,
     )
 
 
@@ -443,9 +483,9 @@ def total(
 ) -> tuple[float, int]:  # fmt: skip
     """Return the least or greatest number from sample `first` to `last`."""
     extremum, is_lost = np.nan, 0
-    for t in range(first, last + 1):
-        extremum = pick(is_least, extremum, numbers[t])
-        is_lost |= lost[t]
+    for sample in range(first, last + 1):
+        extremum = pick(is_least, extremum, numbers[sample])
+        is_lost |= lost[sample]
     return extremum, is_lost
 
 
@@ -455,10 +495,10 @@ def scan(
 ) -> None:
     """Compute the least or greatest number from each sample to `last`, for the samples from `first` on."""
     extremum, is_lost = np.nan, 0
-    for t in range(last, first - 1, -1):
-        extremum = pick(is_least, extremum, numbers[t])
-        is_lost |= lost[t]
-        target[t], target_lost[t] = extremum, is_lost
+    for sample in range(last, first - 1, -1):
+        extremum = pick(is_least, extremum, numbers[sample])
+        is_lost |= lost[sample]
+        target[sample], target_lost[sample] = extremum, is_lost
 
 
 @piece
@@ -471,20 +511,20 @@ def scan_until(
     The scan goes backwards, and the left operand at each sample caps the best value over later ends. If all
     numbers of an end were left out so far, its value is the left operand, which no other end can exceed.
     """
-    best, is_lost, is_any_left_out = np.nan, 0, False
-    for t in range(last, first - 1, -1):
-        end_value = least(right[t], left[t])
-        if not np.isnan(left[t]):
+    best_value, is_lost, is_any_left_out = np.nan, 0, False
+    for sample in range(last, first - 1, -1):
+        end_value = least(right[sample], left[sample])
+        if not np.isnan(left[sample]):
             if is_any_left_out:
-                best = left[t]
-            elif not np.isnan(best):
-                best = min(left[t], best)
+                best_value = left[sample]
+            elif not np.isnan(best_value):
+                best_value = min(left[sample], best_value)
             is_any_left_out = False
         if np.isnan(end_value):
             is_any_left_out = True
-        best = most(best, end_value)
-        is_lost |= left_lost[t] | right_lost[t]
-        target[t], target_lost[t] = best, is_lost
+        best_value = most(best_value, end_value)
+        is_lost |= left_lost[sample] | right_lost[sample]
+        target[sample], target_lost[sample] = best_value, is_lost
 
 
 @piece
@@ -495,11 +535,11 @@ def scan_until_by_last(
     """Update until from each sample to `last`, given its values up to the sample before."""
     least_left, is_lost = np.nan, right_lost
     target[last], target_lost[last] = np.nan, 0
-    for t in range(last, first - 1, -1):
-        least_left = least(least_left, left[t])
-        is_lost |= left_lost[t]
-        target[t] = most(target[t], least(right, least_left))
-        target_lost[t] |= is_lost
+    for sample in range(last, first - 1, -1):
+        least_left = least(least_left, left[sample])
+        is_lost |= left_lost[sample]
+        target[sample] = most(target[sample], least(right, least_left))
+        target_lost[sample] |= is_lost
 
 
 @piece
@@ -510,10 +550,10 @@ def scan_until_by_pairs(
     """Compute until from each sample to `last`, given the left operand's minimum for each start and end."""
     target[first : last + 1], target_lost[first : last + 1] = np.nan, 0
     for end in range(first, last + 1):
-        for t in range(first, end + 1):
-            place = starts[end] + t
-            target[t] = most(target[t], least(right[end], least_left[place]))
-            target_lost[t] |= right_lost[end] | least_left_lost[place]
+        for sample in range(first, end + 1):
+            pair_index = starts[end] + sample
+            target[sample] = most(target[sample], least(right[end], least_left[pair_index]))
+            target_lost[sample] |= right_lost[end] | least_left_lost[pair_index]
 
 
 _TILE = 256
@@ -571,55 +611,56 @@ class PaperRun:
             UsageError: the pairs of samples exceed the limit.
         """
         # Def. 16 has no uncertainty: only nominal ends count, and a number is lost where they differ
-        low, high = low_and_high(len(leaves), wide=False)
-        numbers = np.ascontiguousarray(leaves[low])
-        lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
+        low_channel, high_channel = low_and_high(len(leaves), wide=False)
+        numbers = np.ascontiguousarray(leaves[low_channel])
+        lost_flags = ((numbers != leaves[high_channel]) & ~np.isnan(numbers)).astype(np.int8)
         times_ns = np.array(times_ns, np.int64)  # writable, because kernels are compiled for writable arrays
         series = empty((len(self._table.rows), 4, len(times_ns)))
-        samples, rows = self._position + len(times_ns), self._table.rows
+        sample_count, rows = self._position + len(times_ns), self._table.rows
         # unbounded windows only: pairs of bounded ones are counted when their samples come
-        lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
+        window_lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
         # half of all pairs, because no end comes before its start
-        self._check_pairs(int((np.maximum(samples - lows, 0) ** 2 // 2).sum()), samples)
-        for t in range(0, len(times_ns), _TILE):
-            count = min(_TILE, len(times_ns) - t)
-            self._make_room(self._position + count)
+        self._check_pairs(int((np.maximum(sample_count - window_lows, 0) ** 2 // 2).sum()), sample_count)
+        for tile_start in range(0, len(times_ns), _TILE):
+            tile_length = min(_TILE, len(times_ns) - tile_start)
+            self._make_room(self._position + tile_length)
             step_paper(
-                self._table.rows, self._table.operands, numbers, lost, times_ns,
-                t, count, self._position, self._memory, series,
+                self._table.rows, self._table.operands, numbers, lost_flags, times_ns,
+                tile_start, tile_length, self._position, self._memory, series,
             )  # fmt: skip
-            self._position += count
+            self._position += tile_length
         if len(times_ns):
             self._value = series[:, 0, -1].copy()
         return series
 
-    def _make_room(self, samples: int) -> None:
+    def _make_room(self, sample_count: int) -> None:
         """Grow the memory to hold the given number of samples."""
-        memory, pairs = self._memory, self._table.pairs
-        if self._table.columns and samples > len(memory.stamps):
+        memory, pair_table_count = self._memory, self._table.pairs
+        if self._table.columns and sample_count > len(memory.stamps):
             # doubled, so that a long run copies each number a constant number of times
-            more = max(samples, 2 * len(memory.stamps)) - len(memory.stamps)
+            added_length = max(sample_count, 2 * len(memory.stamps)) - len(memory.stamps)
             memory = memory._replace(
-                stamps=_longer(memory.stamps, more),
-                columns=_longer(memory.columns, more),
-                lost_columns=_longer(memory.lost_columns, more),
-                pair_starts=_longer(memory.pair_starts, more),
+                stamps=_longer(memory.stamps, added_length),
+                columns=_longer(memory.columns, added_length),
+                lost_columns=_longer(memory.lost_columns, added_length),
+                pair_starts=_longer(memory.pair_starts, added_length),
             )
-        if pairs:
-            used = int(memory.pair_end[0])
-            required_length = used + pairs * samples * (samples - self._position)
-            self._check_pairs(used, self._position)
+        if pair_table_count:
+            used_length = int(memory.pair_end[0])
+            required_length = used_length + pair_table_count * sample_count * (sample_count - self._position)
+            self._check_pairs(used_length, self._position)
             if required_length > len(memory.pairs):
-                more = max(required_length, min(2 * used, self._max_pairs)) - len(memory.pairs)
+                added_length = max(required_length, min(2 * used_length, self._max_pairs)) - len(memory.pairs)
                 memory = memory._replace(
-                    pairs=_longer(memory.pairs, more), lost_pairs=_longer(memory.lost_pairs, more)
+                    pairs=_longer(memory.pairs, added_length),
+                    lost_pairs=_longer(memory.lost_pairs, added_length),
                 )
         self._memory = memory
 
-    def _check_pairs(self, pairs: int, samples: int) -> None:
-        if pairs > self._max_pairs:
+    def _check_pairs(self, pair_count: int, sample_count: int) -> None:
+        if pair_count > self._max_pairs:
             raise UsageError(
-                f"over {samples:,} samples, an until of two temporal operands below a temporal operator "
+                f"over {sample_count:,} samples, an until of two temporal operands below a temporal operator "
                 "compares too many pairs of samples; bound it, evaluate fewer samples, or use the semantics "
                 "'ltlf'"
             )
@@ -643,33 +684,33 @@ def left_out(
         first_ns: time of the log's first sample.
     """
     is_before = np.zeros(values.shape[1:], np.bool_)
-    numbers = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
-    for row, leaf in zip(is_before, leaves, strict=True):
+    number_of_leaf = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
+    for is_leaf_before, leaf in zip(is_before, leaves, strict=True):
         for delay in set(iter_delays([leaf])):
             # no report comes before those of the first sample
-            row |= positions < (1 if delay == TO_REPORTS else delay.samples or 0)
+            is_leaf_before |= positions < (1 if delay == TO_REPORTS else delay.samples or 0)
             if delay.duration_ns is not None:
-                row |= times_ns - delay.duration_ns < first_ns
+                is_leaf_before |= times_ns - delay.duration_ns < first_ns
         for condition in rate_conditions(leaf):
-            if (number := numbers.get(leaf_key(condition))) is not None:
-                row |= (values[:, number] == -np.inf).all(axis=0)
+            if (number := number_of_leaf.get(leaf_key(condition))) is not None:
+                is_leaf_before |= (values[:, number] == -np.inf).all(axis=0)
     return np.where(is_before, np.nan, values) if is_before.any() else values
 
 
 def _first_memory(table: PaperTable) -> PaperMemory:
-    nodes, room = len(table.rows), _FIRST_ROOM if table.columns else 1
+    node_count, room = len(table.rows), _FIRST_ROOM if table.columns else 1
     return PaperMemory(
         stamps=np.zeros(room, np.int64),
         columns=np.full((table.columns, room), np.nan),
         lost_columns=np.zeros((table.columns, room), np.int8),
-        value=np.full(nodes, np.nan),
-        lost_value=np.zeros(nodes, np.int8),
-        now=np.full(nodes, np.nan),
-        lost_now=np.zeros(nodes, np.int8),
-        left=np.full(nodes, np.nan),
-        lost_left=np.zeros(nodes, np.int8),
-        starts=np.full(nodes, -1, np.int64),
-        opens=np.zeros(nodes, np.int64),
+        value=np.full(node_count, np.nan),
+        lost_value=np.zeros(node_count, np.int8),
+        now=np.full(node_count, np.nan),
+        lost_now=np.zeros(node_count, np.int8),
+        left=np.full(node_count, np.nan),
+        lost_left=np.zeros(node_count, np.int8),
+        starts=np.full(node_count, -1, np.int64),
+        opens=np.zeros(node_count, np.int64),
         pairs=np.empty(0),
         lost_pairs=np.empty(0, np.int8),
         pair_starts=np.zeros((table.pairs, room), np.int64),
@@ -677,9 +718,9 @@ def _first_memory(table: PaperTable) -> PaperMemory:
     )
 
 
-def _longer(array: np.ndarray, more: int) -> np.ndarray:
+def _longer(array: np.ndarray, added_length: int) -> np.ndarray:
     """Return the array with `more` zeros at the end of its last axis."""
-    return np.concatenate([array, np.zeros((*array.shape[:-1], more), array.dtype)], axis=-1)
+    return np.concatenate([array, np.zeros((*array.shape[:-1], added_length), array.dtype)], axis=-1)
 
 
 def check_operators(specification: Specification) -> None:
@@ -692,11 +733,13 @@ def check_operators(specification: Specification) -> None:
         for _, _, node in iter_nodes(spec.formula):
             if isinstance(node, Temporal) and node.operator not in OPERATORS:
                 source = SourceText.of(specification.source, specification.filename)
-                fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
+                diagnostic = source.diagnostic(
+                    "error", node.span, f"the paper's semantics has no {node.operator}"
+                )
                 remedy = "write it with X, F, G and U"
                 raise UsageError(
-                    f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, which {spec.name} uses; "
-                    f"{remedy}, or evaluate with the semantics 'ltlf'"
+                    f"{diagnostic.filename}:{diagnostic.line}:{diagnostic.column}: {diagnostic.message},"
+                    f" which {spec.name} uses; {remedy}, or evaluate with the semantics 'ltlf'"
                 )
 
 

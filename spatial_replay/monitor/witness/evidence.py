@@ -86,28 +86,28 @@ class Evidence:
     def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
         """Return the samples at several times, as `scene` does, in one pass over the log."""
         # in descending order, so that `pop` removes the earliest
-        pending, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
-        for scene in self._scenes() if pending else ():
+        pending_ns, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
+        for scene in self._scenes() if pending_ns else ():
             trace = scene.trace
-            while pending and pending[-1] <= trace.times_ns[-1]:
-                time_ns = pending.pop()
+            while pending_ns and pending_ns[-1] <= trace.times_ns[-1]:
+                time_ns = pending_ns.pop()
                 begin, end = window_of(trace.times_ns, time_ns, time_ns + 1)
                 if begin == end:
                     raise LookupError(f"the log has no sample at {time_ns} ns any more")
                 earlier_samples = (
                     tail(trace.slice(0, begin), self._reach) if begin and self._reach else trace.slice(0, 0)
                 )
-                sample = Trace.concatenate([earlier_samples, trace.slice(begin, end)])
-                scenes[time_ns] = TraceScene(sample, self._regions, len(earlier_samples))
-            if not pending:
+                sample_trace = Trace.concatenate([earlier_samples, trace.slice(begin, end)])
+                scenes[time_ns] = TraceScene(sample_trace, self._regions, len(earlier_samples))
+            if not pending_ns:
                 return scenes
-        raise LookupError(f"the log has no sample at {pending[-1]} ns any more")
+        raise LookupError(f"the log has no sample at {pending_ns[-1]} ns any more")
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
         """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
         scenes = self._scenes()
-        parts = [self._columns(scene, formulas)[:, :, self._inside(scene)] for scene in scenes]
-        return joined_channels(parts, axis=2)
+        blocks = [self._columns(scene, formulas)[:, :, self._evaluated_slice(scene)] for scene in scenes]
+        return joined_channels(blocks, axis=2)
 
     def _columns(self, scene: TraceScene, formulas: Sequence[Formula]) -> Floats:
         bindings = self.instance.bindings
@@ -125,7 +125,9 @@ class Evidence:
     def times_ns(self) -> Integers:
         """Return the times of the samples, (T,)."""
         scenes = self._scenes()
-        return np.concatenate([scene.trace.times_ns[scene.skip :][self._inside(scene)] for scene in scenes])
+        return np.concatenate(
+            [scene.trace.times_ns[scene.skip :][self._evaluated_slice(scene)] for scene in scenes]
+        )
 
     def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
         """Return the gaps of all objects and signals in a formula that are ever missing.
@@ -133,38 +135,45 @@ class Evidence:
         Args:
             time_ns: a pause that contains this time counts as the longest.
         """
-        kinds = named_parts(formula)
-        parts: list[NDArray[np.bool_]] = []
-        members, absent = set[NamedPart](), set[NamedPart]()
+        formula_parts = named_parts(formula)
+        missing_blocks: list[NDArray[np.bool_]] = []
+        classified_parts, absent_parts = set[NamedPart](), set[NamedPart]()
         for scene in self._scenes():
             trace = scene.trace.slice(scene.skip, len(scene.trace))
-            columns = [trace.filling, *(is_missing(trace, part) for part in kinds)]
-            parts.append(np.stack(columns)[:, self._inside(scene)])
-            members.update(part for part in kinds if _is_classified(trace, part))
-            absent.update(part for part in kinds if _is_absent(trace, part)[self._inside(scene)].any())
+            missing_columns = [trace.filling, *(is_missing(trace, part) for part in formula_parts)]
+            missing_blocks.append(np.stack(missing_columns)[:, self._evaluated_slice(scene)])
+            classified_parts.update(part for part in formula_parts if _is_classified(trace, part))
+            absent_parts.update(
+                part for part in formula_parts if _is_absent(trace, part)[self._evaluated_slice(scene)].any()
+            )
         times_ns = self.times_ns()
-        filling, *columns = np.concatenate(parts, axis=1)
-        is_recorded = ~filling
-        gaps = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
-        for part, missing in zip(kinds, columns, strict=True):
-            if missing[is_recorded].any():
-                gap = _gap(part.title, missing[is_recorded], times_ns[is_recorded])
-                comes_and_goes = part in members and part in absent
+        is_filling, *missing_columns = np.concatenate(missing_blocks, axis=1)
+        is_recorded = ~is_filling
+        gaps = [_gap(None, is_filling, times_ns, time_ns)] if is_filling.any() else []
+        for part, is_part_missing in zip(formula_parts, missing_columns, strict=True):
+            if is_part_missing[is_recorded].any():
+                gap = _gap(part.title, is_part_missing[is_recorded], times_ns[is_recorded])
+                comes_and_goes = part in classified_parts and part in absent_parts
                 gaps.append(replace(gap, window=None) if comes_and_goes else gap)
         return tuple(gaps)
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
         """Return (G, T), whether each open group has a member, or may have one, in each sample."""
-        parts: list[NDArray[np.bool_]] = []
+        blocks: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
-            inside = self._inside(scene)
+            evaluated_samples = self._evaluated_slice(scene)
             memberships = [scene.members(group) for group in groups]
-            parts.append(
-                np.stack([(members.any(axis=1) | unknown)[inside] for _, members, unknown in memberships])
+            blocks.append(
+                np.stack(
+                    [
+                        (members.any(axis=1) | may_have_member)[evaluated_samples]
+                        for _, members, may_have_member in memberships
+                    ]
+                )
             )
-        return np.concatenate(parts, axis=1) if parts else np.empty((0, 0), np.bool_)
+        return np.concatenate(blocks, axis=1) if blocks else np.empty((0, 0), np.bool_)
 
-    def _inside(self, scene: TraceScene) -> slice:
+    def _evaluated_slice(self, scene: TraceScene) -> slice:
         """Return the samples of a scene that the instance is evaluated over."""
         times_ns = scene.trace.times_ns[scene.skip :]
         return slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
@@ -178,9 +187,9 @@ class Evidence:
                 return
             skip = 0
             if previous_trace is not None and self._reach:
-                recent = tail(previous_trace, self._reach)
-                skip = len(recent)
-                trace = Trace.concatenate([recent, trace])
+                recent_trace = tail(previous_trace, self._reach)
+                skip = len(recent_trace)
+                trace = Trace.concatenate([recent_trace, trace])
             previous_trace = trace if len(trace) else previous_trace
             if len(trace) and trace.times_ns[-1] >= self.instance.start_ns:
                 yield TraceScene(trace, self._regions, skip)
@@ -242,25 +251,25 @@ def _is_classified(trace: Trace, part: NamedPart) -> bool:
     return any(trace.classes[code] is not None for code in np.unique(codes).tolist())
 
 
-def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_ns: int = -1) -> Gap:
-    last = len(missing) - 1
-    turns = np.flatnonzero(np.diff(missing, prepend=False, append=False))
-    starts, ends = turns[::2], turns[1::2]
+def _gap(name: str | None, is_gap: NDArray[np.bool_], times_ns: Integers, time_ns: int = -1) -> Gap:
+    last_index = len(is_gap) - 1
+    boundaries = np.flatnonzero(np.diff(is_gap, prepend=False, append=False))
+    starts, ends = boundaries[::2], boundaries[1::2]
     # missing samples are only leading or trailing ones
-    is_at_ends = bool(((starts == 0) | (ends > last)).all()) and not missing.all()
+    is_at_ends = bool(((starts == 0) | (ends > last_index)).all()) and not is_gap.all()
     window_start = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
-    window_end = int(times_ns[starts[-1]]) if ends[-1] > last else None
+    window_end = int(times_ns[starts[-1]]) if ends[-1] > last_index else None
     # a gap at the end of the log has no sample after it
-    spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last)]))
+    spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last_index)]))
     contains_time = (spans[0] <= time_ns) & (time_ns < spans[1])
-    longest = spans[:, (contains_time if contains_time.any() else np.diff(spans, axis=0)).argmax()]
+    longest_span = spans[:, (contains_time if contains_time.any() else np.diff(spans, axis=0)).argmax()]
     return Gap(
         name,
-        int(missing.sum()),
-        len(missing),
+        int(is_gap.sum()),
+        len(is_gap),
         int(times_ns[starts[0]]),
         int(times_ns[ends[-1] - 1]),
         (window_start, window_end) if is_at_ends else None,
-        (int(longest[0]), int(longest[1])),
-        int(longest[1]) - 1 in times_ns[missing][1:],
+        (int(longest_span[0]), int(longest_span[1])),
+        int(longest_span[1]) - 1 in times_ns[is_gap][1:],
     )

@@ -125,18 +125,22 @@ def extremum_of(operator: BooleanOperator, operands: Sequence[int]) -> SignedOpe
     """Return a Boolean operator as minima and maxima of the operands with the given indices."""
     # distinct stand-ins, because two equal operands of the text may be one Python object
     stand_ins = tuple(Truth(True) for _ in operands)
-    numbers = {id(stand_in): number for stand_in, number in zip(stand_ins, operands, strict=True)}
+    operand_of_id = {id(stand_in): number for stand_in, number in zip(stand_ins, operands, strict=True)}
     formula = Boolean(operator, stand_ins)
-    return _normal_form(formula.expansion or formula, numbers, negated=False)
+    return _normal_form(formula.expansion or formula, operand_of_id, negated=False)
 
 
-def _normal_form(formula: Formula, numbers: Mapping[int, int], *, negated: bool) -> SignedOperand | Extremum:
-    if id(formula) in numbers:
-        return SignedOperand(numbers[id(formula)], negated)
+def _normal_form(
+    formula: Formula, operand_of_id: Mapping[int, int], *, negated: bool
+) -> SignedOperand | Extremum:
+    if id(formula) in operand_of_id:
+        return SignedOperand(operand_of_id[id(formula)], negated)
     operator = operator_of(formula)
     if operator == "not":
-        return _normal_form(operands_of(formula)[0], numbers, negated=not negated)
-    operands = tuple(_normal_form(operand, numbers, negated=negated) for operand in operands_of(formula))
+        return _normal_form(operands_of(formula)[0], operand_of_id, negated=not negated)
+    operands = tuple(
+        _normal_form(operand, operand_of_id, negated=negated) for operand in operands_of(formula)
+    )
     return Extremum((operator == "and") != negated, operands)
 
 
@@ -151,9 +155,13 @@ def attaining_operands(
     if isinstance(part, SignedOperand):
         return [part]
     choose = end.of_minimum if part.is_minimum else end.of_maximum
-    keys = [choose(*_interval(operand, interval)) for operand in part.operands]
-    best = min(keys) if part.is_minimum else max(keys)
-    best_parts = [operand for operand, key in zip(part.operands, keys, strict=True) if key == best]
+    compared_ends = [choose(*_interval(operand, interval)) for operand in part.operands]
+    best_end = min(compared_ends) if part.is_minimum else max(compared_ends)
+    best_parts = [
+        operand
+        for operand, compared_end in zip(part.operands, compared_ends, strict=True)
+        if compared_end == best_end
+    ]
     return [operand for best_part in best_parts for operand in attaining_operands(best_part, end, interval)]
 
 
@@ -220,8 +228,8 @@ class _Walk:
                 # `min` returns the first of equal keys, so the first operand wins ties
                 operand_path = min(paths, key=lambda path: path.steps[-1].sample)
             case Temporal():
-                lasting = self._lasting(node, sample, end) if self._nodes.goes_on else None
-                next_step = lasting or self._deciding_operand(formula, operands, sample, end)
+                lasting_step = self._lasting(node, sample, end) if self._nodes.goes_on else None
+                next_step = lasting_step or self._deciding_operand(formula, operands, sample, end)
                 if next_step is None or self._nodes.is_left_out(next_step.node, next_step.sample):
                     return DecidingPath((step,), end)
                 operand_path = self.follow(next_step.node, next_step.sample, end)
@@ -295,8 +303,8 @@ class _Walk:
             left, end, high = SignedOperand(left.index, True), end.turned, -low
         if end is End.LOW or is_closed(formula.bound, self._nodes.times_ns)[sample]:
             return None
-        lasting = self._ends(left, slice(sample, None))[1]
-        return PathNode(left.index, sample + int(np.argmin(lasting))) if lasting.min() == high else None
+        left_ends = self._ends(left, slice(sample, None))[1]
+        return PathNode(left.index, sample + int(np.argmin(left_ends))) if left_ends.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples in an operator's window."""
@@ -322,45 +330,51 @@ class _Walk:
     ) -> PathNode:
         """Return the operand and sample that decide an until, or a since if `is_ahead` is false."""
         span = slice(sample, window.stop) if is_ahead else slice(window.start, sample + 1)
-        lefts, rights = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
-        left_so_far = [_least_between(numbers, is_ahead=is_ahead) for numbers in lefts]
-        inside = slice(window.start - span.start, window.stop - span.start)
+        left_ends, right_ends = self._ends(left, span), self._ends(right, slice(window.start, window.stop))
+        left_minima = [_least_between(numbers, is_ahead=is_ahead) for numbers in left_ends]
+        window_slice = slice(window.start - span.start, window.stop - span.start)
         low, high = (
-            np.minimum(right_numbers, left_least[inside])
-            for right_numbers, left_least in zip(rights, left_so_far, strict=True)
+            np.minimum(right_numbers, left_least[window_slice])
+            for right_numbers, left_least in zip(right_ends, left_minima, strict=True)
         )
         best_sample = window[int(np.argmax(end.of_maximum(low, high)))]
-        right_key = float(end.of_minimum(*rights)[best_sample - window.start])
+        right_number = float(end.of_minimum(*right_ends)[best_sample - window.start])
         left_samples = range(sample, best_sample) if is_ahead else range(best_sample + 1, sample + 1)
-        left_key = end.of_minimum(*lefts)[left_samples.start - span.start : left_samples.stop - span.start]
+        left_numbers = end.of_minimum(*left_ends)[
+            left_samples.start - span.start : left_samples.stop - span.start
+        ]
         left_steps = (
-            [PathNode(left.index, left_samples[int(np.argmin(left_key))])] if len(left_samples) else []
+            [PathNode(left.index, left_samples[int(np.argmin(left_numbers))])] if len(left_samples) else []
         )
-        least = float(left_key.min()) if len(left_samples) else np.inf
+        least_left = float(left_numbers.min()) if len(left_samples) else np.inf
         # a tie goes to the earlier sample
-        if right_key == least:
+        if right_number == least_left:
             return min([*left_steps, PathNode(right.index, best_sample)], key=lambda step: step.sample)
-        return left_steps[0] if least < right_key else PathNode(right.index, best_sample)
+        return left_steps[0] if least_left < right_number else PathNode(right.index, best_sample)
 
     def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
         """Return the operand and sample that decide a weak until, the greater of `phi U psi` and `G phi`."""
         left, right = map(SignedOperand, operands)
-        inside = slice(window.start, window.stop)
-        lefts, rights = self._ends(left, slice(sample, window.stop)), self._ends(right, inside)
-        left_so_far = [_least_between(numbers, is_ahead=True)[window.start - sample :] for numbers in lefts]
-        until = [float(np.max(np.minimum(*pair))) for pair in zip(rights, left_so_far, strict=True)]
-        always = [float(np.min(numbers)) for numbers in self._ends(left, inside)]
-        keys = [float(end.of_maximum(np.array(low), np.array(high))) for low, high in (until, always)]
-        if keys[0] >= keys[1]:
+        window_slice = slice(window.start, window.stop)
+        left_ends, right_ends = self._ends(left, slice(sample, window.stop)), self._ends(right, window_slice)
+        left_minima = [
+            _least_between(numbers, is_ahead=True)[window.start - sample :] for numbers in left_ends
+        ]
+        until_ends = [float(np.max(np.minimum(*pair))) for pair in zip(right_ends, left_minima, strict=True)]
+        always_ends = [float(np.min(numbers)) for numbers in self._ends(left, window_slice)]
+        compared_ends = [
+            float(end.of_maximum(np.array(low), np.array(high))) for low, high in (until_ends, always_ends)
+        ]
+        if compared_ends[0] >= compared_ends[1]:
             return self._until(left, right, sample, window, end)
         return self._extreme(left, window, end, is_minimum=True)
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
     """Return the minimum of a column between its near end and each place, without the place itself."""
-    ordered = column if is_ahead else column[::-1]
-    least = np.minimum.accumulate(np.concatenate([[np.inf], ordered[:-1]]))
-    return least if is_ahead else least[::-1]
+    ordered_column = column if is_ahead else column[::-1]
+    minima = np.minimum.accumulate(np.concatenate([[np.inf], ordered_column[:-1]]))
+    return minima if is_ahead else minima[::-1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,18 +415,18 @@ def missed_response(
                 short_title(substitute(operand, bindings)) for operand in operands_of(node)
             )
             time_ns, is_condition = int(nodes.times_ns[step.sample]), next_step.node == operands[0]
-            closest = (
+            closest_path = (
                 deciding_path(nodes, operands[1], End.HIGH, sample=step.sample) if is_condition else None
             )
-            return MissedResponse(condition, response, time_ns, is_condition), closest
+            return MissedResponse(condition, response, time_ns, is_condition), closest_path
     return None, None
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
     """Return the reasons why an atom is unknown in the one sample of a scene, each reason once."""
     parts = list(iter_expressions(atom.expression))
-    exact = [part.signal for part in parts if isinstance(part, Equality)]
-    reasons = (reason for part in parts if part not in exact for reason in _reasons(scene, part))
+    compared_signals = [part.signal for part in parts if isinstance(part, Equality)]
+    reasons = (reason for part in parts if part not in compared_signals for reason in _reasons(scene, part))
     return tuple(dict.fromkeys(reasons))
 
 
@@ -420,25 +434,25 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
         case Rate():
             is_explained = scene.compared_ns(part) is not None
-            for inner in (part.signal,) if part.signal else map(_position, part.terms):
-                reasons = tuple(_reasons(scene, inner))
+            for inner_part in (part.signal,) if part.signal else map(_position, part.terms):
+                reasons = tuple(_reasons(scene, inner_part))
                 is_explained = is_explained or bool(reasons)
                 yield from reasons
             if not is_explained:
                 rate_text = part.signal.name if part.signal else " and ".join(map(format_term, part.terms))
                 yield f"{rate_text} has no report to compare with, or none of an earlier time"
         case Signal() | Equality():
-            signal, compared = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
+            signal, compared_value = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
             name, value = signal.name, scene.signal(signal)[0]
             if any(name_of_part not in scene.trace.signals for name_of_part in logged_signals(signal)):
                 yield f"there is no signal {name!r}"
             elif not np.isfinite(value):
                 yield f"signal {name!r} has no finite value in the sample"
-            elif is_text_number(compared) != is_text_number(value):
-                kinds = "a text, not a number; `names` of its mapping give texts numbers"
-                if is_text_number(compared):
-                    kinds = "a number, not a text; `names` of its mapping give numbers names"
-                yield f"signal {name!r} is {kinds}"
+            elif is_text_number(compared_value) != is_text_number(value):
+                kind_text = "a text, not a number; `names` of its mapping give texts numbers"
+                if is_text_number(compared_value):
+                    kind_text = "a number, not a text; `names` of its mapping give numbers names"
+                yield f"signal {name!r} is {kind_text}"
         case Number() | Sum() | Negative() | Minimum() | Maximum() | Product() | Scaled():
             return
         case _:
@@ -452,13 +466,13 @@ def _position(term: Term) -> Projection:
 
 
 def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterator[str]:
-    resolved = scene.resolve(term)
-    if resolved.unknown[0]:
+    resolved_term = scene.resolve(term)
+    if resolved_term.unknown[0]:
         yield from _missing(scene, term)
-    elif isinstance(part, Measurement) and part.needs_orientation and np.isnan(resolved.yaw[0]):
+    elif isinstance(part, Measurement) and part.needs_orientation and np.isnan(resolved_term.yaw[0]):
         yield f"{format_term(term)} has no orientation"
     elif isinstance(part, Projection) and part.axis == "z":
-        rows = resolved.operand.rows[0]
+        rows = resolved_term.operand.rows[0]
         bottoms = scene.batch.bottom[rows[rows >= 0]]
         if np.isnan(bottoms).any():
             yield f"{format_term(term)} has no height"
@@ -470,13 +484,13 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     if isinstance(term, Earlier) and _is_before_the_first(scene, term):
         yield f"{format_term(term)} looks back to before the first sample"
         return
-    members = _members(base_of(term))
+    member_names = _members(base_of(term))
     rows = scene.resolve(term).operand.rows[0]
-    for name, row in zip(members or [format_term(term)] * len(rows), rows.tolist(), strict=True):
+    for name, row in zip(member_names or [format_term(term)] * len(rows), rows.tolist(), strict=True):
         time_text = " then" if isinstance(term, Earlier) else ""
         if row < ABSENT:
             yield f"the position of {name} is unknown{time_text}"
-        elif row == ABSENT and members:
+        elif row == ABSENT and member_names:
             yield f"{name} is not in the sample{time_text and f' that {format_term(term)} looks at'}"
 
 
@@ -562,12 +576,12 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
         if operand_and_end is None:
             return None
         leaf, end = operand_and_end
-    (nominal,), ((lower, upper),) = (_intervals(scene, [leaf], wide=wide) for wide in (False, True))
-    value = nominal[0] if nominal[0] == nominal[1] else float("nan")
-    unknown = unknowns_of(scene, leaf)
-    branch = () if unknown else tuple(_branch(scene, leaf.expression, end, 1))
+    (nominal_interval,), ((lower, upper),) = (_intervals(scene, [leaf], wide=wide) for wide in (False, True))
+    value = nominal_interval[0] if nominal_interval[0] == nominal_interval[1] else float("nan")
+    unknown_reasons = unknowns_of(scene, leaf)
+    branch = () if unknown_reasons else tuple(_branch(scene, leaf.expression, end, 1))
     measurements = tuple(_measurement_of(scene, part) for _, part in branch if not isinstance(part, Number))
-    return DecidingAtom(leaf, end, value, lower, upper, branch, measurements, unknown)
+    return DecidingAtom(leaf, end, value, lower, upper, branch, measurements, unknown_reasons)
 
 
 def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
@@ -589,8 +603,11 @@ def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Form
 def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
     """Return the interval of each formula in the one sample of a scene."""
     values = leaf_values(scene, formulas, {})[:, :, 0]
-    low, high = low_and_high(len(values), wide=wide)
-    return [(float(a), float(b)) for a, b in zip(values[low], values[high], strict=True)]
+    low_channel, high_channel = low_and_high(len(values), wide=wide)
+    return [
+        (float(low_end), float(high_end))
+        for low_end, high_end in zip(values[low_channel], values[high_channel], strict=True)
+    ]
 
 
 def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | None:
@@ -607,8 +624,8 @@ def _below(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, End] | 
     if not formulas:
         return None
     intervals = _intervals(scene, formulas)
-    first, *_ = attaining_operands(extremum, end, intervals.__getitem__)
-    return formulas[first.index], end.turned if first.negated else end
+    chosen_operand, *_ = attaining_operands(extremum, end, intervals.__getitem__)
+    return formulas[chosen_operand.index], end.turned if chosen_operand.negated else end
 
 
 def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
@@ -616,31 +633,35 @@ def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
     bodies = list(_bodies(scene, formula))
     if not rate_conditions(formula.body):
         return bodies
-    ends = _intervals(scene, [Boolean("and", tuple(rate_conditions(body))) for body in bodies])
+    rate_intervals = _intervals(scene, [Boolean("and", tuple(rate_conditions(body))) for body in bodies])
     # -inf: a rate of the body has no value
-    return [body for body, (_, high) in zip(bodies, ends, strict=True) if high > -np.inf]
+    return [body for body, (_, high) in zip(bodies, rate_intervals, strict=True) if high > -np.inf]
 
 
 def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
     """Iterate over a quantifier's body for all bindings that may decide it."""
     names, members, _ = scene.members(formula.group)
-    present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
-    for bound in _may_decide(scene, formula, present):
-        yield substitute(formula.body, dict(zip(formula.variables, map(TrackedName, bound), strict=True)))
+    present_names = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
+    for object_names in _may_decide(scene, formula, present_names):
+        yield substitute(
+            formula.body, dict(zip(formula.variables, map(TrackedName, object_names), strict=True))
+        )
 
 
-def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) -> Iterable[tuple[str, ...]]:
+def _may_decide(
+    scene: TraceScene, formula: Quantified, present_names: Sequence[str]
+) -> Iterable[tuple[str, ...]]:
     """Return the bindings that may decide a quantifier: near pairs if a distance decides, else all."""
     pair = closest_pair_of(formula)
-    everyone = permutations(present, len(formula.variables))
-    if pair is None or len(present) < 3:
-        return everyone
-    rows = np.array([scene.resolve(TrackedName(name)).operand.rows[0, 0] for name in present])
+    all_bindings = permutations(present_names, len(formula.variables))
+    if pair is None or len(present_names) < 3:
+        return all_bindings
+    rows = np.array([scene.resolve(TrackedName(name)).operand.rows[0, 0] for name in present_names])
     # an object with unknown position may decide, too
     if (rows < 0).any():
-        return everyone
-    pairs = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
-    return [(present[a], present[b]) for a, b in pairs.tolist()]
+        return all_bindings
+    near_pairs = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
+    return [(present_names[a], present_names[b]) for a, b in near_pairs.tolist()]
 
 
 # ------------------------------------------------------------------------------------------ expressions
@@ -668,8 +689,8 @@ def _branch(
             extremum = Extremum(
                 isinstance(expression, Minimum), tuple(map(SignedOperand, range(len(operands))))
             )
-            first, *_ = attaining_operands(extremum, end, intervals.__getitem__)
-            yield from _branch(scene, operands[first.index], end, weight)
+            chosen_operand, *_ = attaining_operands(extremum, end, intervals.__getitem__)
+            yield from _branch(scene, operands[chosen_operand.index], end, weight)
         case _:
             yield weight, expression
 
@@ -695,26 +716,35 @@ def _measurement_of(scene: TraceScene, part: Expression) -> Measured:
         case Signal():
             return Measured("signal", (part.name,), float(scene.signal(part)[0]))
         case Measurement():
-            single = _attaining(scene, part)
+            single_measurement = _attaining(scene, part)
         case _:
             raise TypeError(f"{part!r} is no measurement")
-    (value,), (spread,) = (column[:, 0].tolist() for column in measurement_values(scene, [single]))
+    (value,), (spread,) = (
+        column[:, 0].tolist() for column in measurement_values(scene, [single_measurement])
+    )
     return Measured(
-        single.quantity, tuple(map(format_term, single.terms)), value, spread, _contact(scene, single)
+        single_measurement.quantity,
+        tuple(map(format_term, single_measurement.terms)),
+        value,
+        spread,
+        _contact(scene, single_measurement),
     )
 
 
 def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
     """Return a measurement with the deciding members instead of groups."""
-    singles = [_singles(scene, term) for term in part.terms]
-    candidates = [part.with_terms(*terms) for terms in product(*singles)]
-    values, places = measurement_values(scene, candidates)[0][:, 0], np.arange(len(candidates))
-    for members, side in zip(reversed(singles), reversed(part.extrema), strict=True):
-        rows = values.reshape(-1, len(members))
-        columns = (np.argmin if side == "min" else np.argmax)(rows, axis=1)
-        row_numbers = np.arange(len(rows))
-        values, places = rows[row_numbers, columns], places.reshape(rows.shape)[row_numbers, columns]
-    return candidates[int(places[0])]
+    single_terms = [_singles(scene, term) for term in part.terms]
+    candidates = [part.with_terms(*terms) for terms in product(*single_terms)]
+    values, candidate_indices = measurement_values(scene, candidates)[0][:, 0], np.arange(len(candidates))
+    for side_terms, side in zip(reversed(single_terms), reversed(part.extrema), strict=True):
+        value_rows = values.reshape(-1, len(side_terms))
+        best_columns = (np.argmin if side == "min" else np.argmax)(value_rows, axis=1)
+        row_numbers = np.arange(len(value_rows))
+        values, candidate_indices = (
+            value_rows[row_numbers, best_columns],
+            candidate_indices.reshape(value_rows.shape)[row_numbers, best_columns],
+        )
+    return candidates[int(candidate_indices[0])]
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:
@@ -725,10 +755,12 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
     if base.members is None:
         group: Any = standing(term)
         names, members, _ = scene.members(group)
-        present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
+        present_names = [
+            name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member
+        ]
     else:
-        present = [*named_members(base)]
-    return [_of_member(term, name) for name in present] or [term]
+        present_names = [*named_members(base)]
+    return [_of_member(term, name) for name in present_names] or [term]
 
 
 def _of_member(term: Term, name: str) -> Term:
@@ -741,8 +773,10 @@ def _of_member(term: Term, name: str) -> Term:
 def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
     match part:
         case SignedDistance():
-            first, second = _footprint(scene, part.first), _footprint(scene, part.second)
-            return contact(first, second) if first and second else None
+            first_footprint, second_footprint = _footprint(scene, part.first), _footprint(scene, part.second)
+            return (
+                contact(first_footprint, second_footprint) if first_footprint and second_footprint else None
+            )
         case Protrusion():
             inner, outer = _footprint(scene, part.inner), _footprint(scene, part.outer)
             return protrusion_contact(inner, outer) if inner and outer else None
