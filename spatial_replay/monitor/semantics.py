@@ -75,7 +75,7 @@ class PaperMemory(NamedTuple):
 def _set_now(rows: Integers, operands: Integers, node: int, numbers: Floats, lost_flags: Flags) -> None:
     """Compute a node on the newest sample alone, from its operands there."""
     code, operand_start, operand_end = rows[node, CODE], rows[node, FIRST], rows[node, END]
-    # such a window needs later samples: on the newest sample alone, the node is left out
+    # the window needs later samples, so the node is left out on the newest sample alone
     if code == NEXT or (code > NEXT and rows[node, LOW] > 0):
         numbers[node], lost_flags[node] = np.nan, 0
         return
@@ -155,7 +155,7 @@ def _step_first(
         return
     start = memory.starts[node]
     if code in (EVENTUALLY, ALWAYS):
-        # the number of a plain operand at a sample never changes: a running extremum suffices
+        # a plain operand's number at a sample never changes, so a running extremum suffices
         if is_plain:
             value[node] = pick(code == ALWAYS, value[node], memory.now[right_node])
             lost_value[node] |= memory.lost_now[right_node]
@@ -240,7 +240,7 @@ def _step_column(
 def _scan_node(
     rows: Integers, operands: Integers, node: int, start: int, last_sample: int, memory: PaperMemory
 ) -> None:
-    """Compute the unbounded operator from each sample to the last one, for the samples from `start` on."""
+    """Compute the unbounded operator from each sample to the last sample, for the samples from `start` on."""
     code, inner_column = rows[node, CODE], rows[node, INNER]
     target, target_lost = memory.columns[inner_column], memory.lost_columns[inner_column]
     right_node, left_node = operands[rows[node, END] - 1], operands[rows[node, FIRST]]
@@ -343,8 +343,8 @@ WIDTH = 11
 NOTHING = -1
 """Table entry for no upper bound, no column, and no row of pairs."""
 
-# codes of nodes; Boolean nodes have the codes of reports. Each node has a row as written, without expansion,
-# because Def. 16 gives a number to each
+# codes of nodes; Boolean nodes have the codes of reports
+# nodes are not expanded, because Def. 16 gives a number to each node as written
 LEAF_NODE, TRUTH = 0, 1
 NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
 
@@ -372,7 +372,7 @@ class PaperTable:
 
 
 def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
-    """Compile a formula of `OPERATORS` over these leaves."""
+    """Compile a formula of `OPERATORS` over the given leaves."""
     nodes = nodes_with_operands(formula)
     number_of_leaf: dict[object, int] = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     is_plain = [is_spatial(node) for node, _ in nodes]
@@ -393,7 +393,7 @@ def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperT
                 upper = NOTHING if node.bound.upper is None else node.bound.upper
                 row[[IS_IN_NS, LOW, HIGH]] = node.bound.unit == "ns", node.bound.lower, upper
             is_until_nested = node.operator == "U" and not is_plain[operand_ids[-1]]
-            # without a bound the numbers of the operator are those of its scan: one column serves both
+            # without a bound, the operator's numbers equal its scan's numbers, so one column serves both
             if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
                 row[INNER] = row[COLUMN]
             elif has_column[identifier] or is_until_nested:
@@ -421,7 +421,7 @@ def _columns(nodes: Sequence[tuple[Formula, Sequence[int]]], is_plain: Sequence[
 
 
 def _code(node: Formula, leaves: Mapping[object, int]) -> tuple[int, int]:
-    """Return a node's code, and its leaf or the sign of its infinity."""
+    """Return a node's code, and the number of its leaf or the sign of its constant."""
     match node:
         case Truth():
             return TRUTH, 1 if node.value else -1
@@ -508,8 +508,9 @@ def scan_until(
 ) -> None:  # fmt: skip
     """Compute until from each sample to `last`, for a left operand that depends on no later sample.
 
-    The scan goes backwards, and the left operand at each sample caps the best value over later ends. If all
-    numbers of an end were left out so far, its value is the left operand, which no other end can exceed.
+    The scan runs backwards, and the left operand at each sample caps the best value over later ends. If all
+    numbers of an end were left out so far, the end's value is the left operand, which no other end can
+    exceed.
     """
     best_value, is_lost, is_any_left_out = np.nan, 0, False
     for sample in range(last, first - 1, -1):
@@ -532,7 +533,7 @@ def scan_until_by_last(
     left: Floats, left_lost: Flags, right: float, right_lost: int,
     first: int, last: int, target: Floats, target_lost: Flags,
 ) -> None:  # fmt: skip
-    """Update until from each sample to `last`, given its values up to the sample before."""
+    """Update until from each sample to `last`, given its values up to the previous sample."""
     least_left, is_lost = np.nan, right_lost
     target[last], target_lost[last] = np.nan, 0
     for sample in range(last, first - 1, -1):
@@ -568,7 +569,7 @@ class PaperRun:
     """The numbers of every node on every prefix by Def. 16.
 
     A temporal operator over formulas without temporal operators stores one number. Below another temporal
-    operator it stores a number for every sample so far, and each new sample takes time proportional to them.
+    operator, it stores a number for every sample so far, and the time of an update grows with their number.
     """
 
     def __init__(
@@ -610,14 +611,14 @@ class PaperRun:
         Raises:
             UsageError: the pairs of samples exceed the limit.
         """
-        # Def. 16 has no uncertainty: only nominal ends count, and a number is lost where they differ
+        # Def. 16 has no uncertainty: only nominal ends are used, and a number is lost where they differ
         low_channel, high_channel = low_and_high(len(leaves), wide=False)
         numbers = np.ascontiguousarray(leaves[low_channel])
         lost_flags = ((numbers != leaves[high_channel]) & ~np.isnan(numbers)).astype(np.int8)
         times_ns = np.array(times_ns, np.int64)  # writable, because kernels are compiled for writable arrays
         series = empty((len(self._table.rows), 4, len(times_ns)))
         sample_count, rows = self._position + len(times_ns), self._table.rows
-        # unbounded windows only: pairs of bounded ones are counted when their samples come
+        # only unbounded windows, because pairs of bounded windows are counted when their samples come
         window_lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
         # half of all pairs, because no end comes before its start
         self._check_pairs(int((np.maximum(sample_count - window_lows, 0) ** 2 // 2).sum()), sample_count)
@@ -673,13 +674,13 @@ def left_out(
     times_ns: Integers,
     first_ns: int,
 ) -> Floats:
-    """Return leaves with NaN where they are left out: they look back (`a[-3]`) beyond the log.
+    """Return leaves with NaN where they are left out, because they look back (`a[-3]`) beyond the log.
 
     A leaf with a rate is also NaN where the rate has no value, if an operator leaves such samples out.
 
     Args:
-        values: (C, A, T), numbers of these leaves.
-        positions: (T,), number of samples of the log before each.
+        values: (C, A, T), numbers of the leaves.
+        positions: (T,), number of samples of the log before each sample.
         times_ns: (T,).
         first_ns: time of the log's first sample.
     """
@@ -687,7 +688,7 @@ def left_out(
     number_of_leaf = {leaf_key(leaf): number for number, leaf in enumerate(leaves)}
     for is_leaf_before, leaf in zip(is_before, leaves, strict=True):
         for delay in set(iter_delays([leaf])):
-            # no report comes before those of the first sample
+            # no report precedes the reports of the first sample
             is_leaf_before |= positions < (1 if delay == TO_REPORTS else delay.samples or 0)
             if delay.duration_ns is not None:
                 is_leaf_before |= times_ns - delay.duration_ns < first_ns
@@ -719,7 +720,7 @@ def _first_memory(table: PaperTable) -> PaperMemory:
 
 
 def _longer(array: np.ndarray, added_length: int) -> np.ndarray:
-    """Return the array with `more` zeros at the end of its last axis."""
+    """Return the array with `added_length` zeros at the end of its last axis."""
     return np.concatenate([array, np.zeros((*array.shape[:-1], added_length), array.dtype)], axis=-1)
 
 
@@ -727,7 +728,7 @@ def check_operators(specification: Specification) -> None:
     """Check that the paper's semantics has all temporal operators of the result specs.
 
     Raises:
-        UsageError: an operator is not the paper's; the message gives its place.
+        UsageError: the paper's semantics lacks an operator. The message gives the operator's place.
     """
     for spec in specification.results:
         for _, _, node in iter_nodes(spec.formula):
@@ -744,7 +745,7 @@ def check_operators(specification: Specification) -> None:
 
 
 def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -> Semantics:
-    """Return the semantics of a name, which has to define all operators of the specifications.
+    """Return a semantics by name, after a check that it defines all operators of the specifications.
 
     Raises:
         UsageError: an unknown name, or an operator that the semantics does not define.
@@ -793,7 +794,7 @@ class Evaluator(NamedTuple):
 
         Args:
             is_live: whether samples are added one by one.
-            samples: number of samples in all, if known; a short run allocates less memory.
+            samples: number of all samples, if known. A short run allocates less memory.
         """
         if self.semantics == "paper":
             return PaperRun(self.formula, self.program.leaves)
@@ -806,14 +807,14 @@ class Evaluator(NamedTuple):
     def leaves_within_log(
         self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int
     ) -> Floats:
-        """Return leaves, marked as the semantics requires where they look back beyond the log.
+        """Return leaves with the values that the semantics requires where they look back beyond the log.
 
         Args:
             leaves: (C, A, T).
-            positions: (T,), number of samples of the log before each.
+            positions: (T,), number of samples of the log before each sample.
             times_ns: (T,).
             first_ns: time of the log's first sample.
         """
         if self.semantics == "paper":
             return left_out(leaves, self.program.leaves, positions, times_ns, first_ns)
-        return leaves  # their intervals are unbounded there already
+        return leaves  # their intervals already are unbounded beyond the log

@@ -1,4 +1,4 @@
-"""The samples of one instance, read again on each request, and their gaps."""
+"""Read the samples of one instance again on request, and find their gaps."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ class Gap:
 
     Attributes:
         name: title of the object or signal (see `NamedPart`); None for pauses.
-        missing: number of samples that lack it, or that fill pauses.
+        missing: number of samples without the object or signal; for pauses, number of samples that fill them.
         samples: number of all samples.
         first_ns, last_ns: times of the first and the last of the missing samples.
-        window: start and end (not included) of the samples that have it, if it is missing only at the ends
-            of the log; else None. None also for an object with a class that is sometimes absent.
-        longest_ns: times of the first sample of its longest gap, and of the first sample after it.
-        is_filled: whether that gap is filled to its end, as by `max_gap`; a lost connection adds only
-            a sample at its beginning.
+        window: start and end (not included) of the samples with the object or signal, if it is missing only
+            at the ends of the log; else None. Also None for an object with a class that is absent in a
+            sample.
+        longest_ns: times of the first sample of the longest gap, and of the first sample after the gap.
+        is_filled: whether the longest gap is filled to its end, as by `max_gap`. A lost connection adds a
+            sample only at the beginning of a gap.
     """
 
     name: str | None
@@ -60,8 +61,9 @@ class Evidence:
         """Store how to read the samples.
 
         Args:
-            traces: iterates over the samples in blocks of any length, with earlier samples that terms read.
-            units: declared units of the log, of signals by name, of lengths under "".
+            traces: iterates over the samples in blocks of any length, with the earlier samples that terms
+                look back at.
+            units: declared units of signals by name; the unit of lengths under "".
             zero_ns: reference time of sentences; None for the time of the first sample.
         """
         self._zero_ns = zero_ns
@@ -76,16 +78,16 @@ class Evidence:
         return substitute(formula, self.instance.bindings)
 
     def scene(self, time_ns: int) -> TraceScene:
-        """Return the sample at a time, with the earlier samples that its terms look back at.
+        """Return the sample at a time, with the earlier samples that terms look back at.
 
         Raises:
-            LookupError: there is no such sample, because the log changed since its evaluation.
+            LookupError: there is no sample at the time, because the log changed since its evaluation.
         """
         return self.scenes([time_ns])[time_ns]
 
     def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
-        """Return the samples at several times, as `scene` does, in one pass over the log."""
-        # in descending order, so that `pop` removes the earliest
+        """Return a scene for each of several times (see `scene`), in one pass over the log."""
+        # in descending order, so that `pop` removes the earliest time
         pending_ns, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
         for scene in self._scenes() if pending_ns else ():
             trace = scene.trace
@@ -117,7 +119,7 @@ class Evidence:
         return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:
-        """Return `zero_ns`; without it, the time of the first sample of all traces."""
+        """Return `zero_ns`, or the time of the first sample of all traces if that is None."""
         if self._zero_ns is not None:
             return self._zero_ns
         return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))
@@ -158,7 +160,7 @@ class Evidence:
         return tuple(gaps)
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
-        """Return (G, T), whether each open group has a member, or may have one, in each sample."""
+        """Return whether each open group has, or may have, a member in each sample, (G, T)."""
         blocks: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
             evaluated_samples = self._evaluated_slice(scene)
@@ -174,12 +176,12 @@ class Evidence:
         return np.concatenate(blocks, axis=1) if blocks else np.empty((0, 0), np.bool_)
 
     def _evaluated_slice(self, scene: TraceScene) -> slice:
-        """Return the samples of a scene that the instance is evaluated over."""
+        """Return the range of the scene's samples over which the instance is evaluated."""
         times_ns = scene.trace.times_ns[scene.skip :]
         return slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
 
     def _scenes(self) -> Iterator[TraceScene]:
-        """Iterate over the samples in blocks, with the earlier samples that their terms look back at."""
+        """Iterate over the samples in blocks, with the earlier samples that terms look back at."""
         previous_trace: Trace | None = None
         for trace in self._traces():
             if len(trace) and trace.times_ns[0] >= self.instance.end_ns:
@@ -203,12 +205,12 @@ class NamedPart(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Its name in sentences."""
+        """Name of the part in sentences."""
         return f"signal {self.name!r}" if self.is_signal else self.name
 
 
 def named_parts(formula: Formula) -> list[NamedPart]:
-    """Return the named signals and objects of a formula, each once."""
+    """Return the distinct signals and objects that a formula names."""
     atoms = list(iter_atoms(formula))
     parts = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
     terms = [term for atom in atoms if atom.relation != "present" for term in atom.terms]
@@ -224,7 +226,7 @@ def _object_names(base: Term) -> tuple[str, ...]:
 
 
 def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), whether the position of an object or the value of a signal is missing in each sample."""
+    """Return for each sample whether the position of an object or the value of a signal is missing, (T,)."""
     name = part.name
     if part.is_signal:
         values = trace.signals.get(name)
@@ -235,7 +237,7 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 
 
 def _is_absent(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
-    """Return (T,), whether an object is absent in each sample; an object with unknown position is not."""
+    """Return for each sample whether an object is absent, (T,). An unknown position is no absence."""
     if part.is_signal or part.name not in trace.names:
         return np.full(len(trace), not part.is_signal)
     return np.asarray(trace.rows[:, trace.names.index(part.name)] == ABSENT)
@@ -255,7 +257,7 @@ def _gap(name: str | None, is_gap: NDArray[np.bool_], times_ns: Integers, time_n
     last_index = len(is_gap) - 1
     boundaries = np.flatnonzero(np.diff(is_gap, prepend=False, append=False))
     starts, ends = boundaries[::2], boundaries[1::2]
-    # missing samples are only leading or trailing ones
+    # whether only leading and trailing samples are missing
     is_at_ends = bool(((starts == 0) | (ends > last_index)).all()) and not is_gap.all()
     window_start = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
     window_end = int(times_ns[starts[-1]]) if ends[-1] > last_index else None

@@ -78,9 +78,9 @@ Interval = tuple[float, float]
 class End(Enum):
     """The deciding end of an interval.
 
-    The low end decides a satisfied formula, because it is at least 0. The high end decides a violated one.
-    Other formulas are `OPEN`. Their path follows the low ends of minima and the high ends of maxima, so it
-    ends at an open operand.
+    The low end decides a satisfied formula, because it is at least 0. The high end decides a violated
+    formula. Other formulas are `OPEN`. The path of an open formula follows the low ends of minima and the
+    high ends of maxima, so it ends at an open operand.
     """
 
     LOW = "low"
@@ -98,11 +98,11 @@ class End(Enum):
         return {End.LOW: End.HIGH, End.HIGH: End.LOW, End.OPEN: End.OPEN}[self]
 
     def of_minimum(self, low: _Number, high: _Number) -> _Number:
-        """Return the numbers that a minimum compares to choose its operand."""
+        """Return the ends that a minimum compares to choose its operand, given low and high ends."""
         return high if self is End.HIGH else low
 
     def of_maximum(self, low: _Number, high: _Number) -> _Number:
-        """Return the numbers that a maximum compares to choose its operand."""
+        """Return the ends that a maximum compares to choose its operand, given low and high ends."""
         return low if self is End.LOW else high
 
 
@@ -147,7 +147,7 @@ def _normal_form(
 def attaining_operands(
     part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
 ) -> list[SignedOperand]:
-    """Return the operands that attain an extremum: one, or several equal operands in order.
+    """Return the operands that attain an extremum. Several equal operands are in order.
 
     Args:
         interval: returns the low and high end of an operand, before negation.
@@ -177,7 +177,7 @@ class PathNode(NamedTuple):
     """A node at a sample on a deciding path.
 
     Attributes:
-        node: its id.
+        node: node id.
         sample: index among the evaluated samples.
     """
 
@@ -208,13 +208,12 @@ def deciding_path(nodes: OfflineNodes, node: int, end: End, *, sample: int = 0) 
 
 
 class _Walk:
-    """The tree of a formula with every node's numbers."""
+    """Follows deciding paths in the tree of a formula, by every node's numbers."""
 
     def __init__(self, nodes: OfflineNodes) -> None:
         self._nodes = nodes
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
-        """Return the path from a node at a sample."""
         step, (formula, operands) = PathNode(node, sample), self._nodes.tree[node]
         match formula:
             case Boolean():
@@ -293,7 +292,7 @@ class _Walk:
     def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
         """Return the least left operand so far of an until with an open window, if it decides the until.
 
-        None for the low end, which no later sample can lower.
+        The result is None for the low end, because later samples cannot lower it.
         """
         formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
@@ -307,8 +306,7 @@ class _Walk:
         return PathNode(left.index, sample + int(np.argmin(left_ends))) if left_ends.min() == high else None
 
     def _window(self, formula: Temporal, sample: int) -> range:
-        """Return the samples in an operator's window."""
-        # one window: the windows of all samples slowed explanations of many intervals down several times
+        # a single window, because the windows of all samples made explanations several times slower
         begin, end = windows_of(formula, self._nodes.times_ns, np.array([sample]))
         return range(int(begin[0]), int(end[0]))
 
@@ -353,7 +351,7 @@ class _Walk:
         return left_steps[0] if least_left < right_number else PathNode(right.index, best_sample)
 
     def _weak_until(self, operands: Sequence[int], sample: int, window: range, end: End) -> PathNode:
-        """Return the operand and sample that decide a weak until, the greater of `phi U psi` and `G phi`."""
+        """Return the operand and sample that decide a weak until: the maximum of `phi U psi` and `G phi`."""
         left, right = map(SignedOperand, operands)
         window_slice = slice(window.start, window.stop)
         left_ends, right_ends = self._ends(left, slice(sample, window.stop)), self._ends(right, window_slice)
@@ -371,7 +369,7 @@ class _Walk:
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
-    """Return the minimum of a column between its near end and each place, without the place itself."""
+    """Return for each place the minimum of a column from its near end to before the place."""
     ordered_column = column if is_ahead else column[::-1]
     minima = np.minimum.accumulate(np.concatenate([[np.inf], ordered_column[:-1]]))
     return minima if is_ahead else minima[::-1]
@@ -379,10 +377,10 @@ def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class MissedResponse:
-    """A failed implication on the deciding path: its condition held, and its response did not.
+    """A failed implication on the deciding path: its condition held, and its response did not hold.
 
     Attributes:
-        condition, response: their names or shortened texts.
+        condition, response: name or shortened text of the condition, and of the response.
         time_ns: time of the sample at which the condition held.
         is_condition: whether the deciding atom is in the condition.
     """
@@ -401,9 +399,9 @@ def short_title(formula: Formula) -> str:
 def missed_response(
     path: DecidingPath, nodes: OfflineNodes, bindings: Bindings = MappingProxyType({})
 ) -> tuple[MissedResponse | None, DecidingPath | None]:
-    """Return the outermost failed implication on the path of a violated formula, if there is one.
+    """Return the outermost failed implication on the path of a violated formula, or None.
 
-    If its condition decides, also return the path to the atom that came closest to fulfilling its response.
+    If the condition decides, also return the path to the atom that came closest to fulfilling the response.
 
     Args:
         bindings: objects by the names of variables.
@@ -423,7 +421,7 @@ def missed_response(
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
-    """Return the reasons why an atom is unknown in the one sample of a scene, each reason once."""
+    """Return the distinct reasons why an atom is unknown in the single sample of a scene."""
     parts = list(iter_expressions(atom.expression))
     compared_signals = [part.signal for part in parts if isinstance(part, Equality)]
     reasons = (reason for part in parts if part not in compared_signals for reason in _reasons(scene, part))
@@ -461,7 +459,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
 
 
 def _position(term: Term) -> Projection:
-    """Return a coordinate of a term; it is unknown if the position of the term is unknown."""
+    """Return a coordinate of a term, which is unknown if the position of the term is unknown."""
     return Projection(term, "x", "min")
 
 
@@ -518,9 +516,9 @@ class Measured:
     Attributes:
         quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal", "present", "speed" or
             "rate".
-        names: measured objects or regions, with their delays and enlargements; or the signal.
+        names: measured objects or regions with delays and enlargements, or the signal.
         value: the number.
-        spread: its uncertainty, from the uncertainty of the objects.
+        spread: uncertainty of the number, from the uncertainty of the objects.
         contact: closest points of a distance; else None.
         reports_ns: times of the two reports that a rate compares; else None.
     """
@@ -539,13 +537,13 @@ class DecidingAtom:
 
     Attributes:
         atom: the atom, with objects instead of variables.
-        end: deciding end of its interval.
-        value: its robustness with every uncertainty at 0; NaN if unknown.
-        lower, upper: ends of its interval.
-        branch: summands of its number: numbers, signals and measurements, each with its weight, such as -1.
-            Empty if the atom is unknown.
+        end: deciding end of the atom's interval.
+        value: robustness of the atom with every uncertainty at 0; NaN if unknown.
+        lower, upper: ends of the atom's interval.
+        branch: summands of the robustness: numbers, signals and measurements, each with a weight such as -1.
+            It is empty if the atom is unknown.
         measured: signals and measurements among the summands.
-        unknown: reasons why it is unknown.
+        unknown: reasons why the atom is unknown.
     """
 
     atom: Atom = field(repr=False)
@@ -570,7 +568,7 @@ class DecidingAtom:
 
 
 def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | None:
-    """Return the atom that decides a leaf in the one sample of a scene; None if its group is empty."""
+    """Return the atom that decides a leaf in the single sample of a scene; None for an empty group."""
     while not isinstance(leaf, Atom):
         operand_and_end = _below(scene, leaf, end)
         if operand_and_end is None:
@@ -601,7 +599,7 @@ def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Form
 
 
 def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:
-    """Return the interval of each formula in the one sample of a scene."""
+    """Return the interval of each formula in the single sample of a scene."""
     values = leaf_values(scene, formulas, {})[:, :, 0]
     low_channel, high_channel = low_and_high(len(values), wide=wide)
     return [
@@ -634,7 +632,7 @@ def _judged_bodies(scene: TraceScene, formula: Quantified) -> list[Formula]:
     if not rate_conditions(formula.body):
         return bodies
     rate_intervals = _intervals(scene, [Boolean("and", tuple(rate_conditions(body))) for body in bodies])
-    # -inf: a rate of the body has no value
+    # a condition of -inf: a rate of the body has no value
     return [body for body, (_, high) in zip(bodies, rate_intervals, strict=True) if high > -np.inf]
 
 
@@ -651,7 +649,7 @@ def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
 def _may_decide(
     scene: TraceScene, formula: Quantified, present_names: Sequence[str]
 ) -> Iterable[tuple[str, ...]]:
-    """Return the bindings that may decide a quantifier: near pairs if a distance decides, else all."""
+    """Return the bindings that may decide a quantifier: near pairs for a distance, else all bindings."""
     pair = closest_pair_of(formula)
     all_bindings = permutations(present_names, len(formula.variables))
     if pair is None or len(present_names) < 3:
@@ -670,7 +668,7 @@ def _may_decide(
 def _branch(
     scene: TraceScene, expression: Expression, end: End, weight: float
 ) -> Iterator[tuple[float, Expression]]:
-    """Iterate over the weighted summands of an expression, with the chosen operands of minima and maxima."""
+    """Iterate over the weights and summands of an expression. Minima and maxima have their chosen operand."""
     match expression:
         case Sum():
             yield from _branch(scene, expression.first, end, weight)
@@ -748,7 +746,7 @@ def _attaining(scene: TraceScene, part: Measurement) -> Measurement:
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:
-    """Return the objects or regions of a term in the sample; the term itself if it has none."""
+    """Return the single objects or regions of a term in the sample; the term itself for an empty group."""
     base = base_of(term)
     if not isinstance(base, Group):
         return [term]
