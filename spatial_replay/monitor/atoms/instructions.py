@@ -162,16 +162,16 @@ TILE = 128
 
 @inlined
 def _copy_to(source: Floats, begin: int, count: int, columns: Floats, target: int) -> None:
-    for k in range(count):
-        columns[target, k] = source[begin + k]
+    for offset in range(count):
+        columns[target, offset] = source[begin + offset]
 
 
 @inlined
 def _copy_from(
     columns: Floats, source: int, leaves: Floats, channel: int, leaf: int, begin: int, count: int
 ) -> None:
-    for k in range(count):
-        leaves[channel, leaf, begin + k] = columns[source, k]
+    for offset in range(count):
+        leaves[channel, leaf, begin + offset] = columns[source, offset]
 
 
 @elementwise
@@ -197,100 +197,122 @@ def run_instructions(
         outputs: number of the instruction that computes leaf j, for each j.
         leaves: (C, A, T), output.
     """
-    channels, total, instructions = leaves.shape[0], leaves.shape[2], len(code) // 4
-    columns = np.empty((instructions * channels, min(TILE, end - begin)))
-    for t in range(begin, end, TILE):
-        count = min(TILE, end - t)
-        for i in range(instructions):
-            op, a, b, c = code[4 * i], code[4 * i + 1], code[4 * i + 2], code[4 * i + 3]
-            row, member = a * total + t, c * total + t
-            for channel in range(channels):
-                mirror = channel ^ 1 if channels > 1 else channel
+    channel_count, sample_count, instruction_count = leaves.shape[0], leaves.shape[2], len(code) // 4
+    columns = np.empty((instruction_count * channel_count, min(TILE, end - begin)))
+    for tile_start in range(begin, end, TILE):
+        tile_length = min(TILE, end - tile_start)
+        for instruction in range(instruction_count):
+            op, a, b, c = (
+                code[4 * instruction],
+                code[4 * instruction + 1],
+                code[4 * instruction + 2],
+                code[4 * instruction + 3],
+            )
+            input_index, member_index = a * sample_count + tile_start, c * sample_count + tile_start
+            for channel in range(channel_count):
+                mirror_channel = channel ^ 1 if channel_count > 1 else channel
                 # rows are indexed, because slicing an array takes as long as ten samples
-                target, opposite = i * channels + channel, a * channels + mirror
-                first, second = a * channels + channel, b * channels + channel
+                target_row, mirror_row = (
+                    instruction * channel_count + channel,
+                    a * channel_count + mirror_channel,
+                )
+                first_row, second_row = a * channel_count + channel, b * channel_count + channel
                 # one loop per operation: a single loop would test the operation at each sample
                 if op == CONSTANT:
-                    for k in range(count):
-                        columns[target, k] = constants[a]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = constants[a]
                 elif op == MEASURED:
                     # channels 2 and 3 are the low and high end with uncertainty
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
-                    _copy_to(values, row, count, columns, target)
+                    _copy_to(values, input_index, tile_length, columns, target_row)
                     if sign:
-                        for k in range(count):
-                            columns[target, k] += sign * spreads[row + k]
+                        for offset in range(tile_length):
+                            columns[target_row, offset] += sign * spreads[input_index + offset]
                 elif op == SIGNAL:
-                    for k in range(count):
-                        value = signals[row + k]
+                    for offset in range(tile_length):
+                        value = signals[input_index + offset]
                         # a text is stored as a number up to `TEXTS`, but is none
-                        columns[target, k] = np.nan if -np.inf < value <= TEXTS else value
+                        columns[target_row, offset] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
-                    for k in range(count):
-                        columns[target, k] = closest[(4 * a + channel) * total + t + k]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = closest[
+                            (4 * a + channel) * sample_count + tile_start + offset
+                        ]
                 elif op == ADD:
-                    for k in range(count):
-                        columns[target, k] = columns[first, k] + columns[second, k]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = columns[first_row, offset] + columns[second_row, offset]
                 elif op == NEGATE:
-                    for k in range(count):
-                        columns[target, k] = -columns[opposite, k]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = -columns[mirror_row, offset]
                 elif op == LEAST:
-                    for k in range(count):
-                        left, right = columns[first, k], columns[second, k]
+                    for offset in range(tile_length):
+                        left, right = columns[first_row, offset], columns[second_row, offset]
                         is_number = left == left and right == right
-                        columns[target, k] = min(left, right) if is_number else np.nan
+                        columns[target_row, offset] = min(left, right) if is_number else np.nan
                 elif op == GREATEST:
-                    for k in range(count):
-                        left, right = columns[first, k], columns[second, k]
+                    for offset in range(tile_length):
+                        left, right = columns[first_row, offset], columns[second_row, offset]
                         is_number = left == left and right == right
-                        columns[target, k] = max(left, right) if is_number else np.nan
+                        columns[target_row, offset] = max(left, right) if is_number else np.nan
                 elif op == HOLDS:
-                    anything = np.inf if channel % 2 else -np.inf
-                    for k in range(count):
-                        number, mirrored = columns[first, k], columns[opposite, k]
-                        is_number = number == number and mirrored == mirrored
-                        columns[target, k] = number if is_number else anything
+                    unbounded_end = np.inf if channel % 2 else -np.inf
+                    for offset in range(tile_length):
+                        number, mirror_number = columns[first_row, offset], columns[mirror_row, offset]
+                        is_number = number == number and mirror_number == mirror_number
+                        columns[target_row, offset] = number if is_number else unbounded_end
                 elif op == AND:
-                    for k in range(count):
-                        columns[target, k] = min(columns[first, k], columns[second, k])
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = min(
+                            columns[first_row, offset], columns[second_row, offset]
+                        )
                 elif op == EQUAL:
-                    for k in range(count):
-                        value = signals[row + k]
-                        equal = np.inf if value == constants[b] else -np.inf
-                        is_alike = value == value and (value <= TEXTS) == (constants[b] <= TEXTS)
-                        columns[target, k] = equal if is_alike else np.nan
+                    for offset in range(tile_length):
+                        value = signals[input_index + offset]
+                        truth = np.inf if value == constants[b] else -np.inf
+                        is_comparable = value == value and (value <= TEXTS) == (constants[b] <= TEXTS)
+                        columns[target_row, offset] = truth if is_comparable else np.nan
                 elif op == DIVIDE:
-                    for k in range(count):
-                        columns[target, k] = columns[first, k] / constants[b]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = columns[first_row, offset] / constants[b]
                 elif op == MULTIPLY:
-                    for k in range(count):
-                        columns[target, k] = columns[first, k] * constants[b]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = columns[first_row, offset] * constants[b]
                 elif op == QUOTIENT:
-                    for k in range(count):
-                        columns[target, k] = columns[first, k] / columns[second, k]
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = columns[first_row, offset] / columns[second_row, offset]
                 elif op == HAS_VALUE:
-                    for k in range(count):
-                        left, right = columns[first, k], columns[second, k]
+                    for offset in range(tile_length):
+                        left, right = columns[first_row, offset], columns[second_row, offset]
                         has_value = np.inf if left == left else -np.inf
-                        columns[target, k] = has_value if right == right else np.nan
+                        columns[target_row, offset] = has_value if right == right else np.nan
                 elif op == OR:
-                    for k in range(count):
-                        columns[target, k] = max(columns[first, k], columns[second, k])
+                    for offset in range(tile_length):
+                        columns[target_row, offset] = max(
+                            columns[first_row, offset], columns[second_row, offset]
+                        )
                 else:
-                    for k in range(count):
-                        value = columns[second, k]
+                    for offset in range(tile_length):
+                        value = columns[second_row, offset]
                         # with unknown membership the body may count or not, so its interval is [-inf, inf]
-                        if members[member + k] < 0:
+                        if members[member_index + offset] < 0:
                             value = np.inf if channel % 2 else -np.inf
-                        if members[member + k] == 0:
-                            columns[target, k] = columns[first, k]
+                        if members[member_index + offset] == 0:
+                            columns[target_row, offset] = columns[first_row, offset]
                         elif op == AND_MEMBER:
-                            columns[target, k] = min(columns[first, k], value)
+                            columns[target_row, offset] = min(columns[first_row, offset], value)
                         else:
-                            columns[target, k] = max(columns[first, k], value)
-        for j in range(len(outputs)):
-            for channel in range(channels):
-                _copy_from(columns, outputs[j] * channels + channel, leaves, channel, j, t, count)
+                            columns[target_row, offset] = max(columns[first_row, offset], value)
+        for leaf in range(len(outputs)):
+            for channel in range(channel_count):
+                _copy_from(
+                    columns,
+                    outputs[leaf] * channel_count + channel,
+                    leaves,
+                    channel,
+                    leaf,
+                    tile_start,
+                    tile_length,
+                )
 
 
 MAX_BINDINGS = 20_000
@@ -358,8 +380,8 @@ class LeafCode:
             case Quantified():
                 return self._quantifier(formula, bindings)
             case Boolean():
-                rows = {id(operand): self._add(operand, bindings) for operand in formula.operands}
-                return self._expansion_row(formula.expansion or formula, rows)
+                row_of_operand = {id(operand): self._add(operand, bindings) for operand in formula.operands}
+                return self._expansion_row(formula.expansion or formula, row_of_operand)
             case Temporal():
                 raise TypeError("a temporal operator in the body of an open quantifier")
 
@@ -377,14 +399,14 @@ class LeafCode:
                 return self._constant(expression.value)
             case Rate():
                 terms = tuple(substitute_term(term, bindings) for term in expression.terms)
-                bound = replace(expression, terms=terms)
-                step = self._expression(step_of(bound), {})
-                return self._row(QUOTIENT, self._expression(change_of(bound), {}), step)
+                bound_rate = replace(expression, terms=terms)
+                step_row = self._expression(step_of(bound_rate), {})
+                return self._row(QUOTIENT, self._expression(change_of(bound_rate), {}), step_row)
             case Signal():
                 return self._row(SIGNAL, self.signals.setdefault(expression, len(self.signals)))
             case Sum():
-                first = self._expression(expression.first, bindings)
-                return self._row(ADD, first, self._expression(expression.second, bindings))
+                first_row = self._expression(expression.first, bindings)
+                return self._row(ADD, first_row, self._expression(expression.second, bindings))
             case Negative():
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
             case Equality(HasRate(rate=rate)):
@@ -393,14 +415,14 @@ class LeafCode:
                 if isinstance(signal, Present):
                     term: Any = substitute_term(signal.term, bindings)
                     signal = presence_of(term).signal
-                constant = self.constants.setdefault(value, len(self.constants))
-                return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant)
+                constant_number = self.constants.setdefault(value, len(self.constants))
+                return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant_number)
             case Product(factor, operand):
-                constant = self.constants.setdefault(factor, len(self.constants))
-                return self._row(MULTIPLY, self._expression(operand, bindings), constant)
+                constant_number = self.constants.setdefault(factor, len(self.constants))
+                return self._row(MULTIPLY, self._expression(operand, bindings), constant_number)
             case Scaled(operand, divisor):
-                constant = self.constants.setdefault(divisor, len(self.constants))
-                return self._row(DIVIDE, self._expression(operand, bindings), constant)
+                constant_number = self.constants.setdefault(divisor, len(self.constants))
+                return self._row(DIVIDE, self._expression(operand, bindings), constant_number)
             case Minimum() | Maximum():
                 op = LEAST if isinstance(expression, Minimum) else GREATEST
                 row, *other_rows = [self._expression(operand, bindings) for operand in expression.operands]
@@ -441,12 +463,15 @@ class LeafCode:
         is_forall = formula.quantifier == "forall"
         group: Any = substitute_term(formula.group, bindings)
         if (pair_and_number := number_of_closest(replace(formula, group=group))) is not None:
-            if (count := len(self._groups.candidates(group))) > MAX_CLOSEST:
-                use = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
-                raise UsageError(f"{use} of {count} objects; {MAX_CLOSEST} is the limit: use a smaller group")
+            if (candidate_count := len(self._groups.candidates(group))) > MAX_CLOSEST:
+                use_text = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
+                raise UsageError(
+                    f"{use_text} of {candidate_count} objects; {MAX_CLOSEST} is the limit:"
+                    " use a smaller group"
+                )
             return self._row(HOLDS, self._expression(pair_and_number[1], bindings))
-        names = self._groups.candidates(group)
-        self._check_bindings(formula, len(names))
+        candidate_names = self._groups.candidates(group)
+        self._check_bindings(formula, len(candidate_names))
         op = AND_MEMBER if is_forall else OR_MEMBER
         # the value over no member
         row = self._constant(inf if is_forall else -inf)
@@ -454,11 +479,11 @@ class LeafCode:
             # the quantifier is unknown in samples with unknown members
             row = self._row(op, row, row, self._member(group, ()))
         # permutations: different variables stand for different members
-        for indices in permutations(range(len(names)), len(formula.variables)):
-            members = [TrackedName(names[n]) for n in indices]
+        for indices in permutations(range(len(candidate_names)), len(formula.variables)):
+            members = [TrackedName(candidate_names[index]) for index in indices]
             member_bindings = {**bindings, **dict(zip(formula.variables, members, strict=True))}
-            body = self._add(formula.judged, member_bindings)
-            row = self._row(op, row, body, self._member(group, indices))
+            body_row = self._add(formula.judged, member_bindings)
+            row = self._row(op, row, body_row, self._member(group, indices))
         return row
 
     def _member(self, group: Group | Earlier, candidates: tuple[int, ...]) -> int:

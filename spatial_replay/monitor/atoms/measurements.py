@@ -45,11 +45,13 @@ def measurement_values(scene: TraceScene, measurements: Sequence[Measurement]) -
     keys = [_key(scene, measurement) for measurement in measurements]
     cache = scene.trace.cache
     arrays = {key: array for key in keys if (array := cache.get(key)) is not None}
-    missing = {
+    missing_measurements = {
         key: measurement for key, measurement in zip(keys, measurements, strict=True) if key not in arrays
     }
-    if missing:
-        for key, array in zip(missing, _measure(scene, list(missing.values())), strict=True):
+    if missing_measurements:
+        for key, array in zip(
+            missing_measurements, _measure(scene, list(missing_measurements.values())), strict=True
+        ):
             cache.put(key, array)
             arrays[key] = array
     if not keys:
@@ -89,9 +91,9 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
             value, spread = misalignment(*(term.yaw for term in resolved_terms)), np.zeros(len(scene))
         else:
             value, spread = next(values), reduce(np.add, [term.spread for term in resolved_terms])
-        unknown = reduce(np.logical_or, [term.unknown for term in resolved_terms])
-        if unknown.any():
-            value = np.where(unknown, np.nan, value)
+        is_unknown = reduce(np.logical_or, [term.unknown for term in resolved_terms])
+        if is_unknown.any():
+            value = np.where(is_unknown, np.nan, value)
         array = np.array([value] if scene.is_sure else [value, spread])
         array.flags.writeable = False
         arrays.append(array)
@@ -133,31 +135,35 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     code = LeafCode(scene)
     outputs = np.array(code.add_leaves(leaves, bindings), np.int64)
     values, spreads = measurement_values(scene, list(code.measurements))
-    count = len(scene)
-    signals = np.array([scene.signal(signal) for signal in code.signals]).reshape(len(code.signals), count)
-    members = np.array([_flags(scene, membership) for membership in code.members], np.int8)
-    members = members.reshape(len(code.members), count)
-    closest = np.array([_closest(scene, pair) for pair in code.closest]).reshape(len(code.closest), 4, count)
-    rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)
+    sample_count = len(scene)
+    signals = np.array([scene.signal(signal) for signal in code.signals]).reshape(
+        len(code.signals), sample_count
+    )
+    membership_rows = np.array([_flags(scene, membership) for membership in code.members], np.int8)
+    membership_rows = membership_rows.reshape(len(code.members), sample_count)
+    closest_ends = np.array([_closest(scene, pair) for pair in code.closest]).reshape(
+        len(code.closest), 4, sample_count
+    )
+    instruction_rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)
     constants = np.array(list(code.constants), np.float64)
     # a comparison of a number with a text is unknown
     has_texts = (signals <= TEXTS).any() or (np.isfinite(constants) & (constants <= TEXTS)).any()
-    is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
-    is_known = is_known and not has_texts and (closest[:, 0] == closest[:, 1]).all()
-    is_sure = (scene.is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
-    channels = 4 if not is_sure else 1 if is_known else 2
-    numbers = np.empty((channels, len(outputs), count))
-    arguments = (
-        rows.reshape(-1), constants, values.reshape(-1), spreads.reshape(-1), signals.reshape(-1),
-        closest.reshape(-1), members.reshape(-1), outputs, numbers,
+    is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (membership_rows < 0).any()
+    is_known = is_known and not has_texts and (closest_ends[:, 0] == closest_ends[:, 1]).all()
+    is_sure = (scene.is_sure or not spreads.any()) and (closest_ends[:, :2] == closest_ends[:, 2:]).all()
+    channel_count = 4 if not is_sure else 1 if is_known else 2
+    leaf_numbers = np.empty((channel_count, len(outputs), sample_count))
+    kernel_arguments = (
+        instruction_rows.reshape(-1), constants, values.reshape(-1), spreads.reshape(-1), signals.reshape(-1),
+        closest_ends.reshape(-1), membership_rows.reshape(-1), outputs, leaf_numbers,
     )  # fmt: skip
     over_cores(
         run_instructions,
-        lambda begin, end: run_instructions(*arguments, begin, end),
-        count,
-        _SHARE // max(len(rows), 1) + 1,
+        lambda begin, end: run_instructions(*kernel_arguments, begin, end),
+        sample_count,
+        _SHARE // max(len(instruction_rows), 1) + 1,
     )
-    return numbers
+    return leaf_numbers
 
 
 def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:

@@ -33,12 +33,12 @@ def before_last_reports(trace: Trace) -> Integers:
     columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
     for name, reported_ns in trace.signals_reported_ns.items():
         columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
-    samples = [np.empty(0, np.int64)]
+    sample_arrays = [np.empty(0, np.int64)]
     for is_known, reported_ns in columns:
-        begins = _begins(is_known, reported_ns)[:, is_known[-1]]
-        first = len(trace) - 1 - np.argmax(begins[::-1], axis=0)
-        samples.append(first[first > 0] - 1)
-    return np.concatenate(samples).astype(np.int64)
+        is_begin = _begins(is_known, reported_ns)[:, is_known[-1]]
+        first_samples = len(trace) - 1 - np.argmax(is_begin[::-1], axis=0)
+        sample_arrays.append(first_samples[first_samples > 0] - 1)
+    return np.concatenate(sample_arrays).astype(np.int64)
 
 
 def is_signal_known(values: Floats) -> Booleans:
@@ -48,9 +48,9 @@ def is_signal_known(values: Floats) -> Booleans:
 
 def _begins(is_known: Booleans, reported_ns: Integers) -> Booleans:
     """Return whether a report begins with each sample; both arguments are (T, ...)."""
-    begins = is_known.copy()
-    begins[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
-    return begins
+    is_begin = is_known.copy()
+    is_begin[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
+    return is_begin
 
 
 class Reports(NamedTuple):
@@ -68,12 +68,14 @@ class Reports(NamedTuple):
     @classmethod
     def of(cls, is_known: Booleans, reported_ns: Integers) -> Reports:
         # the sample before the begin of a report shows the previous report
-        begins = np.where(_begins(is_known, reported_ns), np.arange(len(is_known)), -1)
-        before = np.where(is_known, np.maximum.accumulate(begins) - 1, -1)
-        before = np.where((before >= 0) & is_known[before], before, -1)
-        step_ns = np.where(before < 0, 0, reported_ns - reported_ns[before])
+        begin_samples = np.where(_begins(is_known, reported_ns), np.arange(len(is_known)), -1)
+        previous_samples = np.where(is_known, np.maximum.accumulate(begin_samples) - 1, -1)
+        previous_samples = np.where(
+            (previous_samples >= 0) & is_known[previous_samples], previous_samples, -1
+        )
+        step_ns = np.where(previous_samples < 0, 0, reported_ns - reported_ns[previous_samples])
         seconds = np.where(step_ns > 0, step_ns / 1e9, np.nan)
-        return cls(before.astype(np.int64), seconds)
+        return cls(previous_samples.astype(np.int64), seconds)
 
 
 @dataclass(slots=True)
@@ -119,16 +121,19 @@ class RecentReports:
     def add(self, sample: Sample) -> None:
         """Add the next sample; objects and signals without a report lose their history."""
         latest: dict[str | Signal, LatestReport] = {}
-        objects, times = sample.objects, sample.reported_ns
+        objects, report_times_ns = sample.objects, sample.reported_ns
         for name in objects if self._objects is None else self._objects:
             if name in objects:
-                latest[name] = self._next(name, objects[name], times.get(name, sample.time_ns))
+                latest[name] = self._next(name, objects[name], report_times_ns.get(name, sample.time_ns))
         for signal in self._signals:
             time_ns = sample.time_ns
             if isinstance(signal, ComputedSignal):
                 value = computed_signal(signal, sample)
             else:
-                value, time_ns = sample.signals.get(signal.name, nan), times.get(signal.name, time_ns)
+                value, time_ns = (
+                    sample.signals.get(signal.name, nan),
+                    report_times_ns.get(signal.name, time_ns),
+                )
             if isfinite(value) and value > TEXTS:
                 latest[signal] = self._next(signal, value, time_ns)
         self.latest = latest
@@ -142,15 +147,15 @@ class RecentReports:
 
         Lasting objects without two reports are ignored. NaN if another object lacks two reports.
         """
-        shortest, latest = inf, self.latest
+        shortest_s, latest = inf, self.latest
         for term in terms:
             for name in (term.name,) if isinstance(term, TrackedName) else _members_in(term, sample):
-                seconds = latest[name].seconds if name in latest else nan
-                if seconds < shortest:
-                    shortest = seconds
-                elif seconds != seconds and name not in sample.lasting:
+                step_s = latest[name].seconds if name in latest else nan
+                if step_s < shortest_s:
+                    shortest_s = step_s
+                elif step_s != step_s and name not in sample.lasting:
                     return nan
-        return shortest if isfinite(shortest) else nan
+        return shortest_s if isfinite(shortest_s) else nan
 
     def packed_centre(self, name: str, tracked: TrackedObject) -> tuple[bytes, bytes]:
         """Return the packed centre of an object, computed once for each report."""
@@ -171,22 +176,24 @@ class RecentReports:
         latest = self.latest.get(name)
         if latest is None:
             return None
-        previous_report, seconds = latest.before, latest.seconds
-        current: TrackedObject = latest.value
-        if previous_report is None or seconds != seconds:
-            return current if name in sample.lasting else None
-        previous: TrackedObject = previous_report.value
+        previous_report, step_s = latest.before, latest.seconds
+        current_object: TrackedObject = latest.value
+        if previous_report is None or step_s != step_s:
+            return current_object if name in sample.lasting else None
+        previous_object: TrackedObject = previous_report.value
         # no arithmetic: the earlier report itself, bit for bit
-        if seconds == shortest:
-            return previous
-        if not seconds > shortest:
+        if step_s == shortest:
+            return previous_object
+        if not step_s > shortest:
             return None
-        (x, y), (previous_x, previous_y) = (centre_of(tracked.footprint) for tracked in (current, previous))
-        share = shortest / seconds
-        shift = np.array([[(previous_x - x) * share, (previous_y - y) * share]])
-        moved = shift_rows(FootprintBatch.from_footprints([current.footprint]), shift)
-        uncertainty = max(current.uncertainty, previous.uncertainty)
-        return replace(current, footprint=moved.footprint(0), uncertainty=uncertainty)
+        (x, y), (previous_x, previous_y) = (
+            centre_of(tracked.footprint) for tracked in (current_object, previous_object)
+        )
+        fraction = shortest / step_s
+        shift = np.array([[(previous_x - x) * fraction, (previous_y - y) * fraction]])
+        moved_batch = shift_rows(FootprintBatch.from_footprints([current_object.footprint]), shift)
+        uncertainty = max(current_object.uncertainty, previous_object.uncertainty)
+        return replace(current_object, footprint=moved_batch.footprint(0), uncertainty=uncertainty)
 
 
 def _members_in(term: Term, sample: Sample) -> Iterable[str]:
@@ -195,12 +202,12 @@ def _members_in(term: Term, sample: Sample) -> Iterable[str]:
         return (term.name,)  # type: ignore[union-attr]
     if not term.is_open:
         return named_members(term)
-    group_class, left_out = (term.class_name or "").casefold(), left_out_of(term)
+    group_class, excluded_names = (term.class_name or "").casefold(), left_out_of(term)
     classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
     return [
         name
         for name, class_name in classes.items()
-        if name not in left_out
+        if name not in excluded_names
         and (term.class_name == ANY_CLASS or (class_name or "").casefold() == group_class)
     ]
 

@@ -101,15 +101,15 @@ def look_back(formulas: Sequence[Formula]) -> Reach:
 
 def tail(trace: Trace, reach: Reach) -> Trace:
     """Return the samples of a trace that the next sample may look back at (see `look_back`)."""
-    begin = len(trace) - max(reach.samples, reach.to_reports)
+    first_sample = len(trace) - max(reach.samples, reach.to_reports)
     if reach.duration_ns:
         # the next sample is later than the newest one, so it cannot look back further
         latest_ns = trace.times_ns[-1] - reach.duration_ns
-        begin = min(begin, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
-    recent = np.arange(max(begin, 0), len(trace))
+        first_sample = min(first_sample, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
+    recent_samples = np.arange(max(first_sample, 0), len(trace))
     if reach.to_reports:
-        recent = np.union1d(before_last_reports(trace), recent)
-    return trace.take(recent)
+        recent_samples = np.union1d(before_last_reports(trace), recent_samples)
+    return trace.take(recent_samples)
 
 
 class RecentSamples:
@@ -177,14 +177,14 @@ class TraceScene:
         self.trace = trace
         self.regions = regions
         self.skip = skip
-        self._column = {name: index for index, name in enumerate(trace.names)}
+        self._column_of_name = {name: index for index, name in enumerate(trace.names)}
         self._has_centres = False
-        self._moved: list[FootprintBatch] = []
+        self._moved_batches: list[FootprintBatch] = []
         self._joined_batch: FootprintBatch | None = None
-        self._moved_count = 0
+        self._moved_row_count = 0
         self._reports: dict[TrackedName | Signal, Reports] = {}
-        self._steps: dict[tuple[TrackedName | Variable | Group, ...], Floats] = {}
-        self._resolved: dict[Term, ResolvedTerm] = {}
+        self._step_seconds: dict[tuple[TrackedName | Variable | Group, ...], Floats] = {}
+        self._resolved_terms: dict[Term, ResolvedTerm] = {}
         self._members: dict[Group | Earlier, tuple[tuple[str, ...], Flags, Booleans]] = {}
 
     def __len__(self) -> int:
@@ -202,17 +202,19 @@ class TraceScene:
         If terms need them, the centres of all these follow, then moved footprints, each before its centre.
         """
         if not self._has_centres:
-            return self._whole
+            return self._base_batch
         if self._joined_batch is None:
-            self._joined_batch = FootprintBatch.concatenate([self._whole, self._centres, *self._moved])
+            self._joined_batch = FootprintBatch.concatenate(
+                [self._base_batch, self._centres, *self._moved_batches]
+            )
         return self._joined_batch
 
     @cached_property
     def _centres(self) -> FootprintBatch:
-        return centres_of(self._whole)
+        return centres_of(self._base_batch)
 
     @cached_property
-    def _whole(self) -> FootprintBatch:
+    def _base_batch(self) -> FootprintBatch:
         regions = [footprint_from_outline(outline) for outline in self.regions.values()]
         if not regions:
             return self.trace.footprints
@@ -248,20 +250,23 @@ class TraceScene:
         sources: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
         for term in step_of(rate).terms:
             sources += map(TrackedName, self._members_of(term)[0])
-        seconds = {name: float(self._reports_of(name).seconds[self.skip]) for name in sources}
-        moving = [name for name in sources if not isnan(seconds[name])]
-        if not moving:
+        step_seconds = {name: float(self._reports_of(name).seconds[self.skip]) for name in sources}
+        compared_sources = [name for name in sources if not isnan(step_seconds[name])]
+        if not compared_sources:
             return None
-        nearest = min(moving, key=seconds.__getitem__)
-        times_ns, previous_sample = self._reported_ns(nearest), self._reports_of(nearest).before[self.skip]
+        fastest_source = min(compared_sources, key=step_seconds.__getitem__)
+        times_ns, previous_sample = (
+            self._reported_ns(fastest_source),
+            self._reports_of(fastest_source).before[self.skip],
+        )
         return int(times_ns[previous_sample]), int(times_ns[self.skip])
 
     def _reported_ns(self, source: TrackedName | Signal) -> Integers:
         """Return the report times of an object or a signal in each sample, (T,) of the whole trace."""
         trace, reported_ns = self.trace, None
         if isinstance(source, TrackedName):
-            if trace.reported_ns is not None and source.name in self._column:
-                reported_ns = trace.reported_ns[:, self._column[source.name]]
+            if trace.reported_ns is not None and source.name in self._column_of_name:
+                reported_ns = trace.reported_ns[:, self._column_of_name[source.name]]
         elif not isinstance(source, ComputedSignal):
             reported_ns = trace.signals_reported_ns.get(source.name)
         return trace.times_ns if reported_ns is None else reported_ns
@@ -278,26 +283,26 @@ class TraceScene:
 
     def _step(self, terms: tuple[TrackedName | Variable | Group, ...]) -> Floats:
         """Return the shortest time between the last two reports of a term at each sample, (T,), seconds."""
-        if terms not in self._steps:
-            shortest = np.full(len(self.trace), np.inf)
+        if terms not in self._step_seconds:
+            shortest_s = np.full(len(self.trace), np.inf)
             for term in terms:
                 is_open = isinstance(term, Group) and term.is_open
                 for name, rows in zip(*self._members_of(term), strict=True):
                     seconds = self._reports_of(TrackedName(name)).seconds
-                    ignored = (rows == ABSENT) & is_open
+                    is_ignored = (rows == ABSENT) & is_open
                     if (
                         name in self.trace.lasting
                     ):  # an object that lasts stands still until it has two reports
-                        ignored |= (rows >= 0) & np.isnan(seconds)
-                    shortest = np.minimum(shortest, np.where(ignored, np.inf, seconds))
-            self._steps[terms] = np.where(np.isfinite(shortest), shortest, np.nan)
-        return self._steps[terms]
+                        is_ignored |= (rows >= 0) & np.isnan(seconds)
+                    shortest_s = np.minimum(shortest_s, np.where(is_ignored, np.inf, seconds))
+            self._step_seconds[terms] = np.where(np.isfinite(shortest_s), shortest_s, np.nan)
+        return self._step_seconds[terms]
 
     def resolve(self, term: Term) -> ResolvedTerm:
         """Resolve a term without variables."""
-        if term not in self._resolved:
-            self._resolved[term] = self._resolve(term)
-        return self._resolved[term]
+        if term not in self._resolved_terms:
+            self._resolved_terms[term] = self._resolve(term)
+        return self._resolved_terms[term]
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         """Return the names of all objects that are ever in an open group."""
@@ -319,100 +324,110 @@ class TraceScene:
         return self._members[group]
 
     def _find_members(self, group: Group | Earlier) -> tuple[tuple[str, ...], Flags, Booleans]:
-        base = open_group(group)
-        _, source = self._base_and_source(group)
-        names, rows = self._open_rows(base)
-        is_before_start = source < 0
-        present = (rows != ABSENT)[np.maximum(source, 0)] & ~is_before_start[:, None]
-        return names, present.astype(np.int8), is_before_start
+        group_now = open_group(group)
+        _, source_samples = self._base_and_source(group)
+        names, rows = self._open_rows(group_now)
+        is_before_start = source_samples < 0
+        is_member = (rows != ABSENT)[np.maximum(source_samples, 0)] & ~is_before_start[:, None]
+        return names, is_member.astype(np.int8), is_before_start
 
     def _resolve(self, term: Term) -> ResolvedTerm:
         if isinstance(term, Enlarged):
-            inner = self.resolve(term.term)
-            operand = Operand(inner.operand.rows, inner.operand.enlargement + term.radius)
-            return ResolvedTerm(operand, inner.unknown, inner.spread, inner.yaw)
+            inner_term = self.resolve(term.term)
+            operand = Operand(inner_term.operand.rows, inner_term.operand.enlargement + term.radius)
+            return ResolvedTerm(operand, inner_term.unknown, inner_term.spread, inner_term.yaw)
         if isinstance(term, Centre):
-            inner, self._has_centres = self.resolve(term.term), True
-            rows, row_count = inner.operand.rows, len(self._whole)
+            inner_term, self._has_centres = self.resolve(term.term), True
+            rows, row_count = inner_term.operand.rows, len(self._base_batch)
             # the row of a moved footprint precedes the row of its centre
             centres = np.where(rows < 2 * row_count, rows + row_count, rows + 1)
-            return replace(inner, operand=Operand(np.where(rows < 0, rows, centres)))
+            return replace(inner_term, operand=Operand(np.where(rows < 0, rows, centres)))
         if isinstance(term, Earlier) and term.rate:
             return self._moved_back(term)
-        base, source = self._base_and_source(term)
+        base, source_samples = self._base_and_source(term)
         if isinstance(base, RegionName):
-            return self._resolve_region(base, source < 0)
-        samples = np.maximum(source, 0) if isinstance(term, Earlier) else slice(self.skip, None)
+            return self._resolve_region(base, source_samples < 0)
+        samples = np.maximum(source_samples, 0) if isinstance(term, Earlier) else slice(self.skip, None)
         if isinstance(base, Group):
             is_open = base.members is None
             rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[samples]
             # an absent object is no member of an open group, but makes a named group unknown
-            unknown = (rows < (ABSENT if is_open else 0)).any(axis=1)
+            is_unknown = (rows < (ABSENT if is_open else 0)).any(axis=1)
         else:
             rows = self._rows_of(base.name)[samples, None]
-            unknown = rows[:, 0] < 0
-        return self._resolve_rows(rows, unknown | (source < 0))
+            is_unknown = rows[:, 0] < 0
+        return self._resolve_rows(rows, is_unknown | (source_samples < 0))
 
     def _moved_back(self, term: Earlier) -> ResolvedTerm:
         """Resolve a term at the time of the earlier report that a rate compares."""
-        shortest, columns, spreads = self._step(term.rate), [], []
-        for name, current in zip(*self._members_of(term.term), strict=True):
-            rows, spread = self._moved_rows(name, current, shortest)
-            columns.append(rows)
+        shortest_s, row_columns, spreads = self._step(term.rate), [], []
+        for name, current_rows in zip(*self._members_of(term.term), strict=True):
+            rows, spread = self._moved_rows(name, current_rows, shortest_s)
+            row_columns.append(rows)
             spreads.append(spread)
-        if not columns:
-            count = len(self)
-            empty = Operand(np.empty((count, 0), np.int64))
-            return ResolvedTerm(empty, np.zeros(count, np.bool_), np.zeros(count), np.full(count, np.nan))
-        rows = np.stack(columns, axis=1)[self.skip :]
+        if not row_columns:
+            sample_count = len(self)
+            no_operand = Operand(np.empty((sample_count, 0), np.int64))
+            return ResolvedTerm(
+                no_operand,
+                np.zeros(sample_count, np.bool_),
+                np.zeros(sample_count),
+                np.full(sample_count, np.nan),
+            )
+        rows = np.stack(row_columns, axis=1)[self.skip :]
         is_open = isinstance(term.term, Group) and term.term.is_open
-        unknown = np.asarray((rows < (ABSENT if is_open else 0)).any(axis=1))
+        is_unknown = np.asarray((rows < (ABSENT if is_open else 0)).any(axis=1))
         spread = np.stack(spreads, axis=1)[self.skip :].max(axis=1)
-        return ResolvedTerm(Operand(rows), unknown, spread, np.full(len(rows), np.nan))
+        return ResolvedTerm(Operand(rows), is_unknown, spread, np.full(len(rows), np.nan))
 
-    def _moved_rows(self, name: str, current: Integers, shortest: Floats) -> tuple[Integers, Floats]:
+    def _moved_rows(self, name: str, current_rows: Integers, shortest_s: Floats) -> tuple[Integers, Floats]:
         """Return the rows of an object moved back by its velocity, and their uncertainty.
 
         Args:
-            current: (T,), row of the object in each sample of the whole trace.
-            shortest: (T,), time by which the object is moved back, s.
+            current_rows: (T,), row of the object in each sample of the whole trace.
+            shortest_s: (T,), time by which the object is moved back, s.
         """
-        before, seconds = self._reports_of(TrackedName(name))
-        is_there, stands = current >= 0, np.isnan(seconds) & (name in self.trace.lasting)
-        before_rows = np.where(before < 0, ABSENT, self._rows_of(name)[before])
+        previous_samples, seconds = self._reports_of(TrackedName(name))
+        is_present, is_standing = current_rows >= 0, np.isnan(seconds) & (name in self.trace.lasting)
+        previous_rows = np.where(previous_samples < 0, ABSENT, self._rows_of(name)[previous_samples])
         # without an earlier report, the object is unknown
-        rows = np.where(is_there & ~stands, _NO_REPORT, current)
+        rows = np.where(is_present & ~is_standing, _NO_REPORT, current_rows)
         # row -1, for samples without the object, reads the appended 0
         uncertainty = np.append(self.trace.uncertainty, 0.0)
-        spread = np.where(is_there, uncertainty[np.where(is_there, current, -1)], 0.0)
-        is_previous = is_there & (seconds == shortest)
+        spread = np.where(is_present, uncertainty[np.where(is_present, current_rows, -1)], 0.0)
+        is_previous = is_present & (seconds == shortest_s)
         # the earlier report itself, so that a replay and a live run give the same bits
         rows[is_previous], spread[is_previous] = (
-            before_rows[is_previous],
-            uncertainty[before_rows[is_previous]],
+            previous_rows[is_previous],
+            uncertainty[previous_rows[is_previous]],
         )
-        between = np.flatnonzero(is_there & (seconds > shortest))
-        if len(between):
-            newer, older = current[between], before_rows[between]
-            rows[between] = self._add_moved_rows(newer, older, shortest[between] / seconds[between])
+        between_samples = np.flatnonzero(is_present & (seconds > shortest_s))
+        if len(between_samples):
+            newer_rows, older_rows = current_rows[between_samples], previous_rows[between_samples]
+            rows[between_samples] = self._add_moved_rows(
+                newer_rows, older_rows, shortest_s[between_samples] / seconds[between_samples]
+            )
             # between two reports, the greater uncertainty counts
-            spread[between] = np.maximum(uncertainty[newer], uncertainty[older])
+            spread[between_samples] = np.maximum(uncertainty[newer_rows], uncertainty[older_rows])
         return rows, spread
 
-    def _add_moved_rows(self, newer: Integers, older: Integers, share: Floats) -> Integers:
+    def _add_moved_rows(self, newer_rows: Integers, older_rows: Integers, fractions: Floats) -> Integers:
         """Add copies of newer rows, moved by a share of the way to older rows; return their row numbers."""
         # the joined batch has to include the new rows
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
         moved_batch = shift_rows(
-            self._whole.select(newer), (centres[older] - centres[newer]) * share[:, None]
+            self._base_batch.select(newer_rows),
+            (centres[older_rows] - centres[newer_rows]) * fractions[:, None],
         )
         # interleave the moved rows with their centres
-        pairs = np.arange(2 * len(newer)).reshape(2, -1).T.ravel()
-        self._moved.append(FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(pairs))
-        first = 2 * len(self._whole) + self._moved_count
-        self._moved_count += 2 * len(newer)
-        return np.asarray(first + 2 * np.arange(len(newer)), np.int64)
+        row_order = np.arange(2 * len(newer_rows)).reshape(2, -1).T.ravel()
+        self._moved_batches.append(
+            FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(row_order)
+        )
+        first_row = 2 * len(self._base_batch) + self._moved_row_count
+        self._moved_row_count += 2 * len(newer_rows)
+        return np.asarray(first_row + 2 * np.arange(len(newer_rows)), np.int64)
 
     def _members_of(
         self, term: TrackedName | Variable | RegionName | Group
@@ -432,35 +447,38 @@ class TraceScene:
             return term, samples
         if term.samples is not None:
             return term.term, np.asarray(np.maximum(samples - term.samples, -1), np.int64)
-        times = self.trace.times_ns
-        source_times = times[self.skip :] - (term.duration_ns or 0)
-        return term.term, np.searchsorted(times, source_times, side="right").astype(np.int64) - 1
+        times_ns = self.trace.times_ns
+        source_times_ns = times_ns[self.skip :] - (term.duration_ns or 0)
+        return term.term, np.searchsorted(times_ns, source_times_ns, side="right").astype(np.int64) - 1
 
-    def _resolve_rows(self, rows: Integers, unknown: Booleans) -> ResolvedTerm:
+    def _resolve_rows(self, rows: Integers, is_unknown: Booleans) -> ResolvedTerm:
         is_present = rows >= 0
-        places = np.maximum(rows, 0)
+        safe_rows = np.maximum(rows, 0)
         if len(self.trace.uncertainty) and is_present.shape[1]:
             spread = (
                 np.zeros(len(rows))
                 if self.is_sure
-                else np.where(is_present, self.trace.uncertainty[places], 0.0).max(axis=1)
+                else np.where(is_present, self.trace.uncertainty[safe_rows], 0.0).max(axis=1)
             )
-            yaw = np.where(is_present[:, 0], self.trace.yaw[places[:, 0]], np.nan)
+            yaw = np.where(is_present[:, 0], self.trace.yaw[safe_rows[:, 0]], np.nan)
         else:
             spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
-        return ResolvedTerm(Operand(rows), unknown, spread, yaw)
+        return ResolvedTerm(Operand(rows), is_unknown, spread, yaw)
 
-    def _resolve_region(self, region: RegionName, unknown: Booleans) -> ResolvedTerm:
+    def _resolve_region(self, region: RegionName, is_unknown: Booleans) -> ResolvedTerm:
         row = len(self.trace.footprints) + list(self.regions).index(region.name)
-        count = len(self)
+        sample_count = len(self)
         return ResolvedTerm(
-            Operand(np.full((count, 1), row, np.int64)), unknown, np.zeros(count), np.full(count, np.nan)
+            Operand(np.full((sample_count, 1), row, np.int64)),
+            is_unknown,
+            np.zeros(sample_count),
+            np.full(sample_count, np.nan),
         )
 
     def _rows_of(self, name: str) -> Integers:
         """Return an object's row in each sample of the whole trace, (T,); `ABSENT` for an unknown name."""
-        if name in self._column:
-            return self.trace.rows[:, self._column[name]]
+        if name in self._column_of_name:
+            return self.trace.rows[:, self._column_of_name[name]]
         return np.full(len(self.trace), ABSENT, np.int64)
 
     def _named_rows(self, group: Group) -> Integers:
@@ -471,21 +489,25 @@ class TraceScene:
 
     def _open_rows(self, group: Group) -> tuple[tuple[str, ...], Integers]:
         """Return possible members and their rows in the whole trace, `ABSENT` for non-members."""
-        left_out = left_out_of(group)
-        names = tuple(name for name in self.trace.names if name not in left_out)
-        rows = self.trace.rows[:, [self._column[name] for name in names]]
+        excluded_names = left_out_of(group)
+        names = tuple(name for name in self.trace.names if name not in excluded_names)
+        rows = self.trace.rows[:, [self._column_of_name[name] for name in names]]
         if group.class_name == ANY_CLASS or not names:
             return names, rows
         group_class = (group.class_name or "").casefold()
-        fits = np.array([(name or "").casefold() == group_class for name in self.trace.classes], np.bool_)
+        is_fitting_class = np.array(
+            [(name or "").casefold() == group_class for name in self.trace.classes], np.bool_
+        )
         # a row below `ABSENT` stands for observation -2 - row, an object with unknown position
         observation = np.where(rows < ABSENT, -2 - rows, np.maximum(rows, 0))
         if len(self.trace.class_code) == 0:
             return names, rows
-        is_member = (rows != ABSENT) & fits[self.trace.class_code[observation]]
-        ever = is_member.any(axis=0)
-        member_names = tuple(name for name, is_kept in zip(names, ever.tolist(), strict=True) if is_kept)
-        return member_names, np.where(is_member, rows, ABSENT)[:, ever]
+        is_member = (rows != ABSENT) & is_fitting_class[self.trace.class_code[observation]]
+        is_ever_member = is_member.any(axis=0)
+        member_names = tuple(
+            name for name, is_ever in zip(names, is_ever_member.tolist(), strict=True) if is_ever
+        )
+        return member_names, np.where(is_member, rows, ABSENT)[:, is_ever_member]
 
 
 def footprint_from_outline(outline: Outline) -> Footprint:

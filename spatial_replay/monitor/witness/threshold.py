@@ -75,12 +75,12 @@ class Dial:
         """Choose the first written number of the deciding branch; else its first radius; else the margin."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
-        parts = [part for _, part in deciding.branch]
-        numbers = [part.value for part in parts if isinstance(part, Number)]
+        branch_parts = [part for _, part in deciding.branch]
+        numbers = [part.value for part in branch_parts if isinstance(part, Number)]
         for number in numbers:
             if number in atom.parameters:
                 return cls("number", number, is_exact)
-        for radius in (radius for part in parts for radius in _radii(part)):
+        for radius in (radius for part in branch_parts for radius in _radii(part)):
             return cls("radius", radius, is_exact)
         return cls("margin", 0.0, is_exact)
 
@@ -132,8 +132,8 @@ class Dial:
             case Number():
                 return {int(self.is_at("number", expression.value))}
             case Sum():
-                first, second = self.slopes(expression.first), self.slopes(expression.second)
-                return {a + b for a in first for b in second}
+                first_slopes, second_slopes = self.slopes(expression.first), self.slopes(expression.second)
+                return {a + b for a in first_slopes for b in second_slopes}
             case Negative():
                 return {-slope for slope in self.slopes(expression.operand)}
             case Product(factor, operand):
@@ -184,9 +184,11 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
         case Quantified():
             yield from _signed_atoms(formula.body, signs)
         case Boolean() | Temporal():
-            for place, operand in enumerate(formula.operands):
+            for operand_index, operand in enumerate(formula.operands):
                 operand_signs_below = {
-                    sign * sign_below for sign in signs for sign_below in operand_signs(formula, place)
+                    sign * sign_below
+                    for sign in signs
+                    for sign_below in operand_signs(formula, operand_index)
                 }
                 yield from _signed_atoms(operand, frozenset(operand_signs_below))
 
@@ -300,53 +302,72 @@ class _Search:
         self._evaluate = evaluate_prefix if goes_on else evaluate_offline
         self._verdict_of = online_verdict if goes_on else final_verdict
         self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
-        self._leaves, self._times, self._node = leaves, times_ns, node
+        self._leaves, self._times_ns, self._node = leaves, times_ns, node
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
-        slopes = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
+        slopes_by_expression = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
         # slopes come from the formula, because equal leaves share an index wherever they are written
-        self._moving: dict[int, Atom | Quantified] = {}
+        self._moving_leaves: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
-            bare = _bare(leaf)
-            if bare is not None and (atom_slopes := slopes.get(bare[0].expression)):
-                self._moving[index], self._slopes[index] = leaf, bare[1] * max(atom_slopes)
-        bodies = [part for part in iter_formulas(self._formula) if isinstance(part, Quantified)]
+            bare_atom_and_sign = _bare(leaf)
+            if bare_atom_and_sign is not None and (
+                atom_slopes := slopes_by_expression.get(bare_atom_and_sign[0].expression)
+            ):
+                self._moving_leaves[index], self._slopes[index] = (
+                    leaf,
+                    bare_atom_and_sign[1] * max(atom_slopes),
+                )
+        quantifiers = [part for part in iter_formulas(self._formula) if isinstance(part, Quantified)]
         # only a quantifier over a single atom shifts with it; with radii, a prism's height may decide
         self._is_uniform = (
-            all(len(atom_slopes) == 1 for atom_slopes in slopes.values())
+            all(len(atom_slopes) == 1 for atom_slopes in slopes_by_expression.values())
             and not any(
-                self._is_meant(atom) for body in bodies if not _bare(body) for atom in iter_atoms(body)
+                self._is_meant(atom)
+                for quantifier in quantifiers
+                if not _bare(quantifier)
+                for atom in iter_atoms(quantifier)
             )
             and not any(
-                dial.is_at("radius", radius) for expression in slopes for radius in _radii_in(expression)
+                dial.is_at("radius", radius)
+                for expression in slopes_by_expression
+                for radius in _radii_in(expression)
             )
         )
         signs = {
             math.copysign(1.0, sign * slope)
             for atom, sign in _signed_atoms(nodes_of(self._formula)[node])
             if self._is_meant(atom)
-            for slope in slopes[atom.expression]
+            for slope in slopes_by_expression[atom.expression]
             if slope
         }
         # a violated formula has to rise, a satisfied one to fall
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
         low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
-        end = abs(high if verdict is Verdict.VIOLATED else low)
-        steepest = max((abs(slope) for atom_slopes in slopes.values() for slope in atom_slopes), default=0.0)
+        distance_from_flip = abs(high if verdict is Verdict.VIOLATED else low)
+        steepest_slope = max(
+            (abs(slope) for atom_slopes in slopes_by_expression.values() for slope in atom_slopes),
+            default=0.0,
+        )
         # robustness changes by at most the slope
-        self._least = end / steepest if steepest and math.isfinite(end) else 0.0
+        self._least_change = (
+            distance_from_flip / steepest_slope
+            if steepest_slope and math.isfinite(distance_from_flip)
+            else 0.0
+        )
 
     def threshold(self) -> Threshold | None:
         """Return the nearest number that flips the verdict, or None."""
         dial = self._dial
-        nearest = [number for side in self._directions if (number := self._nearest(side)) is not None]
-        for number in sorted(nearest, key=lambda number: abs(number - dial.value)):
+        flipping_numbers = [
+            number for side in self._directions if (number := self._nearest(side)) is not None
+        ]
+        for number in sorted(flipping_numbers, key=lambda number: abs(number - dial.value)):
             candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
             # one of the first two nearly always flips it, and each number costs a measurement of all bindings
-            for batch in filter(None, (candidates[:2], candidates[2:])):
-                verdicts = self._verdicts(batch, is_shifted=False)
-                for candidate, verdict in zip(batch, verdicts, strict=True):
+            for candidate_batch in filter(None, (candidates[:2], candidates[2:])):
+                verdicts = self._verdicts(candidate_batch, is_shifted=False)
+                for candidate, verdict in zip(candidate_batch, verdicts, strict=True):
                     if self._is_flipped(verdict):
                         is_exact = dial.is_exact or len(self._directions) > 1
                         is_written = dial.kind != "margin"
@@ -375,10 +396,10 @@ class _Search:
 
     def obstacle(self) -> Obstacle:
         """Return why no number flips the verdict; the atom is shifted by `_FAR` to find out."""
-        far = _FAR if self._deciding.end is End.HIGH else -_FAR
+        far_shift = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
-            return replace(atom, expression=Sum(atom.expression, Number(far)))
+            return replace(atom, expression=Sum(atom.expression, Number(far_shift)))
 
         formula = self._change_atoms(change)
         added_leaves = new_leaves(formula, self._order)
@@ -396,8 +417,8 @@ class _Search:
 
     def _nearest(self, direction: float) -> float | None:
         """Return a number just beyond the nearest one in a direction that flips the verdict."""
-        find = self._size_by_samples if self._is_uniform else self._size_by_rounds
-        size = find(direction)
+        find_size = self._size_by_samples if self._is_uniform else self._size_by_rounds
+        size = find_size(direction)
         return None if size is None else self._number_beyond(size, direction)
 
     def _size_by_samples(self, direction: float) -> float | None:
@@ -405,23 +426,23 @@ class _Search:
 
         Robustness is the shifted number of one sample, so only one change per sample is tried.
         """
-        moves = [
+        changes = [
             -direction * self._leaves[:, index].ravel() / slope
             for index, slope in self._slopes.items()
             if slope
         ]
-        sizes = np.sort(np.concatenate(moves))
+        sizes = np.sort(np.concatenate(changes))
         # the tolerance includes the deciding sample, whose quotient may be rounded down
-        sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
-        candidates = np.concatenate([[self._least], sizes])
+        sizes = sizes[np.isfinite(sizes) & (sizes >= self._least_change * (1.0 - 1e-9))]
+        candidates = np.concatenate([[self._least_change], sizes])
 
         def flips(size: float) -> bool:
             return self._flips([size], direction)[0]
 
         begin, stop = 0, len(candidates)
-        step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
+        stride = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
         # the first candidate that flips the verdict ends an interval, which is bisected
-        for end in (0, *range(step, stop, step), stop - 1):
+        for end in (0, *range(stride, stop, stride), stop - 1):
             if flips(candidates[end]):
                 return float(candidates[bisect_left(candidates, True, begin, end, key=flips)])
             begin = end + 1
@@ -429,22 +450,22 @@ class _Search:
 
     def _size_by_rounds(self, direction: float) -> float | None:
         # sizes double from the least change that can flip, which may be 0
-        unit = max(self._least, 1e-6 * (abs(self._dial.value) + 1.0))
-        sizes = [self._least, *(unit * 2.0**k for k in range(1, _DOUBLINGS))]
+        first_size = max(self._least_change, 1e-6 * (abs(self._dial.value) + 1.0))
+        sizes = [self._least_change, *(first_size * 2.0**exponent for exponent in range(1, _DOUBLINGS))]
         for _ in range(_ROUNDS):
-            flips = self._flips(sizes, direction)
-            if not any(flips):
+            is_flipping = self._flips(sizes, direction)
+            if not any(is_flipping):
                 return None
-            if flips[0]:
+            if is_flipping[0]:
                 return sizes[0]
-            first = flips.index(True)
-            sizes = np.linspace(sizes[first - 1], sizes[first], _PARTS + 1).tolist()
+            first_flip = is_flipping.index(True)
+            sizes = np.linspace(sizes[first_flip - 1], sizes[first_flip], _PARTS + 1).tolist()
         return sizes[-1]
 
     def _flips(self, sizes: Sequence[float], direction: float) -> list[bool]:
         numbers = [self._number_beyond(size, direction) for size in sizes]
-        possible = [number for number in numbers if self._is_possible(number)]
-        verdicts = dict(zip(possible, self._verdicts(possible), strict=True))
+        possible_numbers = [number for number in numbers if self._is_possible(number)]
+        verdicts = dict(zip(possible_numbers, self._verdicts(possible_numbers), strict=True))
         return [self._is_flipped(verdicts.get(number, self._verdict)) for number in numbers]
 
     def _number_beyond(self, size: float, direction: float) -> float:
@@ -471,8 +492,8 @@ class _Search:
             ]
         elif numbers:
             all_columns = self._columns([leaf for leaves in added_leaves for leaf in leaves])
-            ends = np.cumsum([0, *map(len, added_leaves)]).tolist()
-            columns = [all_columns[:, begin:end] for begin, end in pairwise(ends)]
+            column_ends = np.cumsum([0, *map(len, added_leaves)]).tolist()
+            columns = [all_columns[:, begin:end] for begin, end in pairwise(column_ends)]
         else:
             columns = []
         return [
@@ -486,10 +507,14 @@ class _Search:
         """
         if self._dial.constant:
             return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
-        meant = self._deciding.atom
-        if meant.span.start == meant.span.end:
-            return atom.expression == meant.expression
-        return (atom.span, atom.relation, atom.parameters) == (meant.span, meant.relation, meant.parameters)
+        deciding_atom = self._deciding.atom
+        if deciding_atom.span.start == deciding_atom.span.end:
+            return atom.expression == deciding_atom.expression
+        return (atom.span, atom.relation, atom.parameters) == (
+            deciding_atom.span,
+            deciding_atom.relation,
+            deciding_atom.parameters,
+        )
 
     def _formula_at(self, number: float) -> Formula:
         return self._change_atoms(lambda atom: self._atom_at(atom, number))
@@ -500,23 +525,25 @@ class _Search:
     def _atom_at(self, atom: Atom, number: float) -> Atom:
         return replace(atom, expression=self._dial.turn(atom.expression, number))
 
-    def _shift_columns(self, added: Sequence[Formula], number: float) -> Floats:
+    def _shift_columns(self, added_leaves: Sequence[Formula], number: float) -> Floats:
         """Return the columns of atoms with the dial at a number, by shifts of the original columns."""
-        indices = {
+        index_of_key = {
             leaf_key(rewritten(leaf, lambda atom: self._atom_at(atom, number))): index
-            for index, leaf in self._moving.items()
+            for index, leaf in self._moving_leaves.items()
         }
-        places = [indices[leaf_key(leaf)] for leaf in added]
-        shifts = [self._slopes[index] * (number - self._dial.value) for index in places]
-        shifted: Floats = self._leaves[:, places] + np.array(shifts).reshape(1, -1, 1)
-        return shifted
+        leaf_indices = [index_of_key[leaf_key(leaf)] for leaf in added_leaves]
+        shifts = [self._slopes[index] * (number - self._dial.value) for index in leaf_indices]
+        shifted_columns: Floats = self._leaves[:, leaf_indices] + np.array(shifts).reshape(1, -1, 1)
+        return shifted_columns
 
     def _columns(self, formulas: Sequence[Formula]) -> Floats:
-        return self._evidence.columns(formulas)[:, :, : len(self._times)]
+        return self._evidence.columns(formulas)[:, :, : len(self._times_ns)]
 
-    def _verdict_with(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
-        leaves = joined_channels([self._leaves, columns], axis=1)
-        nodes = self._evaluate(formula, (*self._order, *added), leaves, self._times)
+    def _verdict_with(
+        self, formula: Formula, added_leaves: Sequence[Atom | Quantified], columns: Floats
+    ) -> Verdict:
+        all_leaves = joined_channels([self._leaves, columns], axis=1)
+        nodes = self._evaluate(formula, (*self._order, *added_leaves), all_leaves, self._times_ns)
         return self._verdict_of(*nodes.interval(self._node))
 
 
@@ -547,8 +574,8 @@ def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
     # a term enlarged by the margin, if that shifts every branch by the same amount
     radius, slope = abs(margin), -math.copysign(1.0, margin)
     dial = Dial("radius", radius, is_exact=False)
-    for place in range(len(atom.terms)):
-        variant = partial(_enlarge_term, place=place, radius=radius)
+    for term_index in range(len(atom.terms)):
+        variant = partial(_enlarge_term, term_index=term_index, radius=radius)
         if dial.slopes(variant(atom).expression) == {slope}:
             yield variant
 
@@ -563,12 +590,12 @@ def _with_summand(atom: Atom, margin: float) -> Atom:
     """Return `x >= y` as `x >= y + margin`."""
     if not isinstance(atom.expression, Sum) or not isinstance(atom.expression.second, Negative):
         raise TypeError(f"{atom.text} is no comparison of computed numbers")
-    first, second = atom.expression.first, atom.expression.second.operand
+    left_side, right_side = atom.expression.first, atom.expression.second.operand
     if str(atom.parameters[0]).startswith(">"):
-        second = _plus(second, margin)
+        right_side = _plus(right_side, margin)
     else:
-        first = _plus(first, -margin)
-    return replace(atom, expression=Sum(first, Negative(second)))
+        left_side = _plus(left_side, -margin)
+    return replace(atom, expression=Sum(left_side, Negative(right_side)))
 
 
 def _plus(expression: Expression, number: float) -> Expression:
@@ -576,29 +603,35 @@ def _plus(expression: Expression, number: float) -> Expression:
     return Sum(expression, summand if number >= 0.0 else Negative(summand))
 
 
-def _enlarge_term(atom: Atom, place: int, radius: float) -> Atom:
+def _enlarge_term(atom: Atom, term_index: int, radius: float) -> Atom:
     """Return an atom with one of its terms enlarged."""
-    enlarged = Enlarged(atom.terms[place], radius)
+    enlarged_term = Enlarged(atom.terms[term_index], radius)
 
     def leaf(part: Number | Signal | Measurement) -> Expression:
         if not isinstance(part, Measurement):
             return part
-        return part.with_terms(*(enlarged if term == enlarged.term else term for term in part.terms))
+        return part.with_terms(
+            *(enlarged_term if term == enlarged_term.term else term for term in part.terms)
+        )
 
-    terms = (*atom.terms[:place], enlarged, *atom.terms[place + 1 :])
+    terms = (*atom.terms[:term_index], enlarged_term, *atom.terms[term_index + 1 :])
     return replace(atom, expression=map_leaves(atom.expression, leaf), terms=terms)
 
 
 def _short_numbers(number: float, value: float) -> Iterator[float]:
     """Iterate over short numbers near `number`, or beyond it as seen from `value`, then `number` itself."""
-    exact, change = Decimal(number), Decimal(number) - Decimal(value)
+    exact_number, change = Decimal(number), Decimal(number) - Decimal(value)
     rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
     # a number near 0 may be rounding error: then the digits of the change count
-    leading = change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact
-    last_digit = min(leading.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
-    for place in (last_digit, last_digit - DIGITS):
+    digit_source = (
+        change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact_number
+    )
+    last_digit = min(digit_source.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
+    for decimal_place in (last_digit, last_digit - DIGITS):
         # the nearest short number may not flip the verdict; the one beyond does
         for rounding in (ROUND_HALF_EVEN, rounding_away):
-            rounded = exact.quantize(Decimal(1).scaleb(place), context=Context(_PRECISION, rounding))
-            yield float(rounded) + 0.0
+            short_number = exact_number.quantize(
+                Decimal(1).scaleb(decimal_place), context=Context(_PRECISION, rounding)
+            )
+            yield float(short_number) + 0.0
     yield number

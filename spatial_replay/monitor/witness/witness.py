@@ -191,29 +191,31 @@ def find_witness(
     verdict = verdict_of(lower, upper)
     end = End.of(verdict)
     path = deciding_path(nodes, node, end)
-    steps, deciding = _steps(evidence, nodes, path), atom_of_path(evidence, nodes, path, evidence.scene)
+    steps, decisive_atom = _steps(evidence, nodes, path), atom_of_path(evidence, nodes, path, evidence.scene)
     at_ns = steps[-1].time_ns
     gaps: tuple[Gap, ...] = ()
-    if deciding is not None and deciding.unknown:
-        gaps = evidence.gaps(deciding.atom, at_ns)
+    if decisive_atom is not None and decisive_atom.unknown:
+        gaps = evidence.gaps(decisive_atom.atom, at_ns)
         # everything is missing in a pause, so the pause is the reason
         if any(gap.name is None and gap.longest_ns[0] <= at_ns < gap.longest_ns[1] for gap in gaps):
-            deciding = replace(deciding, unknown=("the samples pause there",))
+            decisive_atom = replace(decisive_atom, unknown=("the samples pause there",))
     while_present = None
-    if verdict is Verdict.UNKNOWN and deciding is not None and deciding.unknown and not goes_on:
+    if verdict is Verdict.UNKNOWN and decisive_atom is not None and decisive_atom.unknown and not goes_on:
         while_present = _while_present(evidence, leaves, times_ns, node, path)
 
     def flip(atom: DecidingAtom) -> Threshold | Obstacle | None:
         # no samples follow a whole log
-        samples, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
-        return threshold_of(evidence, *samples, node, verdict, atom, goes_on=open_ended)
+        leaves_and_times, may_continue = (
+            (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
+        )
+        return threshold_of(evidence, *leaves_and_times, node, verdict, atom, goes_on=may_continue)
 
-    threshold = flip(deciding) if deciding is not None and flips else None
+    threshold = flip(decisive_atom) if decisive_atom is not None and flips else None
     has_open_end = end is not End.OPEN and lower < upper and not goes_on
-    missed, closest, closest_path = _NOTHING_MISSED
+    missed, closest_atom, closest_path = _NOTHING_MISSED
     if verdict is Verdict.VIOLATED:
-        missed, closest, closest_path = find_missed_response(evidence, nodes, path, evidence.scene)
-    response_threshold = flip(closest[0]) if closest is not None and flips else None
+        missed, closest_atom, closest_path = find_missed_response(evidence, nodes, path, evidence.scene)
+    response_threshold = flip(closest_atom[0]) if closest_atom is not None and flips else None
     return Witness(
         instance.name,
         instance.object,
@@ -221,14 +223,14 @@ def find_witness(
         lower,
         upper,
         steps,
-        deciding,
+        decisive_atom,
         threshold if isinstance(threshold, Threshold) else None,
         None if isinstance(threshold, Threshold) else threshold,
         _open_end(evidence, nodes, node, end.turned) if has_open_end else None,
         int(times_ns[-1]) if goes_on else None,
         missed,
         gaps,
-        closest,
+        closest_atom,
         () if closest_path is None else _steps(evidence, nodes, closest_path),
         evidence.units,
         declared_unit(evidence.bound(nodes.tree[node][0]), evidence.units),
@@ -242,10 +244,10 @@ def _open_end(
 ) -> tuple[DecidingAtom, int] | None:
     """Return the atom that leaves an end of a node's interval open, and its time; None if none does."""
     path = deciding_path(nodes, node, end)
-    deciding = atom_of_path(evidence, nodes, path, evidence.scene)
-    if deciding is None or deciding.lower == deciding.upper:
+    decisive_atom = atom_of_path(evidence, nodes, path, evidence.scene)
+    if decisive_atom is None or decisive_atom.lower == decisive_atom.upper:
         return None
-    return deciding, int(nodes.times_ns[path.steps[-1].sample])
+    return decisive_atom, int(nodes.times_ns[path.steps[-1].sample])
 
 
 SceneAt: TypeAlias = Callable[[int], TraceScene]
@@ -285,12 +287,14 @@ def find_missed_response(
     evidence: Evidence, nodes: OfflineNodes, path: DecidingPath, scene_at: SceneAt
 ) -> MissedWitness:
     """Return the missed response on the path of a violated formula."""
-    missed, nearest = missed_response(path, nodes, evidence.instance.bindings)
+    missed, closest_path = missed_response(path, nodes, evidence.instance.bindings)
     if missed is not None:
-        best = None if nearest is None else atom_of_path(evidence, nodes, nearest, scene_at)
-        if nearest is None or best is None or best.unknown:
+        closest_atom = None if closest_path is None else atom_of_path(evidence, nodes, closest_path, scene_at)
+        if closest_path is None or closest_atom is None or closest_atom.unknown:
             return MissedWitness(missed)
-        return MissedWitness(missed, (best, int(nodes.times_ns[nearest.steps[-1].sample])), nearest)
+        return MissedWitness(
+            missed, (closest_atom, int(nodes.times_ns[closest_path.steps[-1].sample])), closest_path
+        )
     step = path.steps[-1]
     leaf, at_ns = evidence.bound(nodes.tree[step.node][0]), int(nodes.times_ns[step.sample])
     if not isinstance(leaf, Quantified):
@@ -302,8 +306,10 @@ def find_missed_response(
         return _NOTHING_MISSED
     condition, response, is_condition = implication
     missed = MissedResponse(short_title(condition), short_title(response), at_ns, is_condition)
-    best = deciding_atom(scene, response, End.HIGH) if is_condition else None
-    return MissedWitness(missed, None if best is None or best.unknown else (best, at_ns))
+    closest_atom = deciding_atom(scene, response, End.HIGH) if is_condition else None
+    return MissedWitness(
+        missed, None if closest_atom is None or closest_atom.unknown else (closest_atom, at_ns)
+    )
 
 
 def _steps(evidence: Evidence, nodes: OfflineNodes, path: DecidingPath) -> tuple[WitnessStep, ...]:
@@ -320,34 +326,36 @@ def _while_present(
     instance, bindings = evidence.instance, evidence.instance.bindings
     formula, order = instance.formula, instance.program.leaves
     nodes = nodes_of(formula)
-    operators = [step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")]
-    objects = dict.fromkeys(map(base_of, iter_terms([nodes[path.steps[-1].node]])))
+    operator_nodes = [
+        step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")
+    ]
+    base_terms = dict.fromkeys(map(base_of, iter_terms([nodes[path.steps[-1].node]])))
     terms = [
         term
-        for term in objects
+        for term in base_terms
         if isinstance(term, TrackedName) or (isinstance(term, Variable) and term.name in bindings)
     ]
-    if not operators or not terms:
+    if not operator_nodes or not terms:
         return None
     conditions = [Atom(presence.signal.name, "present", presence) for presence in map(presence_of, terms)]
-    columns = evidence.columns(conditions)[:, :, : len(times_ns)]
-    absent = [place for place in range(len(terms)) if (columns[0, place] < 0.0).any()]
-    if not absent or any((columns[0, place] < 0.0).all() for place in absent):
+    presence_columns = evidence.columns(conditions)[:, :, : len(times_ns)]
+    absent_indices = [index for index in range(len(terms)) if (presence_columns[0, index] < 0.0).any()]
+    if not absent_indices or any((presence_columns[0, index] < 0.0).all() for index in absent_indices):
         return None
-    condition = Boolean("and", tuple(conditions[place] for place in absent))
-    operator = nodes[operators[-1]]
+    condition = Boolean("and", tuple(conditions[index] for index in absent_indices))
+    operator = nodes[operator_nodes[-1]]
     connective: BooleanOperator = "->" if operator_of(operator) in ("G", "H") else "and"
 
     body = Boolean(connective, (condition, *operands_of(operator)))
-    guarded_formula = with_operands(formula, operators[-1], (body,))
-    all_leaves = joined_channels([leaves, columns], axis=1)
-    evaluated = evaluate_offline(guarded_formula, (*order, *conditions), all_leaves, times_ns)
+    guarded_formula = with_operands(formula, operator_nodes[-1], (body,))
+    all_leaves = joined_channels([leaves, presence_columns], axis=1)
+    guarded_nodes = evaluate_offline(guarded_formula, (*order, *conditions), all_leaves, times_ns)
     # nodes before the operator and around it keep their ids
-    verdict = final_verdict(*evaluated.interval(node))
+    verdict = final_verdict(*guarded_nodes.interval(node))
     if verdict is Verdict.UNKNOWN:
         return None
-    condition_text = " and ".join(conditions[place].text for place in absent)
-    names = tuple(bindings.get(terms[place].name, terms[place]).name for place in absent)
+    condition_text = " and ".join(conditions[index].text for index in absent_indices)
+    names = tuple(bindings.get(terms[index].name, terms[index]).name for index in absent_indices)
     return WhilePresent(names, f"{title_of(operator)} ({condition_text} {connective} …)", verdict)
 
 
@@ -364,16 +372,20 @@ def time_of_least(
     nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
     path = deciding_path(nodes, node, End.HIGH)
     # the number depends on all samples of its path
-    earliest = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
+    earliest_sample = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
 
     def is_reached(sample: int) -> bool:
-        until = slice(sample + 1)
-        prefix = evaluate_prefix(instance.formula, order, leaves[..., until], times_ns[until])
-        return bool(prefix.ends(node)[1][0] <= least)
+        prefix_slice = slice(sample + 1)
+        prefix_nodes = evaluate_prefix(
+            instance.formula, order, leaves[..., prefix_slice], times_ns[prefix_slice]
+        )
+        return bool(prefix_nodes.ends(node)[1][0] <= least)
 
     # the samples up to the deciding one mostly suffice: one evaluation instead of a search
-    later = range(earliest, earliest if is_reached(earliest) else len(times_ns) - 1)
-    return int(times_ns[earliest + bisect_left(later, True, key=is_reached)])
+    later_samples = range(
+        earliest_sample, earliest_sample if is_reached(earliest_sample) else len(times_ns) - 1
+    )
+    return int(times_ns[earliest_sample + bisect_left(later_samples, True, key=is_reached)])
 
 
 def _step(step: PathNode, formula: Formula, times_ns: Integers) -> WitnessStep:
