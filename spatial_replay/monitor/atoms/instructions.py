@@ -1,12 +1,13 @@
 """Leaves (atoms and open quantifiers) compiled to instructions over columns of samples.
 
-Each instruction writes one column in every channel (see `online.codes`). It computes it from earlier columns,
-or reads measurements, signals and constants.
+Each instruction writes one column in every channel (see `online.codes`). It computes the column from earlier
+columns, measurements, signals or constants.
 
 For some quantifiers, only the closest two members of a group are measured.
-`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. Its body
-depends only on the distance of p and q, and falls with it, so the closest pair gives the least value.
-Likewise, it gives the greatest value for `exists p, q` with a body that rises as the distance falls.
+`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. The body
+depends only on the distance of p and q, and falls with the distance, so the closest pair has the least value.
+Likewise, the closest pair has the greatest value for `exists p, q` with a body that rises as the distance
+falls.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class ClosestPair:
     """The signed distance of the closest two members of an open group.
 
     Attributes:
-        enlargement: enlargement of both members together, in footprint units.
+        enlargement: sum of the enlargements of both members, in footprint units.
     """
 
     group: Group
@@ -84,7 +85,10 @@ def closest_pair_of(formula: Quantified) -> ClosestPair | None:
 
 
 def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | None:
-    """Return the closest pair that decides a quantifier, and the quantifier's number as a function of it."""
+    """Return the closest pair that decides a quantifier, and the quantifier's robustness as an expression.
+
+    The expression contains the pair instead of the distance. The result is None for other quantifiers.
+    """
     body, sign = formula.body, 1 if formula.quantifier == "forall" else -1
     is_negated = False
     while isinstance(body, Boolean) and body.operator == "not":
@@ -133,7 +137,7 @@ def _enlargement(leaf: Expression, variables: tuple[str, ...]) -> float | None:
 
 
 def _variable_and_radius(term: Term) -> tuple[str | None, float]:
-    """Return the name and the enlargement of a variable; name None for other terms."""
+    """Return the name and the enlargement of a variable. The name is None for other terms."""
     match term:
         case Enlarged(inner, radius):
             name, inner_radius = _variable_and_radius(inner)
@@ -143,15 +147,15 @@ def _variable_and_radius(term: Term) -> tuple[str | None, float]:
     return None, 0.0
 
 
-# operations of instructions (operation, a, b, c); a number is NaN where it is undefined
+# operations of instructions (operation, a, b, c); an undefined number is NaN
 CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # constant, measurement or signal a
 ADD, NEGATE, LEAST, GREATEST = 3, 4, 5, 6  # of numbers; NaN where an operand is NaN
 HOLDS = 7  # a number as an interval: [-inf, inf] where it is NaN
 AND, OR = 8, 9  # of intervals
-AND_MEMBER, OR_MEMBER = 10, 11  # a, joined with b where membership c is 1, with [-inf, inf] where -1
+AND_MEMBER, OR_MEMBER = 10, 11  # a with b where membership c is 1, with [-inf, inf] where it is -1
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
-EQUAL = 14  # signal a and constant b: +inf or -inf; NaN where only one of them is a text, or a is missing
+EQUAL = 14  # +inf or -inf for signal a and constant b; NaN for a missing signal, or a text and a number
 QUOTIENT = 15  # a by b, which is positive and equal in all channels
 HAS_VALUE = 16  # +inf where a is a number, else -inf; NaN where b is NaN
 MULTIPLY = 17  # a by constant b, which is positive
@@ -194,7 +198,7 @@ def run_instructions(
     Args:
         code: four numbers for each instruction.
         values, spreads, signals, closest, members: rows of T numbers each; four rows per closest pair.
-        outputs: number of the instruction that computes leaf j, for each j.
+        outputs: (A,), number of the instruction that computes each leaf.
         leaves: (C, A, T), output.
     """
     channel_count, sample_count, instruction_count = leaves.shape[0], leaves.shape[2], len(code) // 4
@@ -211,13 +215,13 @@ def run_instructions(
             input_index, member_index = a * sample_count + tile_start, c * sample_count + tile_start
             for channel in range(channel_count):
                 mirror_channel = channel ^ 1 if channel_count > 1 else channel
-                # rows are indexed, because slicing an array takes as long as ten samples
+                # rows are indexed, because a slice of an array takes as long as ten samples
                 target_row, mirror_row = (
                     instruction * channel_count + channel,
                     a * channel_count + mirror_channel,
                 )
                 first_row, second_row = a * channel_count + channel, b * channel_count + channel
-                # one loop per operation: a single loop would test the operation at each sample
+                # one loop per operation, because a single loop would test the operation at each sample
                 if op == CONSTANT:
                     for offset in range(tile_length):
                         columns[target_row, offset] = constants[a]
@@ -231,7 +235,7 @@ def run_instructions(
                 elif op == SIGNAL:
                     for offset in range(tile_length):
                         value = signals[input_index + offset]
-                        # a text is stored as a number up to `TEXTS`, but is none
+                        # a text is stored as a number up to `TEXTS`, but counts as undefined
                         columns[target_row, offset] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
                     for offset in range(tile_length):
@@ -293,7 +297,7 @@ def run_instructions(
                 else:
                     for offset in range(tile_length):
                         value = columns[second_row, offset]
-                        # with unknown membership the body may count or not, so its interval is [-inf, inf]
+                        # with unknown membership, the body may count, so its interval is [-inf, inf]
                         if members[member_index + offset] < 0:
                             value = np.inf if channel % 2 else -np.inf
                         if members[member_index + offset] == 0:
@@ -332,11 +336,13 @@ class OpenGroups(Protocol):
 
 
 class Membership(NamedTuple):
-    """A binding of an open quantifier: 1 in samples where all of `candidates` are members, 0 elsewhere.
+    """A binding of an open quantifier, with a number for each sample.
+
+    The number is 1 in samples in which all `candidates` are members, else 0. Without candidates, it is -1 in
+    samples with unknown members, else 0.
 
     Attributes:
-        candidates: indices of objects among the candidates of the group. Without any, the number is -1 in
-            samples with unknown members, 0 elsewhere.
+        candidates: indices of objects among the candidates of the group.
     """
 
     group: Group | Earlier
@@ -344,11 +350,11 @@ class Membership(NamedTuple):
 
 
 class LeafCode:
-    """Instructions for leaves, operands first; equal instructions share a column.
+    """Instructions for leaves, operands first. Equal instructions share a column.
 
     Attributes:
-        rows: number of each instruction, by operation, a, b and c.
-        constants, measurements, signals, closest, members: numbers of the inputs of instructions.
+        rows: number of an instruction, by its operation, a, b and c.
+        constants, measurements, signals, closest, members: number of an input, by kind of input.
     """
 
     def __init__(self, groups: OpenGroups) -> None:
@@ -444,7 +450,7 @@ class LeafCode:
     def _expansion_row(self, formula: Formula, rows: Mapping[int, int]) -> int:
         """Return the row of an expansion.
 
-        An expansion repeats operands; to compile each repetition would take 2**depth steps.
+        An expansion repeats operands. Compilation of each repetition would take 2**depth steps.
 
         Args:
             rows: rows of the original operands, by the `id` of the operand.
@@ -473,12 +479,12 @@ class LeafCode:
         candidate_names = self._groups.candidates(group)
         self._check_bindings(formula, len(candidate_names))
         op = AND_MEMBER if is_forall else OR_MEMBER
-        # the value over no member
+        # the quantifier's value over no member
         row = self._constant(inf if is_forall else -inf)
         if self._groups.may_be_unknown(group):
             # the quantifier is unknown in samples with unknown members
             row = self._row(op, row, row, self._member(group, ()))
-        # permutations: different variables stand for different members
+        # permutations, because different variables stand for different members
         for indices in permutations(range(len(candidate_names)), len(formula.variables)):
             members = [TrackedName(candidate_names[index]) for index in indices]
             member_bindings = {**bindings, **dict(zip(formula.variables, members, strict=True))}

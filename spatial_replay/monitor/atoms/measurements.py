@@ -40,7 +40,7 @@ def measurement_values(scene: TraceScene, measurements: Sequence[Measurement]) -
     """Compute each measurement in each sample of a scene, or read it from the trace's cache.
 
     Returns:
-        values (K, T), NaN where unknown, and their spreads from uncertainty (K, T).
+        values (K, T), NaN where unknown, and the spreads of the values from uncertainty (K, T).
     """
     keys = [_key(scene, measurement) for measurement in measurements]
     cache = scene.trace.cache
@@ -66,8 +66,8 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     """Compute values and spreads of all measurements in one kernel call.
 
     Returns:
-        (2, T) for each measurement: values, NaN where unknown, and spreads. (1, T), without spreads, if the
-        scene is sure.
+        (2, T) for each measurement: values, NaN where unknown, and spreads. If the scene is sure, (1, T)
+        without spreads.
     """
     operand_numbers: dict[Term, int] = {}
     operands: list[Operand] = []
@@ -102,7 +102,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
 
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     """Return the cache key of a measurement, with the shapes of regions instead of their names."""
-    # an edited specification may use a name for another region
+    # shapes, because an edited specification may use a name for another region
     shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
     # `skip` is part of the key, because arrays begin with the sample `skip`
     if not shapes:
@@ -126,8 +126,8 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     """Compute each leaf in each sample of a scene.
 
     Returns:
-        (C, A, T) in C channels. C = 1 if all values are known. C = 2, low and high end, if a value is
-        unknown. C = 4, also both ends with uncertainty, if a value is uncertain.
+        (C, A, T) in C channels. C is 1 if all values are known. C is 2, for low and high ends, if a value is
+        unknown. C is 4, for both ends without and with uncertainty, if a value is uncertain.
 
     Raises:
         UsageError: the bindings exceed `MAX_BINDINGS`.

@@ -1,6 +1,6 @@
-"""Reports of objects and signals in samples: the previous report, and the time between both.
+"""Reports of objects and signals in samples: the previous report, and the time between both reports.
 
-Consecutive samples may show the same report. The first report after a sample without one has no previous
+Consecutive samples may show the same report. The first report after a sample without a report has no previous
 report.
 """
 
@@ -29,7 +29,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 
 def before_last_reports(trace: Trace) -> Integers:
-    """Return the sample before the newest report begins, for each object and signal with report times."""
+    """Return the sample before the begin of the newest report, for objects and signals with report times."""
     columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
     for name, reported_ns in trace.signals_reported_ns.items():
         columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
@@ -47,7 +47,7 @@ def is_signal_known(values: Floats) -> Booleans:
 
 
 def _begins(is_known: Booleans, reported_ns: Integers) -> Booleans:
-    """Return whether a report begins with each sample; both arguments are (T, ...)."""
+    """Return whether a report begins with each sample. Both arguments, and the result, are (T, ...)."""
     is_begin = is_known.copy()
     is_begin[1:] &= ~is_known[:-1] | (reported_ns[1:] != reported_ns[:-1])
     return is_begin
@@ -57,9 +57,9 @@ class Reports(NamedTuple):
     """The previous report of an object or a signal, in each sample.
 
     Attributes:
-        before: (T,), last sample with the previous report; -1 if there is none. There is none after a sample
-            without a report.
-        seconds: (T,), time between both reports; NaN if there is no previous one, or if not positive.
+        before: (T,), last sample with the previous report; -1 without a previous report, such as after a
+            sample without a report.
+        seconds: (T,), time between both reports; NaN if it is not positive, or without a previous report.
     """
 
     before: Integers
@@ -85,8 +85,8 @@ class LatestReport:
     Attributes:
         value: the object, or the number of the signal.
         reported_ns: time of the report.
-        before: previous report; None if there is none.
-        seconds: time between both reports; NaN if there is no previous one, or if not positive.
+        before: previous report, or None.
+        seconds: time between both reports; NaN if it is not positive, or without a previous report.
         centre: packed centre of an object; None until it is needed.
     """
 
@@ -97,11 +97,11 @@ class LatestReport:
     centre: tuple[bytes, bytes] | None = None
 
     def follow(self, value: Any, reported_ns: int) -> LatestReport:
-        """Return the report of the next sample, which is the same report if its time is the same."""
+        """Return the report of the next sample. It is this report again if the report times are equal."""
         if reported_ns == self.reported_ns:
             return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns
-        self.before = None  # two reports are compared; a longer chain would never be freed
+        self.before = None  # only two reports are compared, and a longer chain would never be freed
         return LatestReport(value, reported_ns, self, step_ns / 1e9 if step_ns > 0 else nan)
 
 
@@ -119,7 +119,7 @@ class RecentReports:
         self.latest: dict[str | Signal, LatestReport] = {}
 
     def add(self, sample: Sample) -> None:
-        """Add the next sample; objects and signals without a report lose their history."""
+        """Add the next sample. Objects and signals without a report lose their history."""
         latest: dict[str | Signal, LatestReport] = {}
         objects, report_times_ns = sample.objects, sample.reported_ns
         for name in objects if self._objects is None else self._objects:
@@ -145,7 +145,7 @@ class RecentReports:
     def step(self, terms: Iterable[Term], sample: Sample) -> float:
         """Return the shortest time between two reports of the terms' objects, s.
 
-        Lasting objects without two reports are ignored. NaN if another object lacks two reports.
+        Lasting objects without two reports are ignored. If another object lacks two reports, return NaN.
         """
         shortest_s, latest = inf, self.latest
         for term in terms:
@@ -162,16 +162,17 @@ class RecentReports:
         latest = self.latest.get(name)
         for report in () if latest is None else (latest, latest.before):
             if report is not None and report.value is tracked:
-                # once per report; with times once per rate, an update of `speed(r)` fell from 157 to 26 µs
+                # computed once per report: with report times computed once per rate, too, an update of
+                # `speed(r)` fell from 157 to 26 µs
                 report.centre = report.centre or packed_centre(tracked)
                 return report.centre
         return packed_centre(tracked)
 
     def moved_back(self, name: str, sample: Sample, shortest: float) -> TrackedObject | None:
-        """Return an object moved back by its velocity; None if it was not reported before.
+        """Return an object moved back by its velocity; None without a previous report.
 
         Args:
-            shortest: time by which it is moved back, s.
+            shortest: time by which the object is moved back, s.
         """
         latest = self.latest.get(name)
         if latest is None:
@@ -181,7 +182,7 @@ class RecentReports:
         if previous_report is None or step_s != step_s:
             return current_object if name in sample.lasting else None
         previous_object: TrackedObject = previous_report.value
-        # no arithmetic: the earlier report itself, bit for bit
+        # the earlier report itself, because arithmetic would change bits
         if step_s == shortest:
             return previous_object
         if not step_s > shortest:

@@ -1,4 +1,4 @@
-"""Terms in a trace: their footprints, uncertainty, unknown samples, and delays (`a[-3]`).
+"""Terms in a trace: footprints, uncertainty, unknown samples, and delays (`a[-3]`).
 
 A rate looks back at reports (see `reports`).
 """
@@ -57,7 +57,7 @@ from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 
 class Delay(NamedTuple):
-    """The delay of a term: in samples, in ns, or to the previous report (both None)."""
+    """The delay of a term, in samples or in ns. Both are None for a delay to the previous report."""
 
     samples: int | None
     duration_ns: int | None
@@ -103,7 +103,7 @@ def tail(trace: Trace, reach: Reach) -> Trace:
     """Return the samples of a trace that the next sample may look back at (see `look_back`)."""
     first_sample = len(trace) - max(reach.samples, reach.to_reports)
     if reach.duration_ns:
-        # the next sample is later than the newest one, so it cannot look back further
+        # the next sample is later than the newest sample, so it cannot look back further
         latest_ns = trace.times_ns[-1] - reach.duration_ns
         first_sample = min(first_sample, int(np.searchsorted(trace.times_ns, latest_ns, side="right")) - 1)
     recent_samples = np.arange(max(first_sample, 0), len(trace))
@@ -113,14 +113,14 @@ def tail(trace: Trace, reach: Reach) -> Trace:
 
 
 class RecentSamples:
-    """The samples at given delays before the newest one; older samples are dropped."""
+    """The samples at given delays before the newest sample. Older samples are dropped."""
 
     def __init__(self, delays: Iterable[Delay]) -> None:
         self._queues: list[tuple[Delay, deque[Sample]]] = [(delay, deque()) for delay in delays]
         self._is_newest_only = [delay for delay, _ in self._queues] == [NO_DELAY]
 
     def add(self, sample: Sample) -> list[Sample | None]:
-        """Add the next sample; return the sample at each delay, or None before the first sample."""
+        """Add the next sample. Return the sample at each delay, or None before the first sample."""
         if self._is_newest_only:
             return [sample]
         return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
@@ -152,10 +152,10 @@ class ResolvedTerm:
     """A term over the samples of a scene.
 
     Attributes:
-        operand: its footprints.
+        operand: footprints of the term.
         unknown: (T,), whether the term is unknown.
-        spread: (T,), its uncertainty; for a group, the largest of its members.
-        yaw: (T,), its orientation; NaN if it has none.
+        spread: (T,), uncertainty; for a group, the largest uncertainty of its members.
+        yaw: (T,), orientation, radians; NaN without orientation.
     """
 
     operand: Operand
@@ -170,7 +170,7 @@ _Base: TypeAlias = TrackedName | Variable | RegionName | Group
 class TraceScene:
     """The samples of a trace from `skip` on, and the regions of a specification.
 
-    Terms may look back at the samples before (`a[-3]`).
+    Terms may look back (`a[-3]`) at samples before `skip`.
     """
 
     def __init__(self, trace: Trace, regions: Mapping[str, Outline], skip: int = 0) -> None:
@@ -197,9 +197,10 @@ class TraceScene:
 
     @property
     def batch(self) -> FootprintBatch:
-        """Footprints of the trace, then of the regions.
+        """Footprints of the trace, then footprints of the regions.
 
-        If terms need them, the centres of all these follow, then moved footprints, each before its centre.
+        If terms need centres, the centres of these footprints follow. Moved footprints come last, each before
+        its centre.
         """
         if not self._has_centres:
             return self._base_batch
@@ -244,8 +245,8 @@ class TraceScene:
     def compared_ns(self, rate: Rate) -> tuple[int, int] | None:
         """Return the times of the two reports that a rate compares in the first sample.
 
-        For several objects, it is the pair with the shortest time between reports. None if the rate has no
-        value.
+        For several objects, the pair with the shortest time between reports is returned. The result is None
+        if the rate has no value.
         """
         sources: list[TrackedName | Signal] = [rate.signal] if rate.signal else []
         for term in step_of(rate).terms:
@@ -282,7 +283,7 @@ class TraceScene:
         return self._reports[source]
 
     def _step(self, terms: tuple[TrackedName | Variable | Group, ...]) -> Floats:
-        """Return the shortest time between the last two reports of a term at each sample, (T,), seconds."""
+        """Return the shortest time between the last two reports of the terms' objects, (T,), seconds."""
         if terms not in self._step_seconds:
             shortest_s = np.full(len(self.trace), np.inf)
             for term in terms:
@@ -316,8 +317,8 @@ class TraceScene:
         """Return the members of an open group.
 
         Returns:
-            the names of all members (M,), their membership (T, M) as 1 or 0, and whether (T,) it is unknown
-            because the group looks back to a time before the trace.
+            the names of all members (M,), their membership (T, M) as 1 or 0, and whether the membership is
+            unknown (T,), because the group looks back to a time before the trace.
         """
         if group not in self._members:
             self._members[group] = self._find_members(group)
@@ -392,11 +393,11 @@ class TraceScene:
         previous_rows = np.where(previous_samples < 0, ABSENT, self._rows_of(name)[previous_samples])
         # without an earlier report, the object is unknown
         rows = np.where(is_present & ~is_standing, _NO_REPORT, current_rows)
-        # row -1, for samples without the object, reads the appended 0
+        # row -1, for samples without the object, is the row of the appended 0
         uncertainty = np.append(self.trace.uncertainty, 0.0)
         spread = np.where(is_present, uncertainty[np.where(is_present, current_rows, -1)], 0.0)
         is_previous = is_present & (seconds == shortest_s)
-        # the earlier report itself, so that a replay and a live run give the same bits
+        # the earlier report itself, so that a replay and a live run give identical bits
         rows[is_previous], spread[is_previous] = (
             previous_rows[is_previous],
             uncertainty[previous_rows[is_previous]],
@@ -407,12 +408,12 @@ class TraceScene:
             rows[between_samples] = self._add_moved_rows(
                 newer_rows, older_rows, shortest_s[between_samples] / seconds[between_samples]
             )
-            # between two reports, the greater uncertainty counts
+            # the uncertainty between two reports is the greater uncertainty
             spread[between_samples] = np.maximum(uncertainty[newer_rows], uncertainty[older_rows])
         return rows, spread
 
     def _add_moved_rows(self, newer_rows: Integers, older_rows: Integers, fractions: Floats) -> Integers:
-        """Add copies of newer rows, moved by a share of the way to older rows; return their row numbers."""
+        """Add newer rows, moved by a fraction of the way to older rows. Return the new row numbers."""
         # the joined batch has to include the new rows
         self._has_centres, self._joined_batch = True, None
         centres = self._centres.vertices
@@ -420,7 +421,7 @@ class TraceScene:
             self._base_batch.select(newer_rows),
             (centres[older_rows] - centres[newer_rows]) * fractions[:, None],
         )
-        # interleave the moved rows with their centres
+        # interleaves the moved rows with their centres
         row_order = np.arange(2 * len(newer_rows)).reshape(2, -1).T.ravel()
         self._moved_batches.append(
             FootprintBatch.concatenate([moved_batch, centres_of(moved_batch)]).select(row_order)
@@ -441,7 +442,7 @@ class TraceScene:
         return (term.name,), self._rows_of(term.name)[None]
 
     def _base_and_source(self, term: _Base | Earlier) -> tuple[_Base, Integers]:
-        """Return the base of a term, and the sample that it reads at each sample of the scene (-1: none)."""
+        """Return the base of a term, and the sample that the term reads at each sample; -1 for no sample."""
         samples = np.arange(self.skip, len(self.trace), dtype=np.int64)
         if not isinstance(term, Earlier):
             return term, samples
@@ -511,7 +512,7 @@ class TraceScene:
 
 
 def footprint_from_outline(outline: Outline) -> Footprint:
-    """Return the shape of a region; a polygon that is not convex is decomposed.
+    """Return the footprint of a region. A concave polygon is decomposed.
 
     Raises:
         GeometryError: the outline is not a valid footprint.
@@ -523,7 +524,7 @@ def footprint_from_outline(outline: Outline) -> Footprint:
 
 
 def seam_texts(formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> list[str]:
-    """Return a sentence for each region of several convex parts that `enclosedin` refers to."""
+    """Return a sentence for each region in `enclosedin` that has several convex parts."""
     atoms = (part for formula in formulas for part in iter_formulas(formula) if isinstance(part, Atom))
     names = dict.fromkeys(
         getattr(base_of(atom.terms[1]), "name", "") for atom in atoms if atom.relation == "enclosedin"

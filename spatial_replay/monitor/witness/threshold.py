@@ -59,7 +59,7 @@ class Dial:
 
     Attributes:
         kind: "number": a number that the atom compares with. "radius": the enlargement of a term. "margin":
-            the amount by which the relation has to hold, 0 as written.
+            the amount by which the relation has to hold, which is 0 in the text.
         value: the number.
         is_exact: whether the atom holds at one number only (`a dist b == c`).
         constant: name of the constant with this value, if it is varied in all atoms; else "".
@@ -72,7 +72,7 @@ class Dial:
 
     @classmethod
     def of(cls, deciding: DecidingAtom) -> Dial:
-        """Choose the first written number of the deciding branch; else its first radius; else the margin."""
+        """Choose the first written number of the deciding branch, else its first radius, else the margin."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
         branch_parts = [part for _, part in deciding.branch]
@@ -85,7 +85,10 @@ class Dial:
         return cls("margin", 0.0, is_exact)
 
     def with_constant(self, formula: Formula) -> Dial | None:
-        """Return the dial of the number's constant; None without one, or if it is also used in arithmetic."""
+        """Return the dial of the number's constant.
+
+        The result is None without a constant, and for a constant that is also used in arithmetic.
+        """
         if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
             return None
         (constant,) = self.value.constants
@@ -98,7 +101,7 @@ class Dial:
         return None if is_entangled else replace(self, constant=constant)
 
     def is_at(self, kind: Literal["number", "radius"], number: float) -> bool:
-        """Return whether the dial varies this number of that kind."""
+        """Return whether the dial varies a number of the given kind."""
         if self.constant:
             return isinstance(number, NamedNumber) and self.constant in number.constants
         return kind == self.kind and number == self.value
@@ -177,7 +180,7 @@ def _numbers(expression: Expression) -> Iterator[float]:
 
 
 def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> Iterator[tuple[Atom, int]]:
-    """Iterate over the atoms of a formula, with the signs of their effects on the formula's number."""
+    """Iterate over the atoms of a formula, with the signs of their effects on the formula's robustness."""
     match formula:
         case Atom():
             yield from ((formula, sign) for sign in signs)
@@ -198,18 +201,18 @@ RESIDUE: Final = 1e-12
 _PRECISION: Final = 60
 _FAR = 1e300
 _STEPS = 8.0
-"""Floating-point steps that a number moves too far, so that rounding cannot undo the flip."""
+"""Floating-point steps by which a flipping number is moved further, so that rounding cannot undo the flip."""
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
-"""Rounds of a search, and parts of the interval in each.
+"""Rounds of a search for dials that do not shift all samples equally, and parts of the interval per round.
 
-The search is for dials that do not shift all samples equally. Each round reads the log once, and divides the
-interval between a number that flips the verdict and one that does not.
+Each round reads the log once, and divides the interval between a number that flips the verdict and a number
+that does not flip it.
 """
 _AT_FIRST = 64
 """Number of candidates in the first pass of a search in both directions.
 
-There, a larger change need not flip the verdict, so bisection alone could miss the nearest number.
+In such a search, a larger change need not flip the verdict, so bisection could miss the nearest number.
 """
 
 
@@ -218,13 +221,13 @@ class Threshold:
     """The number of an atom, and the nearest number that would flip the verdict.
 
     Attributes:
-        value: number in the specification. For an atom without a number (`a leftof b`) it is 0, the margin by
-            which the relation has to hold.
+        value: number in the specification. For an atom without a number (`a leftof b`), the value is 0, the
+            margin by which the relation has to hold.
         flips_at: nearest number that flips the verdict, rounded away from `value` to a few digits.
         is_written: whether the number is in the text.
-        is_exact: whether numbers beyond `flips_at` need not flip it (`a dist b == c`).
+        is_exact: whether numbers beyond `flips_at` need not flip the verdict (`a dist b == c`).
         verdict: the verdict at `flips_at`.
-        constant: name of the number's constant, if `flips_at` is a value of it; else "".
+        constant: name of the constant for which `flips_at` is a value; "" for other numbers.
         replacement: text with a number that flips the verdict, for an atom without a number; else "".
     """
 
@@ -240,8 +243,8 @@ class Threshold:
 Obstacle: TypeAlias = Literal["others", "unknown", "limits", "infinity"]
 """The reason why no number of an atom flips a verdict.
 
-"others": other atoms decide it, too. "unknown": unknown samples decide it, too. "limits": no number that can
-be written is large enough. "infinity": the atom is infinite.
+"others": other atoms decide the verdict, too. "unknown": unknown samples decide the verdict, too. "limits":
+no number that can be written is large enough. "infinity": the atom's robustness is infinite.
 """
 
 
@@ -258,15 +261,15 @@ def threshold_of(
     """Find the nearest number of the deciding atom that flips a verdict, or the reason why no number does.
 
     A constant is varied in all its atoms. A number without a name is varied in all atoms from the same place
-    in the text: a macro, or a quantifier over a named group, creates several.
+    in the text. A macro, or a quantifier over a named group, creates several such atoms.
 
     Args:
         leaves: (C, A, T), leaves of the instance in each sample.
-        node: node of the verdict.
-        goes_on: whether samples may follow; the verdict then holds over every continuation.
+        node: id of the node with the verdict.
+        goes_on: whether samples may follow. The verdict then holds over every continuation.
 
     Returns:
-        None for an atom that is itself open.
+        the threshold or the obstacle. None if the deciding atom is open or unknown.
     """
     if deciding.end is End.OPEN or deciding.unknown:
         return None
@@ -306,7 +309,7 @@ class _Search:
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
         slopes_by_expression = {atom.expression: dial.slopes(atom.expression) for atom in atoms}
-        # slopes come from the formula, because equal leaves share an index wherever they are written
+        # slopes come from the formula, because equal leaves share an index although their spans differ
         self._moving_leaves: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
         for index, leaf in enumerate(self._order):
@@ -319,7 +322,7 @@ class _Search:
                     bare_atom_and_sign[1] * max(atom_slopes),
                 )
         quantifiers = [part for part in iter_formulas(self._formula) if isinstance(part, Quantified)]
-        # only a quantifier over a single atom shifts with it; with radii, a prism's height may decide
+        # only a quantifier over a single atom shifts like the atom; with radii, a prism's height may decide
         self._is_uniform = (
             all(len(atom_slopes) == 1 for atom_slopes in slopes_by_expression.values())
             and not any(
@@ -341,7 +344,7 @@ class _Search:
             for slope in slopes_by_expression[atom.expression]
             if slope
         }
-        # a violated formula has to rise, a satisfied one to fall
+        # a violated formula has to rise, and a satisfied formula has to fall
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
         low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
         distance_from_flip = abs(high if verdict is Verdict.VIOLATED else low)
@@ -349,7 +352,7 @@ class _Search:
             (abs(slope) for atom_slopes in slopes_by_expression.values() for slope in atom_slopes),
             default=0.0,
         )
-        # robustness changes by at most the slope
+        # robustness changes by at most the slope times the change
         self._least_change = (
             distance_from_flip / steepest_slope
             if steepest_slope and math.isfinite(distance_from_flip)
@@ -364,7 +367,8 @@ class _Search:
         ]
         for number in sorted(flipping_numbers, key=lambda number: abs(number - dial.value)):
             candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
-            # one of the first two nearly always flips it, and each number costs a measurement of all bindings
+            # one of the first two candidates nearly always flips the verdict
+            # each candidate costs a measurement of all bindings
             for candidate_batch in filter(None, (candidates[:2], candidates[2:])):
                 verdicts = self._verdicts(candidate_batch, is_shifted=False)
                 for candidate, verdict in zip(candidate_batch, verdicts, strict=True):
@@ -378,12 +382,12 @@ class _Search:
         return None
 
     def _replacement(self, margin: float) -> str:
-        """Return the text of the deciding atom with a margin that flips the verdict; "" if there is none."""
+        """Return the deciding atom's text with a margin that flips the verdict; "" without such a text."""
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
             formula = self._change_atoms(variant)
             added_leaves = new_leaves(formula, self._order)
-            # heights or rounding may decide instead, so the verdict is computed
+            # the verdict is computed, because heights or rounding may decide instead of the margin
             if self._is_flipped(self._verdict_with(formula, added_leaves, self._columns(added_leaves))):
                 changed_atom = variant(atom)
                 return format_atom(
@@ -395,7 +399,7 @@ class _Search:
         return ""
 
     def obstacle(self) -> Obstacle:
-        """Return why no number flips the verdict; the atom is shifted by `_FAR` to find out."""
+        """Return why no number flips the verdict, from the verdict with the atom shifted by `_FAR`."""
         far_shift = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
@@ -409,14 +413,14 @@ class _Search:
         return "others" if verdict is self._verdict else "unknown"
 
     def _is_flipped(self, verdict: Verdict) -> bool:
-        """Return whether a verdict is the opposite one or, if samples may follow, any other."""
+        """Return whether a verdict is the opposite verdict or, if samples may follow, another verdict."""
         return verdict is not self._verdict and (self._goes_on or verdict is not Verdict.UNKNOWN)
 
     def _is_possible(self, number: float) -> bool:
         return math.isfinite(number) and (self._dial.kind != "radius" or number >= 0.0)
 
     def _nearest(self, direction: float) -> float | None:
-        """Return a number just beyond the nearest one in a direction that flips the verdict."""
+        """Return a number just beyond the nearest number in a direction that flips the verdict, or None."""
         find_size = self._size_by_samples if self._is_uniform else self._size_by_rounds
         size = find_size(direction)
         return None if size is None else self._number_beyond(size, direction)
@@ -449,7 +453,7 @@ class _Search:
         return None
 
     def _size_by_rounds(self, direction: float) -> float | None:
-        # sizes double from the least change that can flip, which may be 0
+        # sizes double, starting at the least change that can flip the verdict, which may be 0
         first_size = max(self._least_change, 1e-6 * (abs(self._dial.value) + 1.0))
         sizes = [self._least_change, *(first_size * 2.0**exponent for exponent in range(1, _DOUBLINGS))]
         for _ in range(_ROUNDS):
@@ -469,7 +473,7 @@ class _Search:
         return [self._is_flipped(verdicts.get(number, self._verdict)) for number in numbers]
 
     def _number_beyond(self, size: float, direction: float) -> float:
-        """Return the number moved by `size` and a few rounding steps; a radius is at least 0."""
+        """Return the dial's value moved by `size` and a few rounding steps. A radius is at least 0."""
         value = self._dial.value
         rounding_step = (
             0.0 if self._dial.is_exact else _STEPS * float(np.spacing(max(abs(value) + size, 1.0)))
@@ -481,7 +485,8 @@ class _Search:
         """Return the verdict with the dial at each number.
 
         Args:
-            is_shifted: whether atoms may be shifted instead of measured again; both agree up to rounding.
+            is_shifted: whether atoms may be shifted instead of measured again. The results differ only by
+                rounding.
         """
         formulas = [self._formula_at(number) for number in numbers]
         added_leaves = [new_leaves(formula, self._order) for formula in formulas]
@@ -503,7 +508,8 @@ class _Search:
     def _is_meant(self, atom: Atom) -> bool:
         """Return whether the search varies an atom.
 
-        A constant is varied in all its atoms, any other number in atoms from the deciding atom's place.
+        A constant is varied in all its atoms. Another number is varied in all atoms from the deciding atom's
+        place in the text.
         """
         if self._dial.constant:
             return any(self._dial.is_at("number", number) for number in _numbers(atom.expression))
@@ -526,7 +532,7 @@ class _Search:
         return replace(atom, expression=self._dial.turn(atom.expression, number))
 
     def _shift_columns(self, added_leaves: Sequence[Formula], number: float) -> Floats:
-        """Return the columns of atoms with the dial at a number, by shifts of the original columns."""
+        """Return the columns of leaves with the dial at a number, by a shift of the original columns."""
         index_of_key = {
             leaf_key(rewritten(leaf, lambda atom: self._atom_at(atom, number))): index
             for index, leaf in self._moving_leaves.items()
@@ -548,7 +554,7 @@ class _Search:
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:
-    """Return the atom of a leaf that has only quantifiers and negations above it, and its sign."""
+    """Return the atom of a leaf, and its sign; None if a leaf has more than quantifiers and negations."""
     sign = 1
     while not isinstance(formula, Atom):
         if isinstance(formula, Boolean) and formula.operator == "not":
@@ -565,13 +571,13 @@ def _radii_in(expression: Expression) -> list[float]:
 
 
 def _variants(atom: Atom, margin: float) -> Iterator[Callable[[Atom], Atom]]:
-    """Yield changes of an atom without a number that make it ask for a margin."""
+    """Yield changes of an atom without a number, after which it requires a margin."""
     match atom.relation, atom.expression:
         case "ovlp", _:
             yield partial(_as_distance, margin=margin)
         case "sum", Sum(_, Negative()):
             yield partial(_with_summand, margin=margin)
-    # a term enlarged by the margin, if that shifts every branch by the same amount
+    # a term may be enlarged by the margin, if this shifts every branch by the same amount
     radius, slope = abs(margin), -math.copysign(1.0, margin)
     dial = Dial("radius", radius, is_exact=False)
     for term_index in range(len(atom.terms)):
@@ -619,16 +625,16 @@ def _enlarge_term(atom: Atom, term_index: int, radius: float) -> Atom:
 
 
 def _short_numbers(number: float, value: float) -> Iterator[float]:
-    """Iterate over short numbers near `number`, or beyond it as seen from `value`, then `number` itself."""
+    """Iterate over short numbers at `number`, and beyond it as seen from `value`. The last is `number`."""
     exact_number, change = Decimal(number), Decimal(number) - Decimal(value)
     rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
-    # a number near 0 may be rounding error: then the digits of the change count
+    # a number near 0 may be a rounding error, so the digits of the change are used
     digit_source = (
         change if abs(number) <= max(RESIDUE * abs(value), _STEPS * np.spacing(1.0)) else exact_number
     )
     last_digit = min(digit_source.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
     for decimal_place in (last_digit, last_digit - DIGITS):
-        # the nearest short number may not flip the verdict; the one beyond does
+        # the nearest short number may not flip the verdict, but a short number beyond it does
         for rounding in (ROUND_HALF_EVEN, rounding_away):
             short_number = exact_number.quantize(
                 Decimal(1).scaleb(decimal_place), context=Context(_PRECISION, rounding)

@@ -63,12 +63,12 @@ class WitnessStep:
     """A node on the deciding path, at its deciding sample.
 
     Attributes:
-        node: its id.
+        node: node id.
         operator: "and", "F", a relation's name, …
-        name: name of the spec whose root it is, or None.
-        text: its canonical text.
+        name: name of the spec whose root is the node, or None.
+        text: canonical text of the node.
         time_ns: time of the sample.
-        leaves_out: whether its operator leaves out samples, or members, because a rate has no value.
+        leaves_out: whether the operator leaves out samples, or members, because a rate has no value.
     """
 
     node: int
@@ -81,10 +81,10 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class WhilePresent:
-    """The verdict of an unknown formula that is restricted to samples with its objects.
+    """The verdict of an unknown formula after it is restricted to samples with its objects.
 
     Attributes:
-        names: names of these objects.
+        names: names of the objects.
         text: text of the restricted formula.
     """
 
@@ -95,10 +95,11 @@ class WhilePresent:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """The atom that decides a node's verdict over a finished log, or settled it before the log ended.
+    """The atom that decides a node's verdict over a finished log, or settled it before the end of the log.
 
-    Robustness consists of minima and maxima, so one atom at one sample determines it. It determines the upper
-    end of a violated formula, the lower end of a satisfied formula, and the open ends of an unknown formula.
+    Robustness consists of minima and maxima, so one atom at one sample determines it. The atom determines the
+    upper end of a violated formula, the lower end of a satisfied formula, and the open ends of an unknown
+    formula.
 
     Attributes:
         name: name of the spec.
@@ -107,20 +108,20 @@ class Witness:
         path: path from the node to the deciding leaf, at least one step.
         deciding: deciding atom. None if the path ends at `true` or `false`, at a window or a next sample
             beyond the log, or at a quantifier over an empty group.
-        threshold: change of the atom's number that flips the verdict; None if there is none.
-        obstacle: reason for no threshold, if there is a deciding atom.
+        threshold: change of the atom's number that flips the verdict, or None.
+        obstacle: reason why a deciding atom has no threshold; else None.
         open_end: atom that leaves the other end of a known verdict's interval open, and the time of its
             sample; else None.
         settled_ns: time of the sample that made the verdict certain. The interval then belongs to that
             sample. None for a witness over the whole log.
         missed: outermost failed implication on the path, or None.
         gaps: missing samples of the objects and signals in an unknown atom.
-        closest: atom that came closest to fulfilling a missed response, and the time of its sample. None if
-            this atom decides, or if there is none.
-        closest_path: path from the response to that atom.
-        units: declared units of the log, of signals by name, of lengths under "".
+        closest: atom that came closest to fulfilling a missed response, and the time of its sample. None
+            without a missed response, and if this atom decides.
+        closest_path: path from the response to the atom in `closest`.
+        units: declared units of signals by name; the unit of lengths under "".
         unit: declared unit of `lower` and `upper`, or "".
-        while_present: verdict with `present`, for a formula that is unknown only because samples lack its
+        while_present: verdict of the formula with `present`, if it is unknown only because samples lack its
             objects; else None.
         closest_threshold: change of the number of `closest` that flips the verdict, or None.
     """
@@ -147,7 +148,7 @@ class Witness:
 
     @property
     def node(self) -> int:
-        """The id of its node."""
+        """Id of the node whose verdict is explained."""
         return self.path[0].node
 
     @property
@@ -180,8 +181,9 @@ def find_witness(
         leaves: (C, A, T), leaves of the instance.
         times_ns: (T,), T at least 1.
         node: id of the node.
-        goes_on: whether samples may follow; the verdict then holds over every continuation.
-        whole: leaves and times of the whole log, over which the verdict is to flip; None for these samples.
+        goes_on: whether samples may follow. The verdict then holds over every continuation.
+        whole: leaves and times over which a threshold has to flip the verdict, such as those of the whole
+            log; None for `leaves` and `times_ns`.
         flips: whether to search for the number that flips the verdict.
     """
     instance = evidence.instance
@@ -196,7 +198,7 @@ def find_witness(
     gaps: tuple[Gap, ...] = ()
     if decisive_atom is not None and decisive_atom.unknown:
         gaps = evidence.gaps(decisive_atom.atom, at_ns)
-        # everything is missing in a pause, so the pause is the reason
+        # all objects and signals are missing in a pause, so the pause is the reason
         if any(gap.name is None and gap.longest_ns[0] <= at_ns < gap.longest_ns[1] for gap in gaps):
             decisive_atom = replace(decisive_atom, unknown=("the samples pause there",))
     while_present = None
@@ -242,7 +244,7 @@ def find_witness(
 def _open_end(
     evidence: Evidence, nodes: OfflineNodes, node: int, end: End
 ) -> tuple[DecidingAtom, int] | None:
-    """Return the atom that leaves an end of a node's interval open, and its time; None if none does."""
+    """Return the atom that leaves an end of a node's interval open, and its time, or None."""
     path = deciding_path(nodes, node, end)
     decisive_atom = atom_of_path(evidence, nodes, path, evidence.scene)
     if decisive_atom is None or decisive_atom.lower == decisive_atom.upper:
@@ -251,7 +253,7 @@ def _open_end(
 
 
 SceneAt: TypeAlias = Callable[[int], TraceScene]
-"""Returns the scene of the sample at a time (see `Evidence.scene`)."""
+"""Function of a time that returns the scene of its sample (see `Evidence.scene`)."""
 
 
 class MissedWitness(NamedTuple):
@@ -261,7 +263,7 @@ class MissedWitness(NamedTuple):
         missed: outermost failed implication, or None.
         closest: atom that came closest to fulfilling the response, and the time of its sample. None if the
             condition does not decide.
-        path: path from the response to that atom. None within one node of an open group.
+        path: path from the response to the atom in `closest`. None for an implication within a quantifier.
     """
 
     missed: MissedResponse | None = None
@@ -299,7 +301,7 @@ def find_missed_response(
     leaf, at_ns = evidence.bound(nodes.tree[step.node][0]), int(nodes.times_ns[step.sample])
     if not isinstance(leaf, Quantified):
         return _NOTHING_MISSED
-    # an implication within the one node of an open group
+    # an implication within a quantifier, which is a single node
     scene = scene_at(at_ns)
     implication = failed_implication(scene, leaf, path.end)
     if implication is None:
@@ -319,9 +321,10 @@ def _steps(evidence: Evidence, nodes: OfflineNodes, path: DecidingPath) -> tuple
 def _while_present(
     evidence: Evidence, leaves: Floats, times_ns: Integers, node: int, path: DecidingPath
 ) -> WhilePresent | None:
-    """Return the verdict of a node if its path's innermost operator only counts samples with the objects.
+    """Return the verdict of a node with its path's innermost operator restricted to samples with the objects.
 
-    None if this verdict is unknown, if the leaf's objects are in all samples, or if one of them is in none.
+    The result is None if this verdict is unknown, or if each object of the leaf is in all samples. It is also
+    None if an object is in no sample.
     """
     instance, bindings = evidence.instance, evidence.instance.bindings
     formula, order = instance.formula, instance.program.leaves
@@ -350,7 +353,7 @@ def _while_present(
     guarded_formula = with_operands(formula, operator_nodes[-1], (body,))
     all_leaves = joined_channels([leaves, presence_columns], axis=1)
     guarded_nodes = evaluate_offline(guarded_formula, (*order, *conditions), all_leaves, times_ns)
-    # nodes before the operator and around it keep their ids
+    # the ids of nodes before and around the operator are unchanged
     verdict = final_verdict(*guarded_nodes.interval(node))
     if verdict is Verdict.UNKNOWN:
         return None
@@ -371,7 +374,7 @@ def time_of_least(
     order = instance.program.leaves
     nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
     path = deciding_path(nodes, node, End.HIGH)
-    # the number depends on all samples of its path
+    # the robustness depends on all samples of its path
     earliest_sample = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
 
     def is_reached(sample: int) -> bool:
@@ -381,7 +384,7 @@ def time_of_least(
         )
         return bool(prefix_nodes.ends(node)[1][0] <= least)
 
-    # the samples up to the deciding one mostly suffice: one evaluation instead of a search
+    # the samples up to the deciding sample mostly suffice, which needs one evaluation instead of a search
     later_samples = range(
         earliest_sample, earliest_sample if is_reached(earliest_sample) else len(times_ns) - 1
     )
