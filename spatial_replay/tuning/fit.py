@@ -71,34 +71,37 @@ class LimitedRelation:
         parties = self.quantity.parties
         if not parties:
             name = written_name(self.quantity.signal, RELATION_NAMES)
-            return f"{name} {self._compared}"
+            return f"{name} {self._comparison}"
         variables = variables_of(parties, taken)
-        a, b = (
+        left_text, right_text = (
             variable if party.is_class else written_name(party.name, RELATION_NAMES)
             for party, variable in zip(parties, variables, strict=True)
         )
-        text = self._atom(a, b)
+        text = self._atom(left_text, right_text)
         if parties[0].is_class and parties[0] == parties[1]:
-            return f"forall {a}, {b} in class {quote_name(parties[0].name)}: {text}"
+            return f"forall {left_text}, {right_text} in class {quote_name(parties[0].name)}: {text}"
         for party, variable in reversed(list(zip(parties, variables, strict=True))):
             if party.is_class:
                 text = f"forall {variable} in class {quote_name(party.name)}: {text}"
         return text
 
-    def _atom(self, a: str, b: str) -> str:
+    def _atom(self, left: str, right: str) -> str:
         relation = self.quantity.relation
         if relation == "dist":
             if self.other_limit is not None:
-                return f"{format_number(self.limit)} <= {a} dist {b} <= {format_number(-self.other_limit)}"
-            return f"{a} dist {b} {self._compared}"
+                return (
+                    f"{format_number(self.limit)} <= {left} dist {right} "
+                    f"<= {format_number(-self.other_limit)}"
+                )
+            return f"{left} dist {right} {self._comparison}"
         if relation == "oriented":
-            return f"{a} oriented[{format_number(-self.limit)}] {b}"
+            return f"{left} oriented[{format_number(-self.limit)}] {right}"
         bracket = "[z]" if relation == "prec" else ""
-        text = f"{a} {relation}{bracket} {b}"
+        text = f"{left} {relation}{bracket} {right}"
         return f"not ({text})" if self.direction else text
 
     @property
-    def _compared(self) -> str:
+    def _comparison(self) -> str:
         # 0 - limit instead of -limit, which would be -0.0 for 0.0
         return (
             f"<= {format_number(0.0 - self.limit)}" if self.direction else f">= {format_number(self.limit)}"
@@ -111,31 +114,41 @@ class LimitedRelation:
             verb: function that returns the words for "are" or "is".
         """
         quantity = self.quantity
-        number = number_text(0.0 - self.limit if self.direction else self.limit)
+        limit_text = number_text(0.0 - self.limit if self.direction else self.limit)
         if not quantity.parties:
-            return f"{quantity.signal} {verb('is')} {'at most' if self.direction else 'at least'} {number}"
-        first, second = quantity.parties
-        if first == second:
-            both, a, b = f"any two of class {first.name}", f"any {first.name}", "any other"
+            return (
+                f"{quantity.signal} {verb('is')} {'at most' if self.direction else 'at least'} {limit_text}"
+            )
+        first_party, second_party = quantity.parties
+        if first_party == second_party:
+            both_text, left_text, right_text = (
+                f"any two of class {first_party.name}",
+                f"any {first_party.name}",
+                "any other",
+            )
         else:
-            a, b = _party_text(first), _party_text(second)
-            both = f"{a} and {b}"
+            left_text, right_text = _party_text(first_party), _party_text(second_party)
+            both_text = f"{left_text} and {right_text}"
         if quantity.relation == "dist":
             if self.other_limit is not None:
-                far = number_text(0.0 - self.other_limit)
-                return f"{both} {verb('are')} {number} to {far} apart"
-            return f"{both} {verb('are')} {'at most' if self.direction else 'at least'} {number} apart"
+                far_text = number_text(0.0 - self.other_limit)
+                return f"{both_text} {verb('are')} {limit_text} to {far_text} apart"
+            return (
+                f"{both_text} {verb('are')} {'at most' if self.direction else 'at least'} {limit_text} apart"
+            )
         if quantity.relation == "oriented":
-            return f"{a} {verb('is')} turned as {b} is"
-        return f"{a} {verb('is')} {_PHRASES[quantity.relation][self.direction].format(b=b)}"
+            return f"{left_text} {verb('is')} turned as {right_text} is"
+        return f"{left_text} {verb('is')} {_PHRASES[quantity.relation][self.direction].format(b=right_text)}"
 
     @property
     def name(self) -> str:
         """Name of a spec with the relation, in letters, digits and underscores."""
-        which = _NAMED[self.quantity.relation][self.direction if self.other_limit is None else 1]
-        names = [party.name for party in dict.fromkeys(self.quantity.parties)] or [self.quantity.signal]
-        parts = [names[0], which, *names[1:]]
-        text = "_".join("".join(c if c.isascii() and c.isalnum() else "_" for c in part) for part in parts)
+        relation_word = _NAMED[self.quantity.relation][self.direction if self.other_limit is None else 1]
+        party_names = [party.name for party in dict.fromkeys(self.quantity.parties)] or [self.quantity.signal]
+        name_parts = [party_names[0], relation_word, *party_names[1:]]
+        text = "_".join(
+            "".join(c if c.isascii() and c.isalnum() else "_" for c in part) for part in name_parts
+        )
         return text if text[0].isalpha() else f"_{text}"
 
     @property
@@ -170,12 +183,12 @@ class Line:
         text = self.fact.text(taken)
         if self.later is None:
             return f"{_OPERATORS[self.pattern]} ({text})"
-        held = (
+        prior_condition = (
             self.later.opposite().text(taken)
             if self.pattern == "until"
             else f"not ({self.later.text(taken)})"
         )
-        return f"({held}) U ({text})"
+        return f"({prior_condition}) U ({text})"
 
     @property
     def title(self) -> str:
@@ -196,8 +209,8 @@ class Line:
             if self.pattern == "until":
                 return f"{self.later.opposite().name}_until_{self.fact.name}"
             return f"{self.fact.name}_before_{self.later.name}"
-        ends = {"always": "always", "finally": "at_end", "eventually": "once"}
-        return f"{self.fact.name}_{ends[self.pattern]}"
+        endings = {"always": "always", "finally": "at_end", "eventually": "once"}
+        return f"{self.fact.name}_{endings[self.pattern]}"
 
 
 def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
@@ -257,57 +270,69 @@ class FittedLimits:
         distinguishes a bad run, one limit moves to the middle between that run and the good runs. It is the
         limit with the greatest gap between them, in margins.
         """
-        values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
-        lowest = values.min(axis=-1)
+        good_values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
+        lowest = good_values.min(axis=-1)
         # unknown values are infinite, and inf - inf is NaN, which `valid` excludes
         with np.errstate(invalid="ignore"):
-            spread = values.max(axis=-1) - lowest
+            spread = good_values.max(axis=-1) - lowest
             margins = np.maximum(_MARGIN * spread / (len(good) - 1), _FINEST * np.abs(lowest))
-        with_limit = np.array([quantity.relation in WITH_LIMIT for quantity in quantities])
-        valid = np.isfinite(lowest) & np.isfinite(margins) & (with_limit | (lowest >= 0.0))
-        _leave_out(valid, quantities, lowest)
-        limits = np.where(with_limit, lowest - margins, 0.0)
+        has_limit = np.array([quantity.relation in WITH_LIMIT for quantity in quantities])
+        is_valid = np.isfinite(lowest) & np.isfinite(margins) & (has_limit | (lowest >= 0.0))
+        _leave_out(is_valid, quantities, lowest)
+        limits = np.where(has_limit, lowest - margins, 0.0)
         # objects that never overlapped get a limit of at least 0, which excludes overlaps
         is_distance = np.array([quantity.relation == "dist" for quantity in quantities])
         limits[:, 0] = np.where(
             is_distance & (lowest[:, 0] >= 0.0), np.maximum(limits[:, 0], 0.0), limits[:, 0]
         )
-        limits = np.where(valid, limits, np.nan)
+        limits = np.where(is_valid, limits, np.nan)
         if not bad:
             return cls(
                 tuple(quantities), tuple(good), (), limits, lowest, margins, np.empty((*limits.shape, 0))
             )
-        reached = np.stack([_by_pattern(run, 1) for run in bad], axis=-1)
-        beyond = reached < limits[..., None]
-        nearest = np.where(beyond, reached, -np.inf).max(axis=-1)
-        limits = np.where(with_limit, np.fmax(limits, (lowest + nearest) / 2.0), limits)
-        limits = np.where(valid, limits, np.nan)
+        bad_values = np.stack([_by_pattern(run, 1) for run in bad], axis=-1)
+        is_beyond_limit = bad_values < limits[..., None]
+        nearest_bad_value = np.where(is_beyond_limit, bad_values, -np.inf).max(axis=-1)
+        limits = np.where(has_limit, np.fmax(limits, (lowest + nearest_bad_value) / 2.0), limits)
+        limits = np.where(is_valid, limits, np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = (lowest[..., None] - reached) / margins[..., None]
-        moved: list[tuple[int, ...]] = []
-        for run in np.flatnonzero(~beyond.any(axis=(0, 1, 2))).tolist():
-            behind = np.where(valid & with_limit & (reached[..., run] < lowest), far[..., run], 0.0)
-            where = np.unravel_index(int(behind.argmax()), behind.shape)
-            if behind[where] > 0.0:
-                limits[where] = max(limits[where], (lowest[where] + reached[(*where, run)]) / 2.0)
-                moved.append((*map(int, where), run))
-        beyond = reached < limits[..., None]
-        apart = np.where(beyond, np.clip(np.nan_to_num(far / _SURE, nan=1.0, posinf=1.0), 0.05, 1.0), 0.0)
-        for index in moved:
-            apart[index] = 1.0
+            distances_in_margins = (lowest[..., None] - bad_values) / margins[..., None]
+        moved_limits: list[tuple[int, ...]] = []
+        for run_index in np.flatnonzero(~is_beyond_limit.any(axis=(0, 1, 2))).tolist():
+            distances_behind = np.where(
+                is_valid & has_limit & (bad_values[..., run_index] < lowest),
+                distances_in_margins[..., run_index],
+                0.0,
+            )
+            limit_index = np.unravel_index(int(distances_behind.argmax()), distances_behind.shape)
+            if distances_behind[limit_index] > 0.0:
+                limits[limit_index] = max(
+                    limits[limit_index], (lowest[limit_index] + bad_values[(*limit_index, run_index)]) / 2.0
+                )
+                moved_limits.append((*map(int, limit_index), run_index))
+        is_beyond_limit = bad_values < limits[..., None]
+        apart = np.where(
+            is_beyond_limit,
+            np.clip(np.nan_to_num(distances_in_margins / _SURE, nan=1.0, posinf=1.0), 0.05, 1.0),
+            0.0,
+        )
+        for apart_index in moved_limits:
+            apart[apart_index] = 1.0
         return cls(tuple(quantities), tuple(good), tuple(bad), limits, lowest, margins, apart)
 
     def fact(self, pattern: int, direction: int, quantity: int) -> LimitedRelation:
         """Return the relation of a quantity with its limit, rounded to a short decimal that still holds."""
-        subject = self.quantities[quantity]
-        if subject.relation not in WITH_LIMIT:
-            return LimitedRelation(subject, direction, 0.0)
-        where = pattern, direction, quantity
-        limit, lowest = float(self.limits[where]), float(self.lowest[where])
-        if not self.bad and (plain := _one_digit(limit, lowest)) is not None:
-            return LimitedRelation(subject, direction, plain)
+        limited_quantity = self.quantities[quantity]
+        if limited_quantity.relation not in WITH_LIMIT:
+            return LimitedRelation(limited_quantity, direction, 0.0)
+        limit_index = pattern, direction, quantity
+        limit, lowest_value = float(self.limits[limit_index]), float(self.lowest[limit_index])
+        if not self.bad and (one_digit_limit := _one_digit(limit, lowest_value)) is not None:
+            return LimitedRelation(limited_quantity, direction, one_digit_limit)
         return LimitedRelation(
-            subject, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest)
+            limited_quantity,
+            direction,
+            _short(limit, max(lowest_value - limit, _FINEST * abs(lowest_value)), lowest_value),
         )
 
     @cached_property
@@ -324,61 +349,68 @@ class FittedLimits:
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
         """Indices of quantities: for each quantity of a class, those of the class members; else empty."""
-        classes = members_of(self.good[0].trace)
-        numbers = {
+        names_by_class = members_of(self.good[0].trace)
+        index_by_relation = {
             (quantity.relation, parties): index
             for index, quantity in enumerate(self.quantities)
             for parties in (
                 [quantity.parties, quantity.parties[::-1]] if quantity.is_symmetric else [quantity.parties]
             )
         }
-        members = []
+        all_members = []
         for quantity in self.quantities:
-            named = [
-                [Party(name) for name in classes.get(party.name, ())] if party.is_class else [party]
+            party_members = [
+                [Party(name) for name in names_by_class.get(party.name, ())] if party.is_class else [party]
                 for party in quantity.parties
             ]
-            member_numbers: set[int] = set()
+            member_indices: set[int] = set()
             if any(party.is_class for party in quantity.parties):
-                pairs = product(*named)
-                member_numbers = {
-                    index for pair in pairs if (index := numbers.get((quantity.relation, pair), -1)) >= 0
+                pairs = product(*party_members)
+                member_indices = {
+                    index
+                    for pair in pairs
+                    if (index := index_by_relation.get((quantity.relation, pair), -1)) >= 0
                 }
-            members.append(tuple(sorted(member_numbers)))
-        return tuple(members)
+            all_members.append(tuple(sorted(member_indices)))
+        return tuple(all_members)
 
     @cached_property
     def moves(self) -> Booleans:
         """(Q,), whether each quantity varies in some good run."""
-        travel = np.max([run.travel for run in self.good], axis=0)
+        travels = np.max([run.travel for run in self.good], axis=0)
         is_length = np.array(
             [quantity.relation not in ("oriented", "signal") for quantity in self.quantities]
         )
-        return np.asarray(travel > np.where(is_length, _STILL * self.scale, 0.0))
+        return np.asarray(travels > np.where(is_length, _STILL * self.scale, 0.0))
 
     @cached_property
     def landmarks(self) -> frozenset[Party]:
         """Objects, and classes of objects, that stay in place in all good runs."""
-        shifts = {
+        shift_by_name = {
             name: max(run.shifts[name] for run in self.good)
             for name in set.intersection(*(set(run.shifts) for run in self.good))
         }
-        farthest = max((shift for shift in shifts.values() if np.isfinite(shift)), default=0.0)
-        still = {name for name, shift in shifts.items() if shift < _STAYS * farthest}
-        classes = [members_of(run.trace) for run in self.good]
-        whole = {
+        farthest = max((shift for shift in shift_by_name.values() if np.isfinite(shift)), default=0.0)
+        still_names = {name for name, shift in shift_by_name.items() if shift < _STAYS * farthest}
+        classes_by_run = [members_of(run.trace) for run in self.good]
+        still_classes = {
             name
-            for name in classes[0]
-            if all(name in names_by_class and names_by_class[name] <= still for names_by_class in classes)
+            for name in classes_by_run[0]
+            if all(
+                name in names_by_class and names_by_class[name] <= still_names
+                for names_by_class in classes_by_run
+            )
         }
-        return frozenset([*map(Party, still), *(Party(name, True) for name in whole)])
+        return frozenset([*map(Party, still_names), *(Party(name, True) for name in still_classes)])
 
     def bits_between(self, quantity: int) -> float:
         """Return the information of "the distance is between its limits at the end", bits."""
         limits = self.limits[FINALLY, :, quantity, None]
         limits = np.where(np.isfinite(limits), limits, -np.inf)
-        inside = [(run.sampled[:, quantity] >= limits).all(axis=0).mean() for run in self.good[:_SCORED_RUNS]]
-        return float(-np.log2(max(float(np.mean(inside)), 2.0**-_MOST_BITS)))
+        inside_shares = [
+            (run.sampled[:, quantity] >= limits).all(axis=0).mean() for run in self.good[:_SCORED_RUNS]
+        ]
+        return float(-np.log2(max(float(np.mean(inside_shares)), 2.0**-_MOST_BITS)))
 
     @cached_property
     def bits(self) -> Floats:
@@ -387,32 +419,36 @@ class FittedLimits:
         It is higher for a line with `F` that holds in fewer samples. It is higher for a line with `G` that
         comes closer to failing, relative to its variation.
         """
-        some = self.good[:_SCORED_RUNS]
-        share = np.mean([(run.sampled[None] >= self.limits[..., None]).mean(axis=-1) for run in some], axis=0)
-        bits = -np.log2(np.maximum(share, 2.0**-_MOST_BITS))
-        travel = np.max([run.travel for run in self.good], axis=0)
+        scored_runs = self.good[:_SCORED_RUNS]
+        holding_shares = np.mean(
+            [(run.sampled[None] >= self.limits[..., None]).mean(axis=-1) for run in scored_runs], axis=0
+        )
+        bits = -np.log2(np.maximum(holding_shares, 2.0**-_MOST_BITS))
+        travels = np.max([run.travel for run in self.good], axis=0)
         is_distance = np.array([quantity.relation == "dist" for quantity in self.quantities])
         has_no_length = np.array(
             [quantity.relation in ("signal", "oriented") for quantity in self.quantities]
         )
-        near = np.maximum(np.abs(self.lowest[ALWAYS]) + self.margins[ALWAYS], 1e-12)
+        failure_distances = np.maximum(np.abs(self.lowest[ALWAYS]) + self.margins[ALWAYS], 1e-12)
         with np.errstate(invalid="ignore", divide="ignore"):
-            tight = np.log2(np.where(is_distance, self.scale / 2.0, travel) / near)
+            tightness_bits = np.log2(np.where(is_distance, self.scale / 2.0, travels) / failure_distances)
         # a relation that never holds, and the limits of a signal, may be accidental
-        tight[1, ~is_distance] = 0.0
-        tight[:, has_no_length | ~self.moves] = 0.0
-        bits[ALWAYS] = tight
+        tightness_bits[1, ~is_distance] = 0.0
+        tightness_bits[:, has_no_length | ~self.moves] = 0.0
+        bits[ALWAYS] = tightness_bits
         return np.where(np.isfinite(self.limits), np.clip(bits, 0.0, _MOST_BITS), 0.0)
 
     def events(self) -> list[LimitedRelation]:
         """Return relations that hold at the end of all good runs but at no beginning, the rarest first."""
-        begun = np.stack([run.first[:, 1] for run in self.good], axis=-1).max(axis=-1)
+        greatest_starts = np.stack([run.first[:, 1] for run in self.good], axis=-1).max(axis=-1)
         limits = self.limits[FINALLY]
-        is_event = np.isfinite(limits) & (begun < limits) & (self.bits[FINALLY] > 0.0)
+        is_event = np.isfinite(limits) & (greatest_starts < limits) & (self.bits[FINALLY] > 0.0)
         is_event[0] &= np.array([quantity.relation != "dist" for quantity in self.quantities])
-        where = np.argwhere(is_event)
-        order = np.argsort(-self.bits[FINALLY][is_event], kind="stable")[:_MOST_EVENTS]
-        return [self.fact(FINALLY, direction, index) for direction, index in where[order].tolist()]
+        event_indices = np.argwhere(is_event)
+        bit_order = np.argsort(-self.bits[FINALLY][is_event], kind="stable")[:_MOST_EVENTS]
+        return [
+            self.fact(FINALLY, direction, index) for direction, index in event_indices[bit_order].tolist()
+        ]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
         """Return the first samples in which relations certainly hold, and may hold, (F, R) each."""
@@ -423,8 +459,8 @@ class FittedLimits:
             ]
             for surely in (True, False)
         ]
-        sure, possible = np.array(first_times, np.int64).reshape(2, len(facts), len(runs))
-        return sure, possible
+        sure_times, possible_times = np.array(first_times, np.int64).reshape(2, len(facts), len(runs))
+        return sure_times, possible_times
 
     def orders(self, facts: Sequence[LimitedRelation]) -> list[tuple[Line, int, Booleans]]:
         """Return the orders of relations that are the same in all good runs.
@@ -434,18 +470,18 @@ class FittedLimits:
             bad run with the reverse order.
         """
         facts = [fact.near for fact in facts]
-        sure, possible = self.times(facts, self.good)
-        bad_sure, bad_possible = self.times(facts, self.bad)
-        lengths = np.array([len(run.trace) for run in self.good])
+        sure_times, possible_times = self.times(facts, self.good)
+        bad_sure_times, bad_possible_times = self.times(facts, self.bad)
+        sample_counts = np.array([len(run.trace) for run in self.good])
         lines = []
-        for first_index, first in enumerate(facts):
-            for later_index, later in enumerate(facts):
-                if first_index == later_index or first.quantity.pair == later.quantity.pair:
+        for first_index, first_fact in enumerate(facts):
+            for later_index, later_fact in enumerate(facts):
+                if first_index == later_index or first_fact.quantity.pair == later_fact.quantity.pair:
                     continue
-                gap = int((possible[later_index] - sure[first_index]).min())
-                if gap > 0 and (sure[later_index] < lengths).all():
-                    violating = bad_sure[later_index] < bad_possible[first_index]
-                    lines.append((order_line(first, later), gap, violating))
+                gap_samples = int((possible_times[later_index] - sure_times[first_index]).min())
+                if gap_samples > 0 and (sure_times[later_index] < sample_counts).all():
+                    is_violating = bad_sure_times[later_index] < bad_possible_times[first_index]
+                    lines.append((order_line(first_fact, later_fact), gap_samples, is_violating))
         return lines
 
 
@@ -454,27 +490,29 @@ def _by_pattern(run: Observed, end: int) -> Floats:
     return np.stack((run.least[:, end], run.last[:, end], run.greatest[:, end]))
 
 
-def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
+def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
     """Mark limits as invalid that another quantity expresses better, or that no one would write."""
-    inside: dict[frozenset[Party], Booleans] = {}
+    inside_by_pair: dict[frozenset[Party], Booleans] = {}
     for index, quantity in enumerate(quantities):
         if quantity.relation == "enclosedin":
-            inside[quantity.pair] = inside.get(quantity.pair, np.zeros(3, bool)) | valid[:, 0, index]
+            inside_by_pair[quantity.pair] = (
+                inside_by_pair.get(quantity.pair, np.zeros(3, bool)) | is_valid[:, 0, index]
+            )
     for index, quantity in enumerate(quantities):
         if quantity.relation == "oriented":
-            valid[:, 1, index] = False
+            is_valid[:, 1, index] = False
         elif quantity.relation == "dist":
             # left out are the depth of an overlap, and a large distance at some time
-            valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
-            valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
-            valid[EVENTUALLY, 0, index] = False
+            is_valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
+            is_valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
+            is_valid[EVENTUALLY, 0, index] = False
         elif quantity.relation == "ovlp":
             # an object inside another one overlaps it, too
-            valid[:, 0, index] &= ~inside.get(quantity.pair, np.zeros(3, bool))
-            valid[:, 1, index] = False
+            is_valid[:, 0, index] &= ~inside_by_pair.get(quantity.pair, np.zeros(3, bool))
+            is_valid[:, 1, index] = False
         elif quantity.relation not in WITH_LIMIT:
             # a negated relation is written only if the relation never holds
-            valid[1:, 1, index] = False
+            is_valid[1:, 1, index] = False
 
 
 def _short(limit: float, margin: float, lowest: float) -> float:
@@ -482,9 +520,9 @@ def _short(limit: float, margin: float, lowest: float) -> float:
     if margin <= 0.0:
         return limit
     exponent = floor(log10(margin)) - 1
-    rounded = Decimal(limit).scaleb(-exponent).to_integral_value(ROUND_FLOOR).scaleb(exponent)
-    short = float(rounded)
-    return short if short <= lowest else lowest
+    rounded_limit = Decimal(limit).scaleb(-exponent).to_integral_value(ROUND_FLOOR).scaleb(exponent)
+    short_limit = float(rounded_limit)
+    return short_limit if short_limit <= lowest else lowest
 
 
 def _one_digit(limit: float, lowest: float) -> float | None:
@@ -493,6 +531,6 @@ def _one_digit(limit: float, lowest: float) -> float | None:
     People write 0.05 instead of 0.0487, and good runs alone do not decide between the two.
     """
     step = Decimal(1).scaleb(floor(log10(max(abs(limit), abs(lowest)) or 1.0)))
-    first = (Decimal(limit) / step).to_integral_value(ROUND_CEILING)
-    last = (Decimal(lowest) / step).to_integral_value(ROUND_FLOOR)
-    return float(first * step) if first == last != 0 else None
+    first_multiple = (Decimal(limit) / step).to_integral_value(ROUND_CEILING)
+    last_multiple = (Decimal(lowest) / step).to_integral_value(ROUND_FLOOR)
+    return float(first_multiple * step) if first_multiple == last_multiple != 0 else None

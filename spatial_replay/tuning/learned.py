@@ -68,40 +68,43 @@ def chosen_lines(fit: FittedLimits, most: int) -> tuple[Line, ...]:
     return tuple(_join_limits(lines))
 
 
-def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
+def _distinctive(fit: FittedLimits, most_lines: int) -> list[Line]:
     """Return lines, each with the most bad runs that the earlier lines do not distinguish."""
-    where = np.argwhere((fit.apart > 0.0).any(axis=-1))
+    limit_indices = np.argwhere((fit.apart > 0.0).any(axis=-1))
     events = fit.events()
-    lengths = np.array([len(run.trace) for run in fit.bad])
-    never = dict(zip(events, fit.times(events, fit.bad)[1] >= lengths, strict=True))
+    sample_counts = np.array([len(run.trace) for run in fit.bad])
+    is_missing_by_event = dict(zip(events, fit.times(events, fit.bad)[1] >= sample_counts, strict=True))
     orders = [(line, violating) for line, _, violating in fit.orders(events) if violating.any()]
-    weights = [fit.apart[tuple(place)] for place in where]
+    weights = [fit.apart[tuple(limit_index)] for limit_index in limit_indices]
     weights += [
-        np.where(violating, np.where(never[line.fact], _NEVER, 1.0), 0.0) for line, violating in orders
+        np.where(violating, np.where(is_missing_by_event[line.fact], _NEVER, 1.0), 0.0)
+        for line, violating in orders
     ]
-    plain = [_plainness(fit, *place) for place in where.tolist()]
-    plain += [_PLAIN_BEFORE if line.pattern == "before" else _PLAIN_UNTIL for line, _ in orders]
-    bits = [round(float(fit.bits[tuple(place)]), 3) for place in where] + [0.0 for _ in orders]
-    apart = np.array(weights).reshape(len(weights), len(fit.bad))
-    rows = {tuple(place): row for row, place in enumerate(where.tolist())}
-    still = np.ones(len(fit.bad))
-    result: list[Line] = []
-    while len(result) < min(most, len(weights)):
-        gains = np.round(apart @ still * plain, 3)
-        best = max(range(len(weights)), key=lambda row: (gains[row], bits[row], -row))
-        if gains[best] < _LEAST_GAIN:
+    plainness = [_plainness(fit, *limit_index) for limit_index in limit_indices.tolist()]
+    plainness += [_PLAIN_BEFORE if line.pattern == "before" else _PLAIN_UNTIL for line, _ in orders]
+    bits = [round(float(fit.bits[tuple(limit_index)]), 3) for limit_index in limit_indices] + [
+        0.0 for _ in orders
+    ]
+    run_weights = np.array(weights).reshape(len(weights), len(fit.bad))
+    row_by_limit = {tuple(limit_index): row for row, limit_index in enumerate(limit_indices.tolist())}
+    run_factors = np.ones(len(fit.bad))
+    selected_lines: list[Line] = []
+    while len(selected_lines) < min(most_lines, len(weights)):
+        gains = np.round(run_weights @ run_factors * plainness, 3)
+        best_row = max(range(len(weights)), key=lambda row: (gains[row], bits[row], -row))
+        if gains[best_row] < _LEAST_GAIN:
             break
-        if best < len(where):
-            pattern, direction, quantity = where[best].tolist()
-            result.append(Line(PATTERNS[pattern], fit.fact(pattern, direction, quantity)))
+        if best_row < len(limit_indices):
+            pattern, direction, quantity = limit_indices[best_row].tolist()
+            selected_lines.append(Line(PATTERNS[pattern], fit.fact(pattern, direction, quantity)))
             # a line about a class includes its members
-            member_rows = [rows.get((pattern, direction, member)) for member in fit.members[quantity]]
-            apart[[row for row in member_rows if row is not None]] = 0.0
+            member_rows = [row_by_limit.get((pattern, direction, member)) for member in fit.members[quantity]]
+            run_weights[[row for row in member_rows if row is not None]] = 0.0
         else:
-            result.append(orders[best - len(where)][0])
-        still = still * (1.0 - apart[best] * _LESS)
-        apart[best] = 0.0
-    return result
+            selected_lines.append(orders[best_row - len(limit_indices)][0])
+        run_factors = run_factors * (1.0 - run_weights[best_row] * _LESS)
+        run_weights[best_row] = 0.0
+    return selected_lines
 
 
 def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -> float:
@@ -113,79 +116,88 @@ def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -
         return 1.0
     if pattern == ALWAYS and relation == "dist":
         return 0.4
-    worth = (
+    weight = (
         0.9 if pattern == FINALLY and (relation in _DIRECTIONS or (relation == "dist" and direction)) else 0.7
     )
-    return worth * (0.7 if pattern == EVENTUALLY else 1.0)
+    return weight * (0.7 if pattern == EVENTUALLY else 1.0)
 
 
 def _join(groups: list[set[Party]], pair: tuple[Party, ...]) -> bool:
     """Join the groups of two objects; return whether the objects were in different groups."""
-    touching = [group for group in groups if not group.isdisjoint(pair)]
-    groups[:] = [*(group for group in groups if group not in touching), set(pair).union(*touching)]
-    return not any(group.issuperset(pair) for group in touching)
+    overlapping_groups = [group for group in groups if not group.isdisjoint(pair)]
+    groups[:] = [
+        *(group for group in groups if group not in overlapping_groups),
+        set(pair).union(*overlapping_groups),
+    ]
+    return not any(group.issuperset(pair) for group in overlapping_groups)
 
 
-def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
+def _characteristic(fit: FittedLimits, most_lines: int) -> list[Line]:
     """Return lines that describe all good runs: goals first, then invariants, then orders."""
-    share = max(1, int(most * _SHARE_OF_ALWAYS))
-    always = _invariants(fit)[:share]
-    goals = _goals(fit)[: max(1, most - len(always))]
+    share_count = max(1, int(most_lines * _SHARE_OF_ALWAYS))
+    invariants = _invariants(fit)[:share_count]
+    goals = _goals(fit)[: max(1, most_lines - len(invariants))]
     orders = list(_chain(fit, [line.fact for line in goals if line.pattern == "finally"]))
-    return [*goals, *always, *orders[: max(0, min(share, most - len(goals) - len(always)))]]
+    return [
+        *goals,
+        *invariants,
+        *orders[: max(0, min(share_count, most_lines - len(goals) - len(invariants)))],
+    ]
 
 
 def _goals(fit: FittedLimits) -> list[Line]:
     """Return lines about the end of good runs: a distance for each object, and relations that changed."""
-    scored: list[tuple[float, int, Line]] = []
-    joined, placed = list[set[Party]](), Counter[Party]()
-    pairs = set()
-    of_class: set[int] = set()
+    scored_lines: list[tuple[float, int, Line]] = []
+    party_groups, distance_counts = list[set[Party]](), Counter[Party]()
+    scored_pairs = set()
+    covered_indices: set[int] = set()
     centre = _centre(fit)
     for _, index in sorted(_distances(fit), key=lambda item: (-item[0], item[1])):
         quantity = fit.quantities[index]
-        if index not in of_class and (
-            _places(fit, quantity, placed, centre) if fit.landmarks else _join(joined, quantity.parties)
+        if index not in covered_indices and (
+            _places(fit, quantity, distance_counts, centre)
+            if fit.landmarks
+            else _join(party_groups, quantity.parties)
         ):
-            of_class.update(fit.members[index])
-            fact = near = fit.fact(FINALLY, 1, index)
+            covered_indices.update(fit.members[index])
+            fact = upper_relation = fit.fact(FINALLY, 1, index)
             if fit.limits[FINALLY, 0, index] > 0.0:
-                fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
-            bit = fit.bits_between(index)
-            if centre in quantity.parties or any(placed[party] == 1 for party in quantity.parties):
+                fact = replace(fit.fact(FINALLY, 0, index), other_limit=upper_relation.limit)
+            bits = fit.bits_between(index)
+            if centre in quantity.parties or any(distance_counts[party] == 1 for party in quantity.parties):
                 # the nearest landmark describes a place best, whatever the path of the object
-                bit = max(bit, _LEAST_BITS_PLACED)
-            scored.append((bit, index, Line("finally", fact)))
-            pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
-    before: dict[tuple[str, Party], set[Party]] = {}
+                bits = max(bits, _LEAST_BITS_PLACED)
+            scored_lines.append((bits, index, Line("finally", fact)))
+            scored_pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
+    followers: dict[tuple[str, Party], set[Party]] = {}
     relations = [
-        (bit, index)
+        (bits, index)
         for index, quantity in enumerate(fit.quantities)
         if quantity.relation not in ("dist", "signal")
         and (not fit.landmarks or fit.landmarks.intersection(quantity.parties))
-        and (bit := _said_at_end(fit, index)) >= _LEAST_BITS
+        and (bits := _said_at_end(fit, index)) >= _LEAST_BITS
         and fit.moves[index]
         and _agrees(fit, FINALLY, 0, index)
     ]
-    for bit, index in sorted(relations, key=lambda item: _by_worth(fit, *item)):
+    for bits, index in sorted(relations, key=lambda item: _by_worth(fit, *item)):
         quantity = fit.quantities[index]
-        began = _begins_otherwise(fit, index)
-        if index in of_class or not (began or quantity.pair in pairs):
+        is_changed = _begins_otherwise(fit, index)
+        if index in covered_indices or not (is_changed or quantity.pair in scored_pairs):
             continue
-        if quantity.relation == "ovlp" and quantity.pair in pairs:
+        if quantity.relation == "ovlp" and quantity.pair in scored_pairs:
             # an object inside another one overlaps it, too
             continue
-        of_class.update(fit.members[index])
+        covered_indices.update(fit.members[index])
         if quantity.relation in _DIRECTIONS:
-            first, second = quantity.parties
-            if _leads(before, quantity.relation, first, second):
+            first_party, second_party = quantity.parties
+            if _leads(followers, quantity.relation, first_party, second_party):
                 continue
-            before.setdefault((quantity.relation, first), set()).add(second)
-        scored.append((bit, index, Line("finally", fit.fact(FINALLY, 0, index))))
-        pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
-    scored += _visits(fit, pairs)
-    ordered = sorted(scored, key=lambda item: (-item[0], item[1]))
-    return _spread([(bit, line) for bit, _, line in ordered], fit.landmarks)
+            followers.setdefault((quantity.relation, first_party), set()).add(second_party)
+        scored_lines.append((bits, index, Line("finally", fit.fact(FINALLY, 0, index))))
+        scored_pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
+    scored_lines += _visits(fit, scored_pairs)
+    sorted_lines = sorted(scored_lines, key=lambda item: (-item[0], item[1]))
+    return _spread([(bits, line) for bits, _, line in sorted_lines], fit.landmarks)
 
 
 def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
@@ -205,30 +217,38 @@ def _said_at_end(fit: FittedLimits, index: int) -> float:
 
 def _centre(fit: FittedLimits) -> Party | None:
     """Return the landmark next to which most objects end, such as a plate; None if no landmark has two."""
-    nearest: dict[Party, tuple[float, Party]] = {}
+    nearest_landmarks: dict[Party, tuple[float, Party]] = {}
     for index, quantity in enumerate(fit.quantities):
-        still = [party for party in quantity.parties if party in fit.landmarks and not party.is_class]
-        moved = [party for party in quantity.parties if party not in fit.landmarks and not party.is_class]
-        if quantity.relation == "dist" and len(still) == len(moved) == 1 and fit.moves[index]:
-            landmark_distance = float(fit.lowest[FINALLY, 0, index]), still[0]
-            nearest[moved[0]] = min(nearest.get(moved[0], landmark_distance), landmark_distance)
-    counts = Counter(landmark for _, landmark in nearest.values())
+        still_parties = [party for party in quantity.parties if party in fit.landmarks and not party.is_class]
+        moved_parties = [
+            party for party in quantity.parties if party not in fit.landmarks and not party.is_class
+        ]
+        if quantity.relation == "dist" and len(still_parties) == len(moved_parties) == 1 and fit.moves[index]:
+            landmark_distance = float(fit.lowest[FINALLY, 0, index]), still_parties[0]
+            nearest_landmarks[moved_parties[0]] = min(
+                nearest_landmarks.get(moved_parties[0], landmark_distance), landmark_distance
+            )
+    landmark_counts = Counter(landmark for _, landmark in nearest_landmarks.values())
     return max(
-        (landmark for landmark in counts if counts[landmark] > 1),
-        key=lambda landmark: (counts[landmark], landmark),
+        (landmark for landmark in landmark_counts if landmark_counts[landmark] > 1),
+        key=lambda landmark: (landmark_counts[landmark], landmark),
         default=None,
     )
 
 
-def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centre: Party | None) -> bool:
+def _places(
+    fit: FittedLimits, quantity: Quantity, distance_counts: Counter[Party], centre: Party | None
+) -> bool:
     """Return whether a distance from a landmark helps to define the place of a moved object, and count it.
 
     An object needs at most `_DISTANCES` of them. The distance from the centre is always used.
     """
-    moved = [party for party in quantity.parties if party not in fit.landmarks]
-    if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
+    moved_parties = [party for party in quantity.parties if party not in fit.landmarks]
+    if len(moved_parties) != 1 or (
+        distance_counts[moved_parties[0]] >= _DISTANCES and centre not in quantity.parties
+    ):
         return False
-    placed.update(moved)
+    distance_counts.update(moved_parties)
     return True
 
 
@@ -237,19 +257,20 @@ def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, 
     return fit.quantities[index].relation == "ovlp", -round(bits, 1), not fit.members[index], index
 
 
-def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
+def _spread(scored_lines: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
     """Return lines by their bits; each earlier line about the same moved object reduces the bits."""
-    counts = Counter[Party]()
-    result = []
-    left = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored]
-    while left:
-        worth = [
-            bit * _NEXT_LINE ** min((counts[party] for party in moved), default=0) for bit, _, moved in left
+    party_counts = Counter[Party]()
+    ordered_lines = []
+    remaining_lines = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored_lines]
+    while remaining_lines:
+        weights = [
+            bit * _NEXT_LINE ** min((party_counts[party] for party in moved_parties), default=0)
+            for bit, _, moved_parties in remaining_lines
         ]
-        _, line, moved = left.pop(worth.index(max(worth)))
-        result.append(line)
-        counts.update(moved)
-    return result
+        _, line, moved_parties = remaining_lines.pop(weights.index(max(weights)))
+        ordered_lines.append(line)
+        party_counts.update(moved_parties)
+    return ordered_lines
 
 
 def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool:
@@ -258,12 +279,12 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
     If so, one line about the class replaces the lines about its members.
     """
     limit = abs(float(fit.limits[pattern, direction, index]))
-    alike = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
+    greatest_ratio = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
     for member in fit.members[index]:
         member_limit = abs(float(fit.limits[pattern, direction, member]))
-        if not fit.bits[pattern, direction, member] >= _LEAST_BITS or max(member_limit, limit) > alike * min(
+        if not fit.bits[pattern, direction, member] >= _LEAST_BITS or max(
             member_limit, limit
-        ):
+        ) > greatest_ratio * min(member_limit, limit):
             return False
     return True
 
@@ -274,31 +295,33 @@ def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
     With landmarks, the weight is nearness; otherwise it says how well a distance defines a place.
     """
     for index, quantity in enumerate(fit.quantities):
-        far, near = fit.limits[FINALLY, :, index]
-        if quantity.relation != "dist" or not near < 0.0 or not fit.moves[index]:
+        lower_limit, negated_upper_limit = fit.limits[FINALLY, :, index]
+        if quantity.relation != "dist" or not negated_upper_limit < 0.0 or not fit.moves[index]:
             continue
         bits = fit.bits_between(index)
         is_apart = len(quantity.pair) == 2 and fit.lowest[FINALLY, 0, index] >= 0.0
         if fit.landmarks:
             if is_apart and not fit.members[index]:
-                yield near, index
+                yield negated_upper_limit, index
         elif is_apart and bits >= _LEAST_BITS and _agrees(fit, FINALLY, 1, index):
-            spread = -near - (far if np.isfinite(far) else 0.0)
+            interval_width = -negated_upper_limit - (lower_limit if np.isfinite(lower_limit) else 0.0)
             travel = max(float(run.travel[index]) for run in fit.good)
-            exact = np.log2(travel / max(spread, 1e-3 * travel))
-            close = np.log2(fit.scale / max(-near, 0.02 * fit.scale))
-            yield float(min(bits, 3.0) + min(exact, 4.0) + close), index
+            precision_bits = np.log2(travel / max(interval_width, 1e-3 * travel))
+            closeness_bits = np.log2(fit.scale / max(-negated_upper_limit, 0.02 * fit.scale))
+            yield float(min(bits, 3.0) + min(precision_bits, 4.0) + closeness_bits), index
 
 
-def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, first: Party, second: Party) -> bool:
+def _leads(
+    followers: dict[tuple[str, Party], set[Party]], relation: str, first: Party, second: Party
+) -> bool:
     """Return whether a chain of already written directions leads from one object to another."""
-    reached, left = {first}, [first]
-    while left:
-        for follower in before.get((relation, left.pop()), ()):
-            if follower not in reached:
-                reached.add(follower)
-                left.append(follower)
-    return second in reached
+    reachable_parties, pending_parties = {first}, [first]
+    while pending_parties:
+        for follower in followers.get((relation, pending_parties.pop()), ()):
+            if follower not in reachable_parties:
+                reachable_parties.add(follower)
+                pending_parties.append(follower)
+    return second in reachable_parties
 
 
 def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[float, int, Line]]:
@@ -308,50 +331,52 @@ def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[f
             continue
         direction = 1 if quantity.relation == "dist" else 0
         limit, bits = fit.limits[EVENTUALLY, direction, index], float(fit.bits[EVENTUALLY, direction, index])
-        ends = [
+        end_values = [
             max(float(run.first[direction, 1, index]), float(run.last[direction, 1, index]))
             for run in fit.good
         ]
         travel = max(float(run.travel[index]) for run in fit.good)
-        if np.isfinite(limit) and bits >= 2.0 and fit.moves[index] and max(ends) < limit - travel / 4.0:
+        if np.isfinite(limit) and bits >= 2.0 and fit.moves[index] and max(end_values) < limit - travel / 4.0:
             yield bits / 2.0, index, Line("eventually", fit.fact(EVENTUALLY, direction, index))
 
 
 def _invariants(fit: FittedLimits) -> list[Line]:
     """Return lines with `G`, those closest to failing first; a class replaces its members."""
-    scored = []
+    scored_lines = []
     for direction, index in np.argwhere(fit.bits[ALWAYS] >= _LEAST_BITS).tolist():
         fact, bits = fit.fact(ALWAYS, direction, index), float(fit.bits[ALWAYS, direction, index])
         is_distance = fact.quantity.relation == "dist"
-        is_said = fact.limit > 0.0 if is_distance and not direction else bits >= _LEAST_BITS_NEAR
-        is_written = is_distance or fact.quantity.relation == "enclosedin"
-        if is_said and is_written and _agrees(fit, ALWAYS, direction, index):
-            scored.append((-round(bits, 3), index, Line("always", fact)))
-    scored.sort(key=lambda item: item[:2])
-    hidden = {(line.fact.direction, member) for _, index, line in scored for member in fit.members[index]}
-    return [line for _, index, line in scored if (line.fact.direction, index) not in hidden]
+        is_informative = fact.limit > 0.0 if is_distance and not direction else bits >= _LEAST_BITS_NEAR
+        is_writable = is_distance or fact.quantity.relation == "enclosedin"
+        if is_informative and is_writable and _agrees(fit, ALWAYS, direction, index):
+            scored_lines.append((-round(bits, 3), index, Line("always", fact)))
+    scored_lines.sort(key=lambda item: item[:2])
+    member_facts = {
+        (line.fact.direction, member) for _, index, line in scored_lines for member in fit.members[index]
+    }
+    return [line for _, index, line in scored_lines if (line.fact.direction, index) not in member_facts]
 
 
 def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
     """Yield lines for the order in which goals are reached."""
     goals = [goal.near for goal in goals]
-    times, _ = fit.times(goals, fit.good)
-    gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
+    goal_times, _ = fit.times(goals, fit.good)
+    orders_by_pair = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
     # a goal that holds in the first sample has no place in the order
-    reached = [
+    reached_goals = [
         goals[index]
-        for index in np.argsort(np.median(times, axis=1), kind="stable").tolist()
-        if times[index].min() > 0
+        for index in np.argsort(np.median(goal_times, axis=1), kind="stable").tolist()
+        if goal_times[index].min() > 0
     ]
-    last: LimitedRelation | None = None
-    for first, later in pairwise(reached):
-        key = last or first, later
-        if key in gaps:
-            yield gaps[key][0]
-            last = None
+    pending_goal: LimitedRelation | None = None
+    for first_goal, later_goal in pairwise(reached_goals):
+        goal_pair = pending_goal or first_goal, later_goal
+        if goal_pair in orders_by_pair:
+            yield orders_by_pair[goal_pair][0]
+            pending_goal = None
         else:
             # both goals are reached at the same time, so the next goal is compared with the first of them
-            last = last or first
+            pending_goal = pending_goal or first_goal
 
 
 def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
@@ -361,14 +386,21 @@ def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
         for line in lines
         if line.fact.quantity.relation == "dist" and line.pattern in ("always", "finally")
     }
-    joined = set()
+    joined_keys = set()
     for line in lines:
-        least, greatest = (limits.get((line.pattern, line.fact.quantity, direction)) for direction in (0, 1))
-        if line.later is not None or least is None or greatest is None or least.other_limit is not None:
+        lower_relation, upper_relation = (
+            limits.get((line.pattern, line.fact.quantity, direction)) for direction in (0, 1)
+        )
+        if (
+            line.later is not None
+            or lower_relation is None
+            or upper_relation is None
+            or lower_relation.other_limit is not None
+        ):
             yield line
-        elif (line.pattern, line.fact.quantity) not in joined:
-            joined.add((line.pattern, line.fact.quantity))
-            yield Line(line.pattern, replace(least, other_limit=greatest.limit))
+        elif (line.pattern, line.fact.quantity) not in joined_keys:
+            joined_keys.add((line.pattern, line.fact.quantity))
+            yield Line(line.pattern, replace(lower_relation, other_limit=upper_relation.limit))
 
 
 # ------------------------------------------------------------------------------------------ the specification
@@ -451,22 +483,24 @@ class Learned(Printed):
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of text that the command `learn` prints: specs with their evidence."""
-        bad = sum(not is_good for _, is_good in self.runs)
-        good = len(self.runs) - bad
-        runs = plural(good, "good run") + (f" and {plural(bad, 'bad run')}" if bad else "")
+        bad_count = sum(not is_good for _, is_good in self.runs)
+        good_count = len(self.runs) - bad_count
+        runs_text = plural(good_count, "good run") + (
+            f" and {plural(bad_count, 'bad run')}" if bad_count else ""
+        )
         if self.specs:
-            yield f"learned {plural(len(self.specs), 'spec')} from {runs}:"
+            yield f"learned {plural(len(self.specs), 'spec')} from {runs_text}:"
         else:
-            what = "distinguishes any bad run" if bad else "is worth a line"
-            yield f"nothing that holds in all of {plural(good, 'good run')} {what}"
+            predicate = "distinguishes any bad run" if bad_count else "is worth a line"
+            yield f"nothing that holds in all of {plural(good_count, 'good run')} {predicate}"
         width = max((len(line.title) for line in self.specs), default=0)
         for line in self.specs:
-            violating = (
-                f"  violated by {len(line.violated_by)} of {bad}"
-                if bad
+            evidence_text = (
+                f"  violated by {len(line.violated_by)} of {bad_count}"
+                if bad_count
                 else f"  robustness at least {line.lowest:.4g}"
             )
-            yield f"  {line.title:<{width}}{violating}"
+            yield f"  {line.title:<{width}}{evidence_text}"
         if self.checked:
             yield checked_text(self.checked).rstrip(".")
         for name in self.missed[:_MOST_MISSED] if self.specs else ():
@@ -520,35 +554,38 @@ def learn_runs(
     if not quantities:
         raise UsageError(_nothing_in_common(good))
     left_out = (*_missing(good), *not_compared)
-    observed: dict[int, Observed] = {}
+    observed_by_id: dict[int, Observed] = {}
     for run in runs:
-        observed[id(run)] = Observed.of(run.trace, quantities)
+        observed_by_id[id(run)] = Observed.of(run.trace, quantities)
         advance(1)
     writer = _Writer(profile, {name for run in runs for name in run.trace.names})
 
-    def learn(some: Sequence[LabelledRun]) -> _Written | None:
-        groups = ([observed[id(run)] for run in some if run.is_good is kind] for kind in (True, False))
+    def learn(training_runs: Sequence[LabelledRun]) -> _Written | None:
+        groups = (
+            [observed_by_id[id(run)] for run in training_runs if run.is_good is is_good]
+            for is_good in (True, False)
+        )
         candidates = chosen_lines(FittedLimits.to(quantities, *groups), lines)
-        return writer.write_lines(candidates, some)
+        return writer.write_lines(candidates, training_runs)
 
     draft = learn(runs)
     if draft is not None and bad:
         draft = writer.order(draft, bad)
-    learned = [_evidence(*pair, good, bad) for pair in draft.pairs] if draft is not None else []
-    violating = {name for line in learned for name in line.violated_by}
-    checked = tuple(_check_folds(good, bad, learn))
-    missed = tuple(run.name for run in bad if run.name not in violating)
+    learned_lines = [_evidence(*pair, good, bad) for pair in draft.pairs] if draft is not None else []
+    violating_names = {name for line in learned_lines for name in line.violated_by}
+    checked_runs = tuple(_check_folds(good, bad, learn))
+    missed = tuple(run.name for run in bad if run.name not in violating_names)
     text = ""
     if draft is not None:
-        head = list(_head(good, bad, missed, checked, left_out))
-        text = writer.text(draft, head, learned, len(good), len(bad))
+        head_lines = list(_head(good, bad, missed, checked_runs, left_out))
+        text = writer.text(draft, head_lines, learned_lines, len(good), len(bad))
     return Learned(
         text,
         parse_specification(text, filename="learned.spatial") if text else None,
-        tuple(learned),
+        tuple(learned_lines),
         tuple((run.name, run.is_good) for run in runs),
         missed,
-        checked,
+        checked_runs,
         left_out,
     )
 
@@ -561,38 +598,38 @@ def _needs(trace: Trace) -> Needs:
 def _check(runs: Sequence[LabelledRun]) -> None:
     good = [run for run in runs if run.is_good]
     if len(good) < 2:
-        have = "there is no good run" if not good else f"{good[0].name} is the only good run"
-        raise UsageError(f"{have}; give at least two, better five, to show what can vary")
+        have_text = "there is no good run" if not good else f"{good[0].name} is the only good run"
+        raise UsageError(f"{have_text}; give at least two, better five, to show what can vary")
     require_comparable(runs, "learn from")
     for run in runs:
         if len(run.trace) < _FEWEST_SAMPLES:
-            have = plural(len(run.trace), "sample")
-            raise UsageError(f"{run.name} is too short to learn from: it has {have}; leave it out")
-    for first in good:
-        for second in runs:
-            if second is first or (len(first.trace), first.trace.names) != (
-                len(second.trace),
-                second.trace.names,
+            have_text = plural(len(run.trace), "sample")
+            raise UsageError(f"{run.name} is too short to learn from: it has {have_text}; leave it out")
+    for good_run in good:
+        for other_run in runs:
+            if other_run is good_run or (len(good_run.trace), good_run.trace.names) != (
+                len(other_run.trace),
+                other_run.trace.names,
             ):
                 continue
-            if first.trace == second.trace:
-                if first.name == second.name:
-                    raise UsageError(f"{first.name} is given twice; give each run once")
-                kind = "good" if second.is_good else "bad"
+            if good_run.trace == other_run.trace:
+                if good_run.name == other_run.name:
+                    raise UsageError(f"{good_run.name} is given twice; give each run once")
+                kind = "good" if other_run.is_good else "bad"
                 raise UsageError(
-                    f"the {kind} run {second.name} holds the same samples as the good run {first.name}; "
-                    "leave one of them out"
+                    f"the {kind} run {other_run.name} holds the same samples as the good run "
+                    f"{good_run.name}; leave one of them out"
                 )
 
 
 def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
     """Yield phrases for objects that at least half of the good runs have, but not all."""
-    counts = Counter(name for run in good for name in run.trace.names)
-    some = [name for name in sorted(counts) if len(good) / 2 <= counts[name] < len(good)]
-    for name in some[:_MOST_NAMED]:
-        yield f"{name}, which is missing in {len(good) - counts[name]} of {plural(len(good), 'good run')}"
-    if len(some) > _MOST_NAMED:
-        yield f"{plural(len(some) - _MOST_NAMED, 'more object')} that some good runs lack"
+    run_counts = Counter(name for run in good for name in run.trace.names)
+    partial_names = [name for name in sorted(run_counts) if len(good) / 2 <= run_counts[name] < len(good)]
+    for name in partial_names[:_MOST_NAMED]:
+        yield f"{name}, which is missing in {len(good) - run_counts[name]} of {plural(len(good), 'good run')}"
+    if len(partial_names) > _MOST_NAMED:
+        yield f"{plural(len(partial_names) - _MOST_NAMED, 'more object')} that some good runs lack"
 
 
 def _nothing_in_common(good: Sequence[LabelledRun]) -> str:
@@ -638,26 +675,26 @@ class _Writer:
 
     def order(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
         """Sort the lines: among lines that the same bad runs violate, shorter ones come first."""
-        alike: dict[tuple[bool, ...], list[Line]] = {}
-        keys = []
+        lines_by_verdicts: dict[tuple[bool, ...], list[Line]] = {}
+        verdict_keys = []
         for line, spec in written.pairs:
-            keys.append(tuple(robustness_of(spec.formula, run.trace)[1] < 0.0 for run in bad))
-            alike.setdefault(keys[-1], []).append(line)
-        for lines in alike.values():
+            verdict_keys.append(tuple(robustness_of(spec.formula, run.trace)[1] < 0.0 for run in bad))
+            lines_by_verdicts.setdefault(verdict_keys[-1], []).append(line)
+        for lines in lines_by_verdicts.values():
             lines.sort(key=lambda line: len(line.formula(self.taken).split()))
-        lines = [alike[key].pop(0) for key in keys]
+        lines = [lines_by_verdicts[verdict_key].pop(0) for verdict_key in verdict_keys]
         return _Written(tuple(lines), self._parse(lines))
 
     def _parse(self, lines: Sequence[Line]) -> Specification:
-        names: set[str] = set()
+        used_names: set[str] = set()
         texts = [f"use {self.profile}"]
-        for number, line in enumerate(lines, 1):
-            name = base = line.name
-            more = 2
-            while name in names or name in self.taken:
-                name, more = f"{base}_{more}", more + 1
-            names.add(name)
-            title = quote_name(f"LEARNED-{number}: {printable(line.title)}")
+        for line_number, line in enumerate(lines, 1):
+            name = base_name = line.name
+            suffix = 2
+            while name in used_names or name in self.taken:
+                name, suffix = f"{base_name}_{suffix}", suffix + 1
+            used_names.add(name)
+            title = quote_name(f"LEARNED-{line_number}: {printable(line.title)}")
             texts.append(f"spec {name} {title} = {line.formula(self.taken)}")
         return parse_specification("\n".join([*texts, ""]))
 
@@ -667,13 +704,13 @@ class _Writer:
         """Return the text of the file: each spec in canonical form, under a comment with its evidence."""
         lines = [*map(_comment, head), f"use {self.profile}"]
         for spec, line in zip(written.specification.specs, evidence, strict=True):
-            lowest = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
-            lines += ["", _comment(f"Holds in {good} of {plural(good, 'good run')}, {lowest}.")]
+            lowest_text = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
+            lines += ["", _comment(f"Holds in {good} of {plural(good, 'good run')}, {lowest_text}.")]
             if bad:
-                violating = (
+                violating_text = (
                     f"{len(line.violated_by)} of {plural(bad, 'bad run')}{_names_text(line.violated_by)}"
                 )
-                lines.append(_comment(f"Violated by {violating}."))
+                lines.append(_comment(f"Violated by {violating_text}."))
             title = quote_name(f"{spec.id}: {spec.title}")
             lines.append(f"spec {spec.name} {title} = {format_formula(spec.formula)}")
         return "\n".join([*lines, ""])
@@ -694,17 +731,27 @@ def _comment(text: str) -> str:
 def _names_text(names: Sequence[str]) -> str:
     if not names:
         return ""
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return f": {', '.join(names[:_MOST_NAMED])}{more}"
+    more_text = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return f": {', '.join(names[:_MOST_NAMED])}{more_text}"
 
 
 def _evidence(
     line: Line, spec: NamedSpec, good: Sequence[LabelledRun], bad: Sequence[LabelledRun]
 ) -> LearnedLine:
-    lowest, run = min((robustness_of(spec.formula, run.trace)[0], index) for index, run in enumerate(good))
-    violating = tuple(run.name for run in bad if robustness_of(spec.formula, run.trace)[1] < 0.0)
+    lowest_robustness, run_index = min(
+        (robustness_of(spec.formula, run.trace)[0], index) for index, run in enumerate(good)
+    )
+    violating_names = tuple(run.name for run in bad if robustness_of(spec.formula, run.trace)[1] < 0.0)
     text = format_formula(spec.formula)
-    return LearnedLine(spec.name, spec.title or "", text, line.pattern, lowest, good[run].name, violating)
+    return LearnedLine(
+        spec.name,
+        spec.title or "",
+        text,
+        line.pattern,
+        lowest_robustness,
+        good[run_index].name,
+        violating_names,
+    )
 
 
 def _check_folds(
@@ -715,15 +762,15 @@ def _check_folds(
     """Yield each run with its verdict under the lines that are learned without its fold."""
     if len(good) < _FEWEST_SAMPLES:
         return
-    folds = min(_FOLDS, max(len(good), len(bad)))
+    fold_count = min(_FOLDS, max(len(good), len(bad)))
     # each fold leaves at least two good runs to learn from
-    if len(good) - -(-len(good) // folds) < 2:
-        folds = len(good)
-    for fold in range(folds):
-        left_out = [*good[fold::folds], *bad[fold::folds]]
-        training_runs = [run for run in (*good, *bad) if not any(run is omitted for omitted in left_out)]
+    if len(good) - -(-len(good) // fold_count) < 2:
+        fold_count = len(good)
+    for fold in range(fold_count):
+        test_runs = [*good[fold::fold_count], *bad[fold::fold_count]]
+        training_runs = [run for run in (*good, *bad) if not any(run is test_run for test_run in test_runs)]
         draft = learn(training_runs)
-        for run in left_out:
+        for run in test_runs:
             lower = upper = float("inf")
             for spec in () if draft is None else draft.specification.specs:
                 low, high = robustness_of(spec.formula, run.trace)
@@ -738,8 +785,8 @@ def _head(
     checked: Sequence[CheckedRun],
     left_out: Sequence[str],
 ) -> Iterator[str]:
-    runs = plural(len(good), "good run") + (f" and {plural(len(bad), 'bad run')}" if bad else "")
-    yield f"Learned from {runs}."
+    runs_text = plural(len(good), "good run") + (f" and {plural(len(bad), 'bad run')}" if bad else "")
+    yield f"Learned from {runs_text}."
     if missed:
         verb = "violates" if len(missed) == 1 else "violate"
         yield f"{plural(len(missed), 'bad run')} {verb} none of these lines{_names_text(missed)}."
@@ -753,10 +800,12 @@ def _head(
 
 def checked_text(checked: Sequence[CheckedRun]) -> str:
     """Return a sentence with the verdicts of the runs that were left out in turn."""
-    parts = []
-    for kind, what in ((True, "satisfied"), (False, "violated")):
-        some = [run for run in checked if run.is_good is kind]
-        if some:
-            right = sum(run.is_right for run in some)
-            parts.append(f"{right} of {len(some)} {'good' if kind else 'bad'} runs are {what}")
-    return f"Checked on runs left out in turn: {', '.join(parts)}."
+    phrases = []
+    for is_good, verdict_text in ((True, "satisfied"), (False, "violated")):
+        runs = [run for run in checked if run.is_good is is_good]
+        if runs:
+            right_count = sum(run.is_right for run in runs)
+            phrases.append(
+                f"{right_count} of {len(runs)} {'good' if is_good else 'bad'} runs are {verdict_text}"
+            )
+    return f"Checked on runs left out in turn: {', '.join(phrases)}."

@@ -77,41 +77,41 @@ def formula_with(probes: Sequence[Probe]) -> Callable[[Numbers], Formula] | None
         return None
 
 
-def _fill(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
-    first = parts[0]
-    if all(type(part) is type(first) for part in parts) and all(part == first for part in parts):
-        return lambda _: first
-    if isinstance(first, float | int):
-        return _number(parts, values)
-    if any(type(part) is not type(first) for part in parts):
+def _fill(nodes: Sequence[Any], probe_numbers: Sequence[Numbers]) -> _Fill:
+    first_node = nodes[0]
+    if all(type(node) is type(first_node) for node in nodes) and all(node == first_node for node in nodes):
+        return lambda _: first_node
+    if isinstance(first_node, float | int):
+        return _number(nodes, probe_numbers)
+    if any(type(node) is not type(first_node) for node in nodes):
         raise _NeedsParsingError
-    if isinstance(first, tuple):
-        if any(len(part) != len(first) for part in parts):
+    if isinstance(first_node, tuple):
+        if any(len(node) != len(first_node) for node in nodes):
             raise _NeedsParsingError
-        fills = [_fill(elements, values) for elements in zip(*parts, strict=True)]
+        fills = [_fill(elements, probe_numbers) for elements in zip(*nodes, strict=True)]
         return lambda numbers: tuple(fill(numbers) for fill in fills)
-    if not is_dataclass(first) or isinstance(first, type):
+    if not is_dataclass(first_node) or isinstance(first_node, type):
         raise _NeedsParsingError
-    changing = {}
-    for name in (field.name for field in fields(first) if field.init and field.compare):
-        field_values = [getattr(part, name) for part in parts]
+    fill_by_name = {}
+    for name in (field.name for field in fields(first_node) if field.init and field.compare):
+        field_values = [getattr(node, name) for node in nodes]
         if any(value != field_values[0] for value in field_values) and not (
-            isinstance(first, Atom) and name == "text"
+            isinstance(first_node, Atom) and name == "text"
         ):
-            changing[name] = _fill(field_values, values)
-    if isinstance(first, Bound) and "lower" in changing and first.upper is not None:
+            fill_by_name[name] = _fill(field_values, probe_numbers)
+    if isinstance(first_node, Bound) and "lower" in fill_by_name and first_node.upper is not None:
         raise _NeedsParsingError
-    return lambda numbers: replace(first, **{name: fill(numbers) for name, fill in changing.items()})
+    return lambda numbers: replace(first_node, **{name: fill(numbers) for name, fill in fill_by_name.items()})
 
 
-def _number(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
-    kind = type(parts[0])
-    if kind is bool or any(type(part) is not kind for part in parts):
+def _number(nodes: Sequence[Any], probe_numbers: Sequence[Numbers]) -> _Fill:
+    number_type = type(nodes[0])
+    if number_type is bool or any(type(node) is not number_type for node in nodes):
         raise _NeedsParsingError
-    for name in values[0]:
+    for name in probe_numbers[0]:
         for sign in (1, -1):
-            if all(part == sign * numbers[name] for part, numbers in zip(parts, values, strict=True)):
-                return lambda numbers, name=name, sign=sign: kind(sign * numbers[name])  # type: ignore[misc]
+            if all(node == sign * numbers[name] for node, numbers in zip(nodes, probe_numbers, strict=True)):
+                return lambda numbers, name=name, sign=sign: number_type(sign * numbers[name])  # type: ignore[misc]
     raise _NeedsParsingError
 
 
@@ -154,13 +154,13 @@ class VariedConstant:
             raise UsageError(f"{name}: the range {range_text} is empty; give a lower and a greater end")
         if written.range is not None:
             # the range in the text limits the tried range
-            inner = [Decimal(repr(end)) for end in written.range]
+            text_range = [Decimal(repr(end)) for end in written.range]
             if written.duration_ns is not None:
-                inner = [end * 10**9 for end in inner]
-            if not inner[0] <= ends[0] < ends[1] <= inner[1]:
-                allowed = f"[{_text(inner[0], written)}, {_text(inner[1], written)}]"
+                text_range = [end * 10**9 for end in text_range]
+            if not text_range[0] <= ends[0] < ends[1] <= text_range[1]:
+                allowed_text = f"[{_text(text_range[0], written)}, {_text(text_range[1], written)}]"
                 raise UsageError(
-                    f"{name}: {range_text} is outside of {allowed}, the range in the text; "
+                    f"{name}: {range_text} is outside of {allowed_text}, the range in the text; "
                     "choose within it, or widen it there"
                 )
         step = Decimal(1).scaleb((width / _PARTS).adjusted())
@@ -210,8 +210,8 @@ class VariedConstant:
 
     def nearest(self, value: Decimal) -> int:
         """Return the index of the value nearest to a number."""
-        inside = min(max(value, self.low), self.high)
-        return min(max(int((inside / self.step).to_integral_value()) - self._before, 0), self.steps)
+        clamped_value = min(max(value, self.low), self.high)
+        return min(max(int((clamped_value / self.step).to_integral_value()) - self._before, 0), self.steps)
 
     @property
     def start(self) -> int:
@@ -225,9 +225,9 @@ class VariedConstant:
         exponent = width.adjusted() + 1 if width else self.step.adjusted()
         while exponent > self.step.adjusted():
             unit = Decimal(1).scaleb(exponent)
-            number = self.nearest((middle / unit).to_integral_value() * unit)
-            if first <= number <= last and 4 * abs(self.decimal(number) - middle) <= 2 * width:
-                return number
+            index = self.nearest((middle / unit).to_integral_value() * unit)
+            if first <= index <= last and 4 * abs(self.decimal(index) - middle) <= 2 * width:
+                return index
             exponent -= 1
         return self.nearest(middle)
 
@@ -245,12 +245,12 @@ def varied_constants(
             constant to tune.
     """
     constants = specification.constants
-    with_range = [
+    names_with_range = [
         name
         for name, constant in constants.items()
         if constant.range is not None and not constant.is_computed
     ]
-    ends_by_name = ranges or dict.fromkeys(with_range)
+    ends_by_name = ranges or dict.fromkeys(names_with_range)
     if not ends_by_name:
         example = next(iter(constants), None)
         raise UsageError(
@@ -261,7 +261,7 @@ def varied_constants(
             f"vary one ({example}=LOW:HIGH), or write const {example} = "
             f"{text_of_constant(constants[example])} in [LOW, HIGH]"
         )
-    varied = []
+    tuned_constants = []
     for name, ends in ends_by_name.items():
         if name not in constants:
             hint = nearest_hint(name, constants) or f"the constants are: {', '.join(constants) or 'none'}"
@@ -269,12 +269,12 @@ def varied_constants(
         if constants[name].is_computed:
             raise UsageError(f"{name} is computed from other constants; vary those")
         if ends is None:
-            span = constants[name].range
-            if span is None:
+            text_range = constants[name].range
+            if text_range is None:
                 raise UsageError(f"{name} has no range in the text; give one: {name}=LOW:HIGH")
-            ends = (_end(span[0], constants[name]), _end(span[1], constants[name]))
-        varied.append(VariedConstant.of(name, constants[name], *ends))
-    return tuple(varied)
+            ends = (_end(text_range[0], constants[name]), _end(text_range[1], constants[name]))
+        tuned_constants.append(VariedConstant.of(name, constants[name], *ends))
+    return tuple(tuned_constants)
 
 
 def text_of_constant(constant: Constant) -> str:
@@ -291,12 +291,12 @@ def _end(value: float, constant: Constant) -> Value:
 
 
 def _decimal(name: str, value: Value, written: Constant) -> Decimal:
-    read = value_from_outside(name, value)
-    if isinstance(read, Duration) != (written.duration_ns is not None):
+    parsed_value = value_from_outside(name, value)
+    if isinstance(parsed_value, Duration) != (written.duration_ns is not None):
         kind = "a number" if written.duration_ns is None else "a duration such as 2s"
         raise UsageError(f"{name} cannot be {value!r}: it is {kind} ({text_of_constant(written)} as written)")
     # repr gives the digits of the text; Decimal(0.1) would have those of the binary float
-    return Decimal(read.ns) if isinstance(read, Duration) else Decimal(repr(read))
+    return Decimal(parsed_value.ns) if isinstance(parsed_value, Duration) else Decimal(repr(parsed_value))
 
 
 def _text(value: Decimal, written: Constant) -> str:
@@ -350,19 +350,19 @@ def _of_formula(before: Formula, after: Formula) -> Direction | None:
         case Atom() as old, Atom() as new:
             return _of_expression(old.expression, new.expression)
         case Quantified() as old, Quantified() as new:
-            same = (old.quantifier, old.variables, old.group) == (
+            has_same_binding = (old.quantifier, old.variables, old.group) == (
                 new.quantifier,
                 new.variables,
                 new.group,
             )
-            return _of_formula(old.body, new.body) if same else None
+            return _of_formula(old.body, new.body) if has_same_binding else None
         case Boolean() as old, Boolean() as new if _alike(old, new):
-            parts = _common(map(_of_formula, old.operands, new.operands))
-            return _opposite(parts) if old.operator == "not" else parts
+            operand_direction = _common(map(_of_formula, old.operands, new.operands))
+            return _opposite(operand_direction) if old.operator == "not" else operand_direction
         case Temporal() as old, Temporal() as new if _alike(old, new):
-            window = _of_bound(old.bound, new.bound)
-            window = _opposite(window) if old.operator in ("G", "H") else window
-            return _common([window, *map(_of_formula, old.operands, new.operands)])
+            window_direction = _of_bound(old.bound, new.bound)
+            window_direction = _opposite(window_direction) if old.operator in ("G", "H") else window_direction
+            return _common([window_direction, *map(_of_formula, old.operands, new.operands)])
     return None
 
 
@@ -376,8 +376,8 @@ def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
         return 0
     if before is None or after is None or before.unit != after.unit:
         return None
-    ends = [float("inf") if bound.upper is None else bound.upper for bound in (before, after)]
-    return _common([_sign(before.lower - after.lower), _sign(ends[1] - ends[0])])
+    upper_ends = [float("inf") if bound.upper is None else bound.upper for bound in (before, after)]
+    return _common([_sign(before.lower - after.lower), _sign(upper_ends[1] - upper_ends[0])])
 
 
 def _of_expression(before: Expression, after: Expression) -> Direction | None:
@@ -399,8 +399,8 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
         case Maximum() as old, Maximum() as new if len(old.operands) == len(new.operands):
             return _common(map(_of_expression, old.operands, new.operands))
         case Measurement() as old, Measurement() as new if old.quantity == new.quantity:
-            changes = zip(old.radius_effects, map(_of_term, old.terms, new.terms), strict=True)
-            return _common([_times(change, effect) for effect, change in changes])
+            term_changes = zip(old.radius_effects, map(_of_term, old.terms, new.terms), strict=True)
+            return _common([_times(change, effect) for effect, change in term_changes])
     return None
 
 
@@ -447,16 +447,16 @@ def load_runs(
     """
     files = [log for log in (*good, *bad) if not isinstance(log, Trace)]
     names_of_good, names_of_bad = _names(good), _names(bad)
-    both = names_of_good.keys() & names_of_bad.keys()
-    if both:
-        names = ", ".join(sorted(names_of_good[place] for place in both))
-        raise UsageError(f"{names} cannot be good and bad at once; leave it out of one of them")
+    shared_places = names_of_good.keys() & names_of_bad.keys()
+    if shared_places:
+        shared_names = ", ".join(sorted(names_of_good[place] for place in shared_places))
+        raise UsageError(f"{shared_names} cannot be good and bad at once; leave it out of one of them")
     has_own_names = len({file.name for file in files}) == len(files)
     runs = []
     for is_good, logs in ((True, good), (False, bad)):
-        for number, log in enumerate(logs, 1):
+        for run_number, log in enumerate(logs, 1):
             if isinstance(log, Trace):
-                name, trace = f"{'good' if is_good else 'bad'} run {number}", log
+                name, trace = f"{'good' if is_good else 'bad'} run {run_number}", log
             else:
                 name = log.name if has_own_names else _place(log)
                 trace = read(log)
@@ -546,12 +546,12 @@ class Margins:
         self._compiled: OrderedDict[tuple[str, Point], _Result] = OrderedDict()
         self._robustness: dict[tuple[int, str, Point], Robustness] = {}
         self._base = parse({})
-        self._first = {spec.name: new_leaves(spec.formula, ()) for spec in self._base.results}
+        self._base_leaves = {spec.name: new_leaves(spec.formula, ()) for spec in self._base.results}
         self.start: Point = tuple(constant.start for constant in self.varied)
-        tried = [self._probe(constant) for constant in self.varied]
-        self.directions = tuple(map(self._direction, self.varied, tried))
-        self.axes = {name: self._axes(name, tried) for name in self._first}
-        self._formulas = {name: self._formula(name, tried) for name in self._first}
+        probe_specifications = [self._probe(constant) for constant in self.varied]
+        self.directions = tuple(map(self._direction, self.varied, probe_specifications))
+        self.axes = {name: self._axes(name, probe_specifications) for name in self._base_leaves}
+        self._formulas = {name: self._formula(name, probe_specifications) for name in self._base_leaves}
         self._prepared: list[_Prepared] = []
         for run in self.runs:
             self._prepared.append(self._prepare(run))
@@ -579,14 +579,14 @@ class Margins:
 
     def _of_result(self, run: int, name: str, point: Point) -> Robustness | None:
         # only the constants of a result are in its key, because others do not change it
-        key = run, name, tuple([point[axis] for axis in self.axes[name]])
-        if key not in self._robustness:
+        cache_key = run, name, tuple([point[axis] for axis in self.axes[name]])
+        if cache_key not in self._robustness:
             result = self._compile(name, point)
             if result is None:
                 return None
             self.evaluations += 1
-            self._robustness[key] = self._evaluate(self._prepared[run], name, result)
-        return self._robustness[key]
+            self._robustness[cache_key] = self._evaluate(self._prepared[run], name, result)
+        return self._robustness[cache_key]
 
     def margin(self, run: int, point: Point, results: Iterable[str] | None = None) -> float:
         """Return the margin of a run from the wrong verdict: its robustness, negated for a bad run.
@@ -611,15 +611,15 @@ class Margins:
 
     def _fitting(self, constant: VariedConstant) -> VariedConstant:
         """Return a constant with a grid of valid values: whole numbers if it counts samples."""
-        ends = {constant.value(0): "least", constant.value(constant.steps): "greatest"}
-        for value, which in ends.items():
+        end_by_value = {constant.value(0): "least", constant.value(constant.steps): "greatest"}
+        for value, end_name in end_by_value.items():
             try:
                 self._parse({constant.name: value})
             except SpecificationError as error:
-                first = error.diagnoses[0]
+                first_fault = error.diagnoses[0]
                 raise UsageError(
-                    f"{constant.name}={value}, the {which} value to try, makes the specification invalid: "
-                    f"line {first.line}: {first.message}; narrow its range"
+                    f"{constant.name}={value}, the {end_name} value to try, makes the specification invalid: "
+                    f"line {first_fault.line}: {first_fault.message}; narrow its range"
                 ) from error
         if not constant.is_whole:
             return constant
@@ -631,17 +631,24 @@ class Margins:
 
     def _probe(self, constant: VariedConstant) -> dict[int, Specification]:
         """Return specifications with five values of one constant, by index of the value."""
-        numbers = sorted({constant.steps * part // 4 for part in range(5)})
-        return {number: self._parse({constant.name: constant.value(number)}) for number in numbers}
+        indices = sorted({constant.steps * quarter // 4 for quarter in range(5)})
+        return {index: self._parse({constant.name: constant.value(index)}) for index in indices}
 
-    def _direction(self, constant: VariedConstant, tried: Mapping[int, Specification]) -> Direction | None:
-        directions = {direction(before, after) for before, after in pairwise(tried.values())}
-        if directions == {0} and len({str(specification.regions) for specification in tried.values()}) == 1:
+    def _direction(
+        self, constant: VariedConstant, specifications: Mapping[int, Specification]
+    ) -> Direction | None:
+        directions = {direction(before, after) for before, after in pairwise(specifications.values())}
+        if (
+            directions == {0}
+            and len({str(specification.regions) for specification in specifications.values()}) == 1
+        ):
             raise UsageError(f"no result of {self._base.filename} depends on {constant.name}; vary another")
         directions -= {0}
         return directions.pop() if len(directions) == 1 else None
 
-    def _axes(self, name: str, tried: Sequence[Mapping[int, Specification]]) -> tuple[int, ...]:
+    def _axes(
+        self, name: str, probe_specifications: Sequence[Mapping[int, Specification]]
+    ) -> tuple[int, ...]:
         """Return the constants that may change a result; a constant in a region may change all results."""
 
         def changes(specification: Specification) -> bool:
@@ -650,16 +657,18 @@ class Margins:
             ) != _result_of(self._base, name)
 
         return tuple(
-            axis for axis, specifications in enumerate(tried) if any(map(changes, specifications.values()))
+            axis
+            for axis, specifications in enumerate(probe_specifications)
+            if any(map(changes, specifications.values()))
         )
 
     def _formula(
-        self, name: str, tried: Sequence[Mapping[int, Specification]]
+        self, name: str, probe_specifications: Sequence[Mapping[int, Specification]]
     ) -> Callable[[Numbers], Formula] | None:
         """Return the function from values to the formula of a result; None if the text must be parsed."""
         written_numbers = {constant.name: constant.written_number for constant in self.varied}
         probes = [Probe(_result_of(self._base, name), written_numbers)]
-        for constant, specifications in zip(self.varied, tried, strict=True):
+        for constant, specifications in zip(self.varied, probe_specifications, strict=True):
             for number, specification in specifications.items():
                 if specification.regions != self._base.regions:
                     return None
@@ -668,10 +677,10 @@ class Margins:
         return formula_with(probes)
 
     def _compile(self, name: str, point: Point) -> _Result | None:
-        key = name, tuple([point[axis] for axis in self.axes[name]])
-        if key in self._compiled:
-            self._compiled.move_to_end(key)
-            return self._compiled[key]
+        cache_key = name, tuple([point[axis] for axis in self.axes[name]])
+        if cache_key in self._compiled:
+            self._compiled.move_to_end(cache_key)
+            return self._compiled[cache_key]
         if (formula_of := self._formulas[name]) is not None:
             numbers = {
                 constant.name: constant.number(number)
@@ -683,15 +692,15 @@ class Margins:
             if specification is None:
                 return None
             formula, regions = _result_of(specification, name), specification.regions
-        self._compiled[key] = compiled = self._compiled_from(name, formula, regions)
+        self._compiled[cache_key] = compiled_result = self._compiled_from(name, formula, regions)
         if len(self._compiled) > _REMEMBERED * len(self.axes):
             self._compiled.popitem(last=False)
-        return compiled
+        return compiled_result
 
     def _compiled_from(self, name: str, formula: Formula, regions: Mapping[str, Outline]) -> _Result:
-        order, first = new_leaves(formula, ()), self._first[name]
-        is_same = regions == self._base.regions and _measurements(order) <= _measurements(first)
-        return _Result(order, OfflineFormula.of(formula, order), regions, is_same)
+        leaves, base_leaves = new_leaves(formula, ()), self._base_leaves[name]
+        is_same = regions == self._base.regions and _measurements(leaves) <= _measurements(base_leaves)
+        return _Result(leaves, OfflineFormula.of(formula, leaves), regions, is_same)
 
     def _prepare(self, run: LabelledRun) -> _Prepared:
         scene = TraceScene(run.trace, self._base.regions)
@@ -699,16 +708,16 @@ class Margins:
         if not len(times_ns):
             raise UsageError(f"{run.name} has no sample; leave it out")
         remarks = check_names(self._base, run.trace.names, tuple(run.trace.signals))
-        missing = [remark.message for remark in remarks if remark.severity == "error"]
-        if missing:
+        error_messages = [remark.message for remark in remarks if remark.severity == "error"]
+        if error_messages:
             raise UsageError(
-                f"{run.name} does not fit {self._base.filename}: {'; '.join(missing)}; leave it out, or "
-                "give names that it has"
+                f"{run.name} does not fit {self._base.filename}: {'; '.join(error_messages)}; "
+                "leave it out, or give names that it has"
             )
         instances: dict[str, list[tuple[Instance, slice]]] = {}
         for instance in find_instances(self._base, self._each, [run.trace], 0, FOREVER):
-            inside = slice(*window_of(times_ns, instance.start_ns, instance.end_ns))
-            instances.setdefault(instance.name, []).append((instance, inside))
+            sample_slice = slice(*window_of(times_ns, instance.start_ns, instance.end_ns))
+            instances.setdefault(instance.name, []).append((instance, sample_slice))
         if not instances:
             raise UsageError(f"{run.name} has no object for the template to stand for; leave it out")
         return _Prepared(scene, instances)
@@ -719,10 +728,10 @@ class Margins:
             # a new trace, so that measurements for tried values do not fill the cache of the run
             scene = TraceScene(replace(scene.trace), result.regions, scene.skip)
         lower = upper = np.inf
-        for instance, inside in prepared.instances.get(name, ()):
+        for instance, sample_slice in prepared.instances.get(name, ()):
             leaves = leaf_values(scene, result.order, instance.bindings)
-            times_ns = scene.trace.times_ns[inside]
-            low, high = result.formula.evaluate(leaves[:, :, inside], times_ns).ends(0)
+            times_ns = scene.trace.times_ns[sample_slice]
+            low, high = result.formula.evaluate(leaves[:, :, sample_slice], times_ns).ends(0)
             lower, upper = min(lower, float(low[0])), min(upper, float(high[0]))
         return Robustness(lower, upper)
 

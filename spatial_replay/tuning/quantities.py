@@ -95,71 +95,83 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
     Args:
         profile: profile of the relations.
     """
-    common = set(traces[0].names).intersection(*(trace.names for trace in traces[1:]))
-    names = sorted(common)
-    left_out = []
+    common_names = set(traces[0].names).intersection(*(trace.names for trace in traces[1:]))
+    names = sorted(common_names)
+    left_out_phrases = []
     if len(names) > MOST_OBJECTS:
-        left_out.append(
+        left_out_phrases.append(
             f"{plural(len(names) - MOST_OBJECTS, 'object')} beyond the first {MOST_OBJECTS} by name"
         )
         names = names[:MOST_OBJECTS]
-    samples = sum(map(len, traces))
-    most = min(MOST_PAIRS, max(2, MOST_MEASURED // max(1, samples)))
+    sample_count = sum(map(len, traces))
+    most_pairs = min(MOST_PAIRS, max(2, MOST_MEASURED // max(1, sample_count)))
     members = [members_of(trace) for trace in traces]
-    classes, crowded = _classes(members, common)
-    if crowded:
-        left_out.append(f"classes with more than {MOST_MEMBERS} objects: {', '.join(crowded)}")
-    class_pairs = list(_class_pairs(classes, members, names, common))
+    classes, crowded_classes = _classes(members, common_names)
+    if crowded_classes:
+        left_out_phrases.append(
+            f"classes with more than {MOST_MEMBERS} objects: {', '.join(crowded_classes)}"
+        )
+    class_pairs = list(_class_pairs(classes, members, names, common_names))
     pairs = _nearest_first(traces[0], [*combinations(map(Party, names), 2)])
-    measured_pairs = [*class_pairs[:most], *pairs[: max(0, most - len(class_pairs))]]
-    if missing := len(class_pairs) + len(pairs) - len(measured_pairs):
-        left_out.append(
-            f"{plural(missing, 'pair')} of objects that come less near than {len(measured_pairs):,} others"
+    measured_pairs = [*class_pairs[:most_pairs], *pairs[: max(0, most_pairs - len(class_pairs))]]
+    if missing_count := len(class_pairs) + len(pairs) - len(measured_pairs):
+        left_out_phrases.append(
+            f"{plural(missing_count, 'pair')} of objects that come less near than "
+            f"{len(measured_pairs):,} others"
         )
     signals = sorted(set(traces[0].signals).intersection(*(trace.signals for trace in traces[1:])))
     signals = [
         signal for signal in signals if not any((trace.signals[signal] <= TEXTS).any() for trace in traces)
     ]
     if len(signals) > MOST_SIGNALS:
-        left_out.append(f"{plural(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
-    taken_names = common | {name for trace in traces for name in trace.names}
+        left_out_phrases.append(
+            f"{plural(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}"
+        )
+    taken_names = common_names | {name for trace in traces for name in trace.names}
     quantities = [quantity for a, b in measured_pairs for quantity in _quantities(a, b, profile, taken_names)]
     for name in signals[:MOST_SIGNALS]:
         atom = Atom(format_relation("signal", (), (name, ">=", 0.0)), "signal", Signal(name))
         quantities.append(Quantity("signal", (), name, atom, atom))
-    return quantities, left_out
+    return quantities, left_out_phrases
 
 
 def members_of(trace: Trace) -> dict[str, set[str]]:
     """Return the names of objects by class."""
     names_by_class: dict[str, set[str]] = {}
     for column, name in enumerate(trace.names):
-        rows = trace.rows[:, column]
-        rows = rows[rows != ABSENT]
+        object_rows = trace.rows[:, column]
+        object_rows = object_rows[object_rows != ABSENT]
         # an unknown object has the row -2 - row, which still has its class (see `Trace`)
-        codes = np.unique(trace.class_code[np.where(rows < 0, -2 - rows, rows)])
+        codes = np.unique(trace.class_code[np.where(object_rows < 0, -2 - object_rows, object_rows)])
         for code in codes.tolist():
             if class_name := trace.classes[code]:
                 names_by_class.setdefault(class_name, set()).add(name)
     return names_by_class
 
 
-def _classes(members: Sequence[Mapping[str, set[str]]], common: set[str]) -> tuple[list[str], list[str]]:
+def _classes(
+    members: Sequence[Mapping[str, set[str]]], common_names: set[str]
+) -> tuple[list[str], list[str]]:
     """Return the classes to compare as a whole, and the classes with too many objects."""
-    shared = set(members[0]).intersection(*members[1:])
-    fitting = sorted(
+    shared_classes = set(members[0]).intersection(*members[1:])
+    fitting_classes = sorted(
         name
-        for name in shared
-        if all(len(run_members[name]) > 1 for run_members in members) or not members[0][name] <= common
+        for name in shared_classes
+        if all(len(run_members[name]) > 1 for run_members in members) or not members[0][name] <= common_names
     )
-    crowded = [
-        name for name in fitting if any(len(run_members[name]) > MOST_MEMBERS for run_members in members)
+    crowded_classes = [
+        name
+        for name in fitting_classes
+        if any(len(run_members[name]) > MOST_MEMBERS for run_members in members)
     ]
-    return [name for name in fitting if name not in crowded], crowded
+    return [name for name in fitting_classes if name not in crowded_classes], crowded_classes
 
 
 def _class_pairs(
-    classes: Sequence[str], members: Sequence[Mapping[str, set[str]]], names: Sequence[str], common: set[str]
+    classes: Sequence[str],
+    members: Sequence[Mapping[str, set[str]]],
+    names: Sequence[str],
+    common_names: set[str],
 ) -> Iterator[tuple[Party, Party]]:
     for name in classes:
         if all(len(run_members[name]) > 1 for run_members in members):
@@ -167,33 +179,36 @@ def _class_pairs(
         for object_name in names:
             if not any(object_name in run_members[name] for run_members in members):
                 yield Party(name, True), Party(object_name)
-    for a, b in combinations(classes, 2):
-        if not all(run_members[a] <= common and run_members[b] <= common for run_members in members):
-            yield Party(a, True), Party(b, True)
+    for first_class, second_class in combinations(classes, 2):
+        if not all(
+            run_members[first_class] <= common_names and run_members[second_class] <= common_names
+            for run_members in members
+        ):
+            yield Party(first_class, True), Party(second_class, True)
 
 
 def _nearest_first(trace: Trace, pairs: list[tuple[Party, Party]]) -> list[tuple[Party, Party]]:
     if len(pairs) < 2 or not len(trace):
         return pairs
-    few = trace.take(np.unique(np.linspace(0, len(trace) - 1, _SAMPLED).astype(np.int64)))
+    sampled_trace = trace.take(np.unique(np.linspace(0, len(trace) - 1, _SAMPLED).astype(np.int64)))
     atoms = [_atom("dist", TrackedName(a.name), TrackedName(b.name), "paper") for a, b in pairs]
-    nearest = leaf_values(TraceScene(few, {}), atoms, {})[0].min(axis=1)
+    least_distances = leaf_values(TraceScene(sampled_trace, {}), atoms, {})[0].min(axis=1)
     # pairs that are unknown in some sample come last
-    key = np.where(np.isfinite(nearest), nearest, np.inf)
-    return [pairs[index] for index in np.argsort(key, kind="stable").tolist()]
+    sort_distances = np.where(np.isfinite(least_distances), least_distances, np.inf)
+    return [pairs[index] for index in np.argsort(sort_distances, kind="stable").tolist()]
 
 
-def _quantities(a: Party, b: Party, profile: str, taken: set[str]) -> Iterator[Quantity]:
+def _quantities(a: Party, b: Party, profile: str, taken_names: set[str]) -> Iterator[Quantity]:
     for relation in _EITHER_WAY:
-        yield _quantity(relation, a, b, profile, taken)
-    ways = [(a, b)] if a == b else [*permutations((a, b))]
+        yield _quantity(relation, a, b, profile, taken_names)
+    ordered_pairs = [(a, b)] if a == b else [*permutations((a, b))]
     for relation in _ONE_WAY:
-        for first, second in ways:
-            yield _quantity(relation, first, second, profile, taken)
+        for first, second in ordered_pairs:
+            yield _quantity(relation, first, second, profile, taken_names)
 
 
-def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken: set[str]) -> Quantity:
-    variables = variables_of((a, b), taken)
+def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken_names: set[str]) -> Quantity:
+    variables = variables_of((a, b), taken_names)
     terms = [
         Variable(variable) if party.is_class else TrackedName(party.name)
         for party, variable in zip((a, b), variables, strict=True)
@@ -272,22 +287,23 @@ class Observed:
     def of(cls, trace: Trace, quantities: Sequence[Quantity]) -> Observed:
         """Measure every quantity in every sample."""
         scene = TraceScene(trace, {})
-        step = max(1, _AT_ONCE // max(1, len(trace)))
-        some = np.unique(np.linspace(0, len(trace) - 1, _SAMPLED_OF_A_RUN).astype(np.int64))
+        block_size = max(1, _AT_ONCE // max(1, len(trace)))
+        sample_indices = np.unique(np.linspace(0, len(trace) - 1, _SAMPLED_OF_A_RUN).astype(np.int64))
         blocks: list[tuple[Floats, ...]] = []
-        for start in range(0, len(quantities), step):
-            values = measure_both_ways(scene, quantities[start : start + step])
-            nominal = np.where(np.isfinite(values[0]), values[0], np.nan).mean(axis=0)
-            is_known = np.isfinite(nominal)
-            span = np.where(is_known, nominal, -np.inf).max(axis=1) - np.where(is_known, nominal, np.inf).min(
-                axis=1
-            )
-            ends = values.min(axis=3), values.max(axis=3), values[..., 0], values[..., -1]
-            blocks.append((*ends, values[:, 0][..., some], np.maximum(span, 0.0)))
+        for start in range(0, len(quantities), block_size):
+            values = measure_both_ways(scene, quantities[start : start + block_size])
+            nominal_values = np.where(np.isfinite(values[0]), values[0], np.nan).mean(axis=0)
+            is_known = np.isfinite(nominal_values)
+            block_travel = np.where(is_known, nominal_values, -np.inf).max(axis=1) - np.where(
+                is_known, nominal_values, np.inf
+            ).min(axis=1)
+            block_ends = values.min(axis=3), values.max(axis=3), values[..., 0], values[..., -1]
+            blocks.append((*block_ends, values[:, 0][..., sample_indices], np.maximum(block_travel, 0.0)))
         # the axis of the quantities in each array
-        axes = (2, 2, 2, 2, 1, 0)
+        quantity_axes = (2, 2, 2, 2, 1, 0)
         least, greatest, first, last, sampled, travel = (
-            np.concatenate(parts, axis) for parts, axis in zip(zip(*blocks, strict=True), axes, strict=True)
+            np.concatenate(parts, quantity_axis)
+            for parts, quantity_axis in zip(zip(*blocks, strict=True), quantity_axes, strict=True)
         )
         shifts = {name: _shift(trace, column) for column, name in enumerate(trace.names)}
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
@@ -300,47 +316,51 @@ class Observed:
             surely: whether the lower end is compared with the limit instead of the upper end.
         """
         values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
-        holds = values >= limit if surely else values > limit
-        return int(holds.argmax()) if holds.any() else len(holds)
+        is_reached = values >= limit if surely else values > limit
+        return int(is_reached.argmax()) if is_reached.any() else len(is_reached)
 
 
 def _shift(trace: Trace, column: int) -> float:
     """Return the mean displacement of an object's corners from the first to the last sample."""
-    rows = trace.rows[[0, -1], column]
-    if (rows < 0).any():
+    shape_rows = trace.rows[[0, -1], column]
+    if (shape_rows < 0).any():
         return np.inf
-    shapes = trace.footprints
-    first, last = (
-        shapes.vertices[
-            shapes.vertex_start[shapes.part_start[row]] : shapes.vertex_start[shapes.part_start[row + 1]]
+    footprints = trace.footprints
+    first_corners, last_corners = (
+        footprints.vertices[
+            footprints.vertex_start[footprints.part_start[row]] : footprints.vertex_start[
+                footprints.part_start[row + 1]
+            ]
         ]
-        for row in rows.tolist()
+        for row in shape_rows.tolist()
     )
-    if first.shape != last.shape:
+    if first_corners.shape != last_corners.shape:
         return np.inf
-    return float(np.hypot(*(last - first).mean(axis=0)))
+    return float(np.hypot(*(last_corners - first_corners).mean(axis=0)))
 
 
 def measure_both_ways(scene: TraceScene, quantities: Sequence[Quantity]) -> Floats:
     """Return quantities and their negatives with lower and upper ends in each sample: (2, 2, Q, T)."""
-    result = np.empty((2, 2, len(quantities), len(scene)))
+    both_ways = np.empty((2, 2, len(quantities), len(scene)))
     formulas = [quantity.formula for quantity in quantities]
     values = leaf_values(scene, formulas, {})
     low, high = low_and_high(len(values), wide=True)
-    result[0] = values[low], values[high]
-    result[1] = -values[high], -values[low]
-    others = [index for index, quantity in enumerate(quantities) if quantity.reach is not quantity.formula]
-    if others:
+    both_ways[0] = values[low], values[high]
+    both_ways[1] = -values[high], -values[low]
+    class_indices = [
+        index for index, quantity in enumerate(quantities) if quantity.reach is not quantity.formula
+    ]
+    if class_indices:
         # over a class, the negated least number is not the least negated number
-        values = leaf_values(scene, [quantities[index].reach for index in others], {})
+        values = leaf_values(scene, [quantities[index].reach for index in class_indices], {})
         low, high = low_and_high(len(values), wide=True)
-        result[1][:, others] = values[low], values[high]
-    return result
+        both_ways[1][:, class_indices] = values[low], values[high]
+    return both_ways
 
 
 def robustness_of(formula: Formula, trace: Trace) -> tuple[float, float]:
     """Return the lower and upper end of a formula's robustness over a whole run, as in a replay."""
-    order = new_leaves(formula, ())
-    leaves = leaf_values(TraceScene(trace, {}), order, {})
-    low, high = OfflineFormula.of(formula, order).evaluate(leaves, trace.times_ns).ends(0)
+    leaf_formulas = new_leaves(formula, ())
+    leaves = leaf_values(TraceScene(trace, {}), leaf_formulas, {})
+    low, high = OfflineFormula.of(formula, leaf_formulas).evaluate(leaves, trace.times_ns).ends(0)
     return float(low[0]), float(high[0])

@@ -54,10 +54,10 @@ def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
     """
     step = 1
     while inside != end:
-        ahead = min(inside + step, end) if end > inside else max(inside - step, end)
-        if not holds(ahead):
-            return last_before(inside, ahead, holds)
-        inside, step = ahead, 2 * step
+        next_number = min(inside + step, end) if end > inside else max(inside - step, end)
+        if not holds(next_number):
+            return last_before(inside, next_number, holds)
+        inside, step = next_number, 2 * step
     return inside
 
 
@@ -152,10 +152,10 @@ class ExactSearch:
         self._steps = [constant.steps for constant in margins.varied]
         parts = _parts(margins)
         self._single = [part for part in parts if len(part.axes) < 2]
-        several = [part for part in parts if len(part.axes) > 1]
+        joint_parts = [part for part in parts if len(part.axes) > 1]
         self._joint = _Part(
-            tuple(axis for part in several for axis in part.axes),
-            tuple(name for part in several for name in part.results),
+            tuple(axis for part in joint_parts for axis in part.axes),
+            tuple(name for part in joint_parts for name in part.results),
         )
 
     def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
@@ -163,72 +163,79 @@ class ExactSearch:
         feasibility = self.decide(good, bad, 0.0)
         if feasibility.looseness is None:
             return feasibility
-        best, low = feasibility.looseness, self._least((*good, *bad), feasibility.looseness)
-        ends = self._steps, [0] * len(self._steps)
-        high = min(self._least(good, ends[0]), self._least(bad, ends[1]))
+        best_looseness, low_margin = feasibility.looseness, self._least((*good, *bad), feasibility.looseness)
+        end_points = self._steps, [0] * len(self._steps)
+        high_margin = min(self._least(good, end_points[0]), self._least(bad, end_points[1]))
         # an invalid end has the margin -inf, which is not an upper bound
-        if any(self._is_invalid((*good, *bad), end) for end in ends):
-            high = math.inf
+        if any(self._is_invalid((*good, *bad), end) for end in end_points):
+            high_margin = math.inf
         is_proven = True
-        most = self._margins.evaluations + _MOST_EVALUATIONS
+        evaluation_limit = self._margins.evaluations + _MOST_EVALUATIONS
         for _ in range(_LEVELS):
-            if self._margins.evaluations > most:
+            if self._margins.evaluations > evaluation_limit:
                 is_proven = False
                 break
-            if high - low <= _PRECISION * abs(low) or low == high:
+            if high_margin - low_margin <= _PRECISION * abs(low_margin) or low_margin == high_margin:
                 break
             # without an upper bound the level is doubled
-            level = (low + high) / 2 if math.isfinite(high) else max(1.0, 2 * low)
-            tried = self.decide(good, bad, level)
-            if tried.looseness is None:
-                high = level
-                is_proven &= tried.is_proven
+            level = (low_margin + high_margin) / 2 if math.isfinite(high_margin) else max(1.0, 2 * low_margin)
+            attempt = self.decide(good, bad, level)
+            if attempt.looseness is None:
+                high_margin = level
+                is_proven &= attempt.is_proven
             else:
-                best, low = tried.looseness, max(level, self._least((*good, *bad), tried.looseness))
-        return Feasibility(best, is_proven)
+                best_looseness, low_margin = (
+                    attempt.looseness,
+                    max(level, self._least((*good, *bad), attempt.looseness)),
+                )
+        return Feasibility(best_looseness, is_proven)
 
     def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Feasibility:
         """Return a point at which all given runs have a margin of at least `level`, if there is one."""
-        numbers = list(self._steps)
-        uncovered = list(bad)
+        looseness = list(self._steps)
+        remaining_bad = list(bad)
         for part in self._single:
             for axis in part.axes:
-                holds = partial(self._holds_at, numbers, axis, level, part.results)
-                numbers[axis] = least_for_all(good, self._steps[axis], holds)
-            if not all(self._holds(run, numbers, level, part.results) for run in good):
+                holds = partial(self._holds_at, looseness, axis, level, part.results)
+                looseness[axis] = least_for_all(good, self._steps[axis], holds)
+            if not all(self._holds(run, looseness, level, part.results) for run in good):
                 return Feasibility(None)
-            uncovered = [run for run in uncovered if not self._holds(run, numbers, level, part.results)]
+            remaining_bad = [
+                run for run in remaining_bad if not self._holds(run, looseness, level, part.results)
+            ]
         if not self._joint.axes:
-            return Feasibility(None if uncovered else tuple(numbers))
-        return self._in_boxes(good, uncovered, numbers, level)
+            return Feasibility(None if remaining_bad else tuple(looseness))
+        return self._in_boxes(good, remaining_bad, looseness, level)
 
     def _in_boxes(
         self, good: Sequence[int], bad: Sequence[int], numbers: Sequence[int], level: float
     ) -> Feasibility:
-        low = _with(numbers, self._joint.axes, 0)
-        boxes = [(low, list(numbers))]
-        most = self._margins.evaluations + _MOST_EVALUATIONS
+        low_corner = _with(numbers, self._joint.axes, 0)
+        boxes = [(low_corner, list(numbers))]
+        evaluation_limit = self._margins.evaluations + _MOST_EVALUATIONS
         for _ in range(_MOST_BOXES):
             if not boxes:
                 return Feasibility(None)
-            if self._margins.evaluations > most:
+            if self._margins.evaluations > evaluation_limit:
                 break
-            low, high = boxes.pop()
-            if not (self._may_fit(good, high, level) and self._may_fit(bad, low, level)):
+            low_corner, high_corner = boxes.pop()
+            if not (self._may_fit(good, high_corner, level) and self._may_fit(bad, low_corner, level)):
                 continue
-            self._contract(good, low, high, level)
-            if not self._may_fit(bad, low, level):
+            self._contract(good, low_corner, high_corner, level)
+            if not self._may_fit(bad, low_corner, level):
                 continue
-            self._contract(bad, high, low, level)
-            for corner in (low, high):
+            self._contract(bad, high_corner, low_corner, level)
+            for corner in (low_corner, high_corner):
                 if all(self._holds(run, corner, level, self._joint.results) for run in (*good, *bad)):
                     return Feasibility(tuple(corner))
-            axis = max(self._joint.axes, key=lambda axis: (high[axis] - low[axis]) / self._steps[axis])
-            if high[axis] > low[axis]:
-                middle = (low[axis] + high[axis]) // 2
+            axis = max(
+                self._joint.axes, key=lambda axis: (high_corner[axis] - low_corner[axis]) / self._steps[axis]
+            )
+            if high_corner[axis] > low_corner[axis]:
+                middle = (low_corner[axis] + high_corner[axis]) // 2
                 # boxes are a stack, so the tighter half is searched first
-                boxes.append((_with(low, [axis], middle + 1), list(high)))
-                boxes.append((list(low), _with(high, [axis], middle)))
+                boxes.append((_with(low_corner, [axis], middle + 1), list(high_corner)))
+                boxes.append((list(low_corner), _with(high_corner, [axis], middle)))
         return Feasibility(None, is_proven=not boxes)
 
     def _contract(
@@ -236,17 +243,19 @@ class ExactSearch:
     ) -> None:
         """Move a corner of a box past numbers that fail even with the opposite corner's other numbers."""
         for axis in self._joint.axes:
-            end, limit = corner[axis], opposite[axis]
-            if end == limit or self._may_fit(runs, _with(opposite, [axis], end), level):
+            corner_number, opposite_number = corner[axis], opposite[axis]
+            if corner_number == opposite_number or self._may_fit(
+                runs, _with(opposite, [axis], corner_number), level
+            ):
                 continue
-            least = max(abs(limit - end) >> _CONTRACTION, 1)
-            while abs(limit - end) > least:
-                middle = (end + limit) // 2
+            least_gap = max(abs(opposite_number - corner_number) >> _CONTRACTION, 1)
+            while abs(opposite_number - corner_number) > least_gap:
+                middle = (corner_number + opposite_number) // 2
                 if self._may_fit(runs, _with(opposite, [axis], middle), level):
-                    limit = middle
+                    opposite_number = middle
                 else:
-                    end = middle
-            corner[axis] = end + (1 if limit > end else -1)
+                    corner_number = middle
+            corner[axis] = corner_number + (1 if opposite_number > corner_number else -1)
 
     def _may_fit(self, runs: Sequence[int], numbers: Sequence[int], level: float) -> bool:
         return all(self._holds(run, numbers, level, self._joint.results) for run in runs) or (
@@ -274,10 +283,13 @@ def _parts(margins: Margins) -> list[_Part]:
     """Return groups of constants that share results, directly or through other constants."""
     parts: list[tuple[set[int], list[str]]] = []
     for name, axes in margins.axes.items():
-        shared = [part for part in parts if part[0] & set(axes)]
-        parts = [part for part in parts if part not in shared]
+        shared_parts = [part for part in parts if part[0] & set(axes)]
+        parts = [part for part in parts if part not in shared_parts]
         parts.append(
-            (set(axes).union(*(part[0] for part in shared)), [name, *(n for p in shared for n in p[1])])
+            (
+                set(axes).union(*(part[0] for part in shared_parts)),
+                [name, *(part_name for shared_part in shared_parts for part_name in shared_part[1])],
+            )
         )
     return [_Part(tuple(sorted(axes)), tuple(names)) for axes, names in parts]
 
@@ -320,11 +332,11 @@ class Search:
 
     def __init__(self, margins: Margins, seed: int = 0) -> None:
         self._margins, self._seed = margins, seed
-        numbers = list(range(len(margins.runs)))
+        run_indices = list(range(len(margins.runs)))
         # in random order, only about ln(n) of n runs change the limit in `least_for_all`
-        random.Random(seed).shuffle(numbers)
-        self._good = [number for number in numbers if margins.runs[number].is_good]
-        self._bad = [number for number in numbers if not margins.runs[number].is_good]
+        random.Random(seed).shuffle(run_indices)
+        self._good = [run_index for run_index in run_indices if margins.runs[run_index].is_good]
+        self._bad = [run_index for run_index in run_indices if not margins.runs[run_index].is_good]
         self._steps = tuple(constant.steps for constant in margins.varied)
 
     def best(self) -> Found:
@@ -370,11 +382,11 @@ class Search:
                     "none is the tightest; give bad runs, too"
                 )
         loosest = self._at(_PARTS)
-        failing = tuple(run for run in self._good if not self._margins.holds(run, loosest))
-        if failing:
-            return Found(loosest, is_held=False, conflict=failing, alone=failing)
-        together = self._least(self._good, _PARTS, self._at)
-        point = self._at(together)
+        failing_runs = tuple(run for run in self._good if not self._margins.holds(run, loosest))
+        if failing_runs:
+            return Found(loosest, is_held=False, conflict=failing_runs, alone=failing_runs)
+        joint_part = self._least(self._good, _PARTS, self._at)
+        point = self._at(joint_part)
         for axis, steps in enumerate(self._steps):
             # the defaults bind the values of this iteration
             def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
@@ -389,21 +401,27 @@ class Search:
         def at(looseness: int) -> Point:
             return (self._number_at(0, looseness),)
 
-        alone = self._alone(at(steps), at(0))
-        good, bad = ([run for run in runs if run not in alone] for runs in (self._good, self._bad))
-        first = self._least(good, steps, at)
-        last = steps - self._least(bad, steps, lambda tightness: at(steps - tightness))
-        failing: list[int] = []
-        if first > last:
-            failing = [run for run in good if not self._margins.holds(run, at(last))]
-            failing += [run for run in bad if not self._margins.holds(run, at(first))]
-        if alone or failing:
-            return Found(at(first), is_held=False, conflict=(*alone, *failing), alone=alone)
-        number = self._crossing(first, last, at)
+        unfit_runs = self._alone(at(steps), at(0))
+        good, bad = ([run for run in runs if run not in unfit_runs] for runs in (self._good, self._bad))
+        first_looseness = self._least(good, steps, at)
+        last_looseness = steps - self._least(bad, steps, lambda tightness: at(steps - tightness))
+        failing_runs: list[int] = []
+        if first_looseness > last_looseness:
+            failing_runs = [run for run in good if not self._margins.holds(run, at(last_looseness))]
+            failing_runs += [run for run in bad if not self._margins.holds(run, at(first_looseness))]
+        if unfit_runs or failing_runs:
+            return Found(
+                at(first_looseness), is_held=False, conflict=(*unfit_runs, *failing_runs), alone=unfit_runs
+            )
+        crossing = self._crossing(first_looseness, last_looseness, at)
         # the widest margin is at the crossing or one step before it
-        widest = max(number, max(number - 1, first), key=lambda each: self._least_margin(at(each)))
-        least = self._least_margin(at(widest))
-        interval = self.interval(at(widest), 0, least)
+        widest_looseness = max(
+            crossing,
+            max(crossing - 1, first_looseness),
+            key=lambda looseness: self._least_margin(at(looseness)),
+        )
+        least_margin = self._least_margin(at(widest_looseness))
+        interval = self.interval(at(widest_looseness), 0, least_margin)
         return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
 
     def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
@@ -411,25 +429,25 @@ class Search:
         good = [run for run in self._good if not self._margins.holds(run, loosest)]
         return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
-    def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
+    def _crossing(self, first_looseness: int, last_looseness: int, at: Callable[[int], Point]) -> int:
         """Return the least looseness at which good runs have the wider margin; `last` if there is none.
 
         The interval is bisected. Runs that cannot have the least margin within it are dropped.
         """
         margin = self._margins.margin
         good, bad = self._good, self._bad
-        while first < last:
-            middle = (first + last) // 2
-            least_good = min(margin(run, at(last)) for run in good) if good else np.inf
-            least_bad = min(margin(run, at(first)) for run in bad)
-            good = [run for run in good if margin(run, at(first)) <= least_good]
-            bad = [run for run in bad if margin(run, at(last)) <= least_bad]
-            goods = min((margin(run, at(middle)) for run in good), default=np.inf)
-            if goods >= min(margin(run, at(middle)) for run in bad):
-                last = middle
+        while first_looseness < last_looseness:
+            middle = (first_looseness + last_looseness) // 2
+            least_good = min(margin(run, at(last_looseness)) for run in good) if good else np.inf
+            least_bad = min(margin(run, at(first_looseness)) for run in bad)
+            good = [run for run in good if margin(run, at(first_looseness)) <= least_good]
+            bad = [run for run in bad if margin(run, at(last_looseness)) <= least_bad]
+            good_margin = min((margin(run, at(middle)) for run in good), default=np.inf)
+            if good_margin >= min(margin(run, at(middle)) for run in bad):
+                last_looseness = middle
             else:
-                first = middle + 1
-        return first
+                first_looseness = middle + 1
+        return first_looseness
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
         """Return the least number from which on every run has the right verdict; at `most` all have it."""
@@ -439,29 +457,29 @@ class Search:
 
     def _widest_by_boxes(self) -> Found:
         """Search exactly over deciding runs, and add the worst other runs until none is worse."""
-        alone = self._alone(self._at(_PARTS), self._at(0))
-        if alone:
-            return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
-        exact = ExactSearch(self._margins, self._point_at)
-        deciding = self._worst(self._margins.start, [])
+        unfit_runs = self._alone(self._at(_PARTS), self._at(0))
+        if unfit_runs:
+            return Found(self._margins.start, is_held=False, conflict=unfit_runs, alone=unfit_runs)
+        exact_search = ExactSearch(self._margins, self._point_at)
+        deciding_runs = self._worst(self._margins.start, [])
         while True:
-            good, bad = self._split(deciding)
-            feasibility = exact.widest(good, bad)
+            good, bad = self._split(deciding_runs)
+            feasibility = exact_search.widest(good, bad)
             if feasibility.looseness is None:
                 break
-            point = self._climb(deciding, self._point_at(feasibility.looseness))
-            missing = self._worst(point, deciding) or self._failing(point)[:1]
-            if not missing:
+            point = self._climb(deciding_runs, self._point_at(feasibility.looseness))
+            worse_runs = self._worst(point, deciding_runs) or self._failing(point)[:1]
+            if not worse_runs:
                 return Found(self._centre(point), is_held=True, is_proven=feasibility.is_proven)
-            deciding += missing
+            deciding_runs += worse_runs
         if feasibility.is_proven:
             # runs that the contradiction does not need are left out, so that the conflict names few runs
-            for run in list(deciding):
-                rest = self._split([other_run for other_run in deciding if other_run != run])
-                fewer = exact.decide(*rest, 0.0)
-                if fewer.looseness is None and fewer.is_proven:
-                    deciding.remove(run)
-        return Found(self._margins.start, False, tuple(deciding), feasibility.is_proven)
+            for run in list(deciding_runs):
+                reduced_runs = self._split([other_run for other_run in deciding_runs if other_run != run])
+                reduced_answer = exact_search.decide(*reduced_runs, 0.0)
+                if reduced_answer.looseness is None and reduced_answer.is_proven:
+                    deciding_runs.remove(run)
+        return Found(self._margins.start, False, tuple(deciding_runs), feasibility.is_proven)
 
     def _split(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
         """Return the good runs and the bad runs among some runs."""
@@ -476,51 +494,59 @@ class Search:
     def _widest_of_several(self) -> Found:
         """Optimise over deciding runs, and add the worst other runs until none is worse."""
         start = self._margins.start
-        deciding = self._worst(start, [])
+        deciding_runs = self._worst(start, [])
         point = start
         for _ in range(_ROUNDS):
-            point = self._optimise(deciding, point)
-            missing = self._worst(point, deciding)
-            if not missing:
+            point = self._optimise(deciding_runs, point)
+            worse_runs = self._worst(point, deciding_runs)
+            if not worse_runs:
                 break
-            deciding += missing
+            deciding_runs += worse_runs
         if not self._all_hold([*self._bad, *self._good], point):
             return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
         return Found(self._centre(point), is_held=True, is_proven=False)
 
-    def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
+    def _worst(self, point: Point, known_runs: Sequence[int]) -> list[int]:
         """Return the good and the bad run with the least margin, if it is below that of the known runs."""
         margin = self._margins.margin
-        least = min((margin(run, point) for run in known), default=np.inf)
-        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
-        return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
+        least_margin = min((margin(run, point) for run in known_runs), default=np.inf)
+        worst_runs = [
+            min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs
+        ]
+        return [
+            run
+            for run in worst_runs
+            if run not in known_runs and (not known_runs or margin(run, point) < least_margin)
+        ]
 
     def _optimise(self, runs: Sequence[int], start: Point) -> Point:
         """Return the best point for some runs, by a search of all grid lines or else by evolution.
 
         A grid line follows an axis with a direction, on which secants find the best number.
         """
-        directed = [axis for axis, direction in enumerate(self._margins.directions) if direction is not None]
-        axis = max(directed, key=lambda axis: self._steps[axis], default=None)
-        others = [other_axis for other_axis in range(len(self._steps)) if other_axis != axis]
-        best: tuple[float, Point] = (-np.inf, start)
+        directed_axes = [
+            axis for axis, direction in enumerate(self._margins.directions) if direction is not None
+        ]
+        axis = max(directed_axes, key=lambda axis: self._steps[axis], default=None)
+        other_axes = [other_axis for other_axis in range(len(self._steps)) if other_axis != axis]
+        best_candidate: tuple[float, Point] = (-np.inf, start)
 
         def look(numbers: Sequence[int]) -> float:
-            nonlocal best
+            nonlocal best_candidate
             point = list(start)
-            for other_axis, number in zip(others, numbers, strict=True):
+            for other_axis, number in zip(other_axes, numbers, strict=True):
                 point[other_axis] = number
             candidate = self._best_on_line(runs, tuple(point), axis)
-            best = max(best, candidate)
+            best_candidate = max(best_candidate, candidate)
             return -candidate[0]
 
-        sizes = [self._steps[other_axis] for other_axis in others]
+        sizes = [self._steps[other_axis] for other_axis in other_axes]
         if axis is not None and math.prod(size + 1 for size in sizes) <= _MOST_LINES:
             for numbers in itertools.product(*(range(size + 1) for size in sizes)):
                 look(numbers)
         else:
-            evolve(look, sizes, [start[other_axis] for other_axis in others], self._seed)
-        return self._climb(runs, best[1])
+            evolve(look, sizes, [start[other_axis] for other_axis in other_axes], self._seed)
+        return self._climb(runs, best_candidate[1])
 
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
         """Return the best point on a line along an axis, with its margin.
@@ -530,39 +556,41 @@ class Search:
         """
         if axis is None:
             return self._sides(runs, point)[0], point
-        best: tuple[float, Point] = (-np.inf, point)
+        best_candidate: tuple[float, Point] = (-np.inf, point)
 
         def excess(looseness: int) -> float:
-            nonlocal best
-            moved = self._with(point, axis, self._number_at(axis, looseness))
-            least, good, bad = self._sides(runs, moved)
-            best = max(best, (least, moved))
-            return good - bad
+            nonlocal best_candidate
+            moved_point = self._with(point, axis, self._number_at(axis, looseness))
+            least_margin, good_margin, bad_margin = self._sides(runs, moved_point)
+            best_candidate = max(best_candidate, (least_margin, moved_point))
+            return good_margin - bad_margin
 
         low, high = 0, self._steps[axis]
-        below, above = excess(low), excess(high)
-        if below >= 0.0 or above < 0.0:
-            return best
-        for turn in range(_SECANTS):
+        low_excess, high_excess = excess(low), excess(high)
+        if low_excess >= 0.0 or high_excess < 0.0:
+            return best_candidate
+        for step in range(_SECANTS):
             if high - low <= 1:
                 break
             # every third step is a bisection, because secants can leave one end in place for many steps
-            share = 0.5 if turn % 3 == 2 else below / (below - above)
+            fraction = 0.5 if step % 3 == 2 else low_excess / (low_excess - high_excess)
             # strictly between the ends, so that the interval always shrinks
-            middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
+            middle = min(max(low + round(fraction * (high - low)), low + 1), high - 1)
             if (middle_excess := excess(middle)) >= 0.0:
-                high, above = middle, middle_excess
+                high, high_excess = middle, middle_excess
             else:
-                low, below = middle, middle_excess
-        return best
+                low, low_excess = middle, middle_excess
+        return best_candidate
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
         """Return the least margin of all given runs, of the good and of the bad ones, limited to `_FAR`."""
-        least = [_FAR, _FAR]
+        least_margins = [_FAR, _FAR]
         for run in runs:
-            side = int(not self._margins.runs[run].is_good)
-            least[side] = max(min(self._margins.margin(run, point), least[side]), -_FAR)
-        return min(least), least[0], least[1]
+            side_index = int(not self._margins.runs[run].is_good)
+            least_margins[side_index] = max(
+                min(self._margins.margin(run, point), least_margins[side_index]), -_FAR
+            )
+        return min(least_margins), least_margins[0], least_margins[1]
 
     def _climb(self, runs: Sequence[int], point: Point) -> Point:
         """Move a point along single axes while the least margin grows, with halving steps."""
@@ -570,33 +598,37 @@ class Search:
         def value(trial: Point) -> float:
             return min(self._margins.margin(run, trial) for run in runs)
 
-        best = value(point)
-        sizes = [max(steps >> 4, 1) for steps in self._steps]
+        best_margin = value(point)
+        step_sizes = [max(steps >> 4, 1) for steps in self._steps]
         for _ in range(12):
-            for axis, size in enumerate(sizes):
-                for step in (-size, size):
-                    moved = self._with(point, axis, min(max(point[axis] + step, 0), self._steps[axis]))
-                    if (margin := value(moved)) > best:
-                        point, best = moved, margin
-            sizes = [max(size >> 1, 1) for size in sizes]
+            for axis, step_size in enumerate(step_sizes):
+                for offset in (-step_size, step_size):
+                    moved_point = self._with(
+                        point, axis, min(max(point[axis] + offset, 0), self._steps[axis])
+                    )
+                    if (margin := value(moved_point)) > best_margin:
+                        point, best_margin = moved_point, margin
+            step_sizes = [max(step_size >> 1, 1) for step_size in step_sizes]
         return point
 
     def _centre(self, point: Point) -> Point:
         """Move each number to the middle of the interval that has no lesser margin."""
-        least = self._least_margin(point)
+        least_margin = self._least_margin(point)
         for axis, constant in enumerate(self._margins.varied):
-            number = constant.roundest(*self.interval(point, axis, least))
-            moved = self._with(point, axis, number)
+            number = constant.roundest(*self.interval(point, axis, least_margin))
+            moved_point = self._with(point, axis, number)
             # a constant without a direction can have a lesser margin between the ends of the interval
-            point = moved if self._all_hold(self._good + self._bad, moved, least) else point
+            point = (
+                moved_point if self._all_hold(self._good + self._bad, moved_point, least_margin) else point
+            )
         return point
 
     def _conflict(self, point: Point) -> tuple[int, ...]:
         """Return the conflicting runs: one or two runs without a common point, else all failing runs."""
-        worst = self._worst(point, [])
-        for few in (*[[run] for run in worst], worst):
-            if not self._all_hold(few, self._optimise(few, point)):
-                return tuple(few)
+        worst_runs = self._worst(point, [])
+        for few_runs in (*[[run] for run in worst_runs], worst_runs):
+            if not self._all_hold(few_runs, self._optimise(few_runs, point)):
+                return tuple(few_runs)
         return tuple(self._failing(point))
 
     # ---------------------------------------------------------------------------------------------- points
@@ -716,11 +748,13 @@ class Conflict:
     def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """Needs of the runs in two sections: runs that fit no values, and runs that contradict each other."""
         needs = self.message.split("; ")
-        count = min(len(self.alone), _MOST_NAMED) + (len(self.alone) > _MOST_NAMED)
-        alone = "this one fits none by itself" if len(self.alone) == 1 else "these fit none by themselves"
-        together = "these contradict each other" if len(self.runs) > 1 else "this one never fits"
-        parts = ((alone, tuple(needs[:count])), (together, tuple(needs[count:])))
-        return tuple(part for part in parts if part[1])
+        alone_count = min(len(self.alone), _MOST_NAMED) + (len(self.alone) > _MOST_NAMED)
+        alone_title = (
+            "this one fits none by itself" if len(self.alone) == 1 else "these fit none by themselves"
+        )
+        joint_title = "these contradict each other" if len(self.runs) > 1 else "this one never fits"
+        sections = ((alone_title, tuple(needs[:alone_count])), (joint_title, tuple(needs[alone_count:])))
+        return tuple(section for section in sections if section[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -808,49 +842,50 @@ class Tuning(Displayed):
         if not 2 <= points <= 200:
             raise UsageError(f"points is {points}; give 2 to 200")
         axes = [varied_names.index(name) for name in axis_names]
-        varied = [self._margins.varied[axis] for axis in axes]
+        constants = [self._margins.varied[axis] for axis in axes]
         grids = [
-            np.unique(np.linspace(0, constant.steps, points).round().astype(np.int64)) for constant in varied
+            np.unique(np.linspace(0, constant.steps, points).round().astype(np.int64))
+            for constant in constants
         ]
-        rows = grids[1] if len(grids) > 1 else np.array([self._point[axes[0]]])
-        margins = np.empty((len(self.runs), len(rows), len(grids[0])))
-        for row, y in enumerate(rows.tolist()):
+        y_indices = grids[1] if len(grids) > 1 else np.array([self._point[axes[0]]])
+        margins = np.empty((len(self.runs), len(y_indices), len(grids[0])))
+        for y_row, y in enumerate(y_indices.tolist()):
             for column, x in enumerate(grids[0].tolist()):
-                moved = list(self._point)
-                moved[axes[-1]] = y
-                moved[axes[0]] = x
-                margins[:, row, column] = [
-                    self._margins.margin(run, tuple(moved)) for run in range(len(self.runs))
+                point = list(self._point)
+                point[axes[-1]] = y
+                point[axes[0]] = x
+                margins[:, y_row, column] = [
+                    self._margins.margin(run, tuple(point)) for run in range(len(self.runs))
                 ]
-        values = [
+        axis_values = [
             np.array(
                 [_number(constant.decimal(number), constant.written.duration_ns) for number in grid.tolist()]
             )
-            for constant, grid in zip(varied, grids, strict=True)
+            for constant, grid in zip(constants, grids, strict=True)
         ]
         tuned_values = tuple(
             _number(constant.decimal(self._point[axis]), constant.written.duration_ns)
-            for constant, axis in zip(varied, axes, strict=True)
+            for constant, axis in zip(constants, axes, strict=True)
         )
         return Surface(
             axis_names,
-            values[0],
-            values[1] if len(values) > 1 else np.full(1, np.nan),
+            axis_values[0],
+            axis_values[1] if len(axis_values) > 1 else np.full(1, np.nan),
             margins,
             tuple((run.name, run.is_good) for run in self.runs),
             tuned_values if self.is_found else None,
-            tuple(constant.written.duration_ns is not None for constant in varied),
+            tuple(constant.written.duration_ns is not None for constant in constants),
         )
 
     @property
     def document(self) -> dict[str, Any]:
         """The result as values for JSON."""
-        unknown = {} if self.is_found else {"low": None, "high": None}
+        unknown_range = {} if self.is_found else {"low": None, "high": None}
         return {
             "found": self.is_found,
             "margin": json_number(self.margin),
             "widest": self.is_widest,
-            "constants": [{**json_fields(constant), **unknown} for constant in self.constants],
+            "constants": [{**json_fields(constant), **unknown_range} for constant in self.constants],
             "runs": json_value(self.runs),
             "conflict": json_value(self.conflict),
         }
@@ -886,20 +921,22 @@ def tune_runs(
     needs = Needs.of([specification], each or {})
     runs = [replace(run, trace=trim_trace(run.trace, needs)[0]) for run in runs]
     _check(specification, runs)
-    varied = varied_constants(specification, ranges)
-    if len(varied) > MOST_CONSTANTS:
+    constants = varied_constants(specification, ranges)
+    if len(constants) > MOST_CONSTANTS:
         raise UsageError(
-            f"{len(varied)} constants are more than the {MOST_CONSTANTS} that are tuned together"
+            f"{len(constants)} constants are more than the {MOST_CONSTANTS} that are tuned together"
         )
     parse = partial(_with_values, specification, constant_writer(specification), runs[0].trace.units)
-    margins = Margins(runs, parse, varied, each or {}, advance=advance)
+    margins = Margins(runs, parse, constants, each or {}, advance=advance)
     search = Search(margins, seed)
-    result = search.best()
-    kept_numbers = _undecided_constants(margins, search, result) if result.is_held else {}
-    point = tuple(kept_numbers.get(axis, number) for axis, number in enumerate(result.point))
-    is_widest = result.is_proven and point == result.point
-    result = replace(result, point=point, is_proven=is_widest if result.is_held else result.is_proven)
-    return _tuning(specification, margins, search, result, kept_numbers)
+    search_result = search.best()
+    kept_numbers = _undecided_constants(margins, search, search_result) if search_result.is_held else {}
+    point = tuple(kept_numbers.get(axis, number) for axis, number in enumerate(search_result.point))
+    is_widest = search_result.is_proven and point == search_result.point
+    search_result = replace(
+        search_result, point=point, is_proven=is_widest if search_result.is_held else search_result.is_proven
+    )
+    return _tuning(specification, margins, search, search_result, kept_numbers)
 
 
 def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict[int, int]:
@@ -912,7 +949,7 @@ def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict
     if all(run.is_good for run in margins.runs):
         return kept_numbers
     for axis, constant in enumerate(margins.varied):
-        point = tuple(kept_numbers.get(place, number) for place, number in enumerate(found.point))
+        point = tuple(kept_numbers.get(other_axis, number) for other_axis, number in enumerate(found.point))
         low, high = search.interval(point, axis)
         is_free = {1: high == constant.steps, -1: low == 0}.get(margins.directions[axis] or 0, False)
         if (low, high) == (0, constant.steps) or is_free:
@@ -922,15 +959,15 @@ def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict
 
 def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
     if specification.relations:
-        names = ", ".join(sorted(specification.relations))
-        raise UsageError(f"relations given in Python cannot be tuned ({names}); write them as def")
+        relation_names = ", ".join(sorted(specification.relations))
+        raise UsageError(f"relations given in Python cannot be tuned ({relation_names}); write them as def")
     if not any(run.is_good for run in runs):
         raise UsageError("there is no good run to satisfy; give at least one that did what it should")
     require_comparable(runs, "tune on")
     for run in runs[1:]:
         if with_numbers(specification, run.trace.units) != with_numbers(specification, runs[0].trace.units):
-            what = f"{run.name} and {runs[0].name} name the numbers of a signal differently"
-            raise UsageError(f"{what}; read both by one mapping")
+            difference = f"{run.name} and {runs[0].name} name the numbers of a signal differently"
+            raise UsageError(f"{difference}; read both by one mapping")
 
 
 def require_comparable(runs: Sequence[LabelledRun], remedy: str) -> None:
@@ -962,29 +999,29 @@ def _with_values(
 
 
 def _tuning(
-    specification: Specification, margins: Margins, search: Search, found: Found, kept: Collection[int]
+    specification: Specification, margins: Margins, search: Search, found: Found, kept_axes: Collection[int]
 ) -> Tuning:
-    constants = []
+    tuned_constants = []
     for axis, constant in enumerate(margins.varied):
-        number = found.point[axis]
-        low, high = search.interval(found.point, axis) if found.is_held else (number, number)
+        value_index = found.point[axis]
+        low, high = search.interval(found.point, axis) if found.is_held else (value_index, value_index)
         duration_ns = constant.written.duration_ns
-        constants.append(
+        tuned_constants.append(
             TunedConstant(
                 constant.name,
-                constant.value(number),
+                constant.value(value_index),
                 constant.written.value if duration_ns is None else text_of_constant(constant.written),
                 constant.value(low),
                 constant.value(high),
                 (constant.value(0), constant.value(constant.steps)),
                 _number(constant.step, duration_ns),
                 margins.directions[axis],
-                axis not in kept,
+                axis not in kept_axes,
             )
         )
     run_margins = []
-    for number, run in enumerate(margins.runs):
-        robustness = margins.robustness(number, found.point)
+    for run_index, run in enumerate(margins.runs):
+        robustness = margins.robustness(run_index, found.point)
         lower, upper = (-np.inf, np.inf) if robustness is None else robustness
         run_margins.append(
             RunMargin(
@@ -992,12 +1029,12 @@ def _tuning(
                 run.is_good,
                 final_verdict(lower, upper),
                 lower if run.is_good else upper,
-                margins.margin(number, found.point),
+                margins.margin(run_index, found.point),
             )
         )
     return Tuning(
         found.is_held,
-        tuple(constants),
+        tuple(tuned_constants),
         min(run.margin for run in run_margins),
         tuple(run_margins),
         None if found.is_held else _conflict(margins, search, found),
@@ -1009,36 +1046,36 @@ def _tuning(
 
 
 def _conflict(margins: Margins, search: Search, found: Found) -> Conflict:
-    conflict = sorted(found.conflict, key=lambda run: (margins.margin(run, found.point), run))
-    alone = [run for run in conflict if run in found.alone]
-    others = [run for run in conflict if run not in found.alone]
+    conflict_runs = sorted(found.conflict, key=lambda run: (margins.margin(run, found.point), run))
+    alone_runs = [run for run in conflict_runs if run in found.alone]
+    other_runs = [run for run in conflict_runs if run not in found.alone]
     is_exact = len(margins.varied) == 1 and margins.directions[0] is not None
-    parts: list[str] = []
-    for runs in (alone, others):
-        parts += [
-            _needs(margins, search, run, is_exact=is_exact, is_alone=runs is alone)
+    needs: list[str] = []
+    for runs in (alone_runs, other_runs):
+        needs += [
+            _needs(margins, search, run, is_exact=is_exact, is_alone=runs is alone_runs)
             for run in runs[:_MOST_NAMED]
         ]
         if len(runs) > _MOST_NAMED:
-            parts.append(f"and {plural(len(runs) - _MOST_NAMED, 'other run')} likewise")
-    names = tuple(margins.runs[run].name for run in (*alone, *others))
-    return Conflict(names, "; ".join(parts), found.is_proven, names[: len(alone)])
+            needs.append(f"and {plural(len(runs) - _MOST_NAMED, 'other run')} likewise")
+    run_names = tuple(margins.runs[run].name for run in (*alone_runs, *other_runs))
+    return Conflict(run_names, "; ".join(needs), found.is_proven, run_names[: len(alone_runs)])
 
 
 def _needs(margins: Margins, search: Search, run: int, *, is_exact: bool, is_alone: bool) -> str:
     """Return the values that a run needs, as part of a sentence."""
-    labelled = margins.runs[run]
-    what = "satisfied" if labelled.is_good else "violated"
+    labelled_run = margins.runs[run]
+    verdict_text = "satisfied" if labelled_run.is_good else "violated"
     if not is_exact:
         if is_alone:
-            return f"{labelled.name} is not {what} with any values tried"
-        return f"{labelled.name} has to be {what}"
+            return f"{labelled_run.name} is not {verdict_text} with any values tried"
+        return f"{labelled_run.name} has to be {verdict_text}"
     constant, limit = margins.varied[0], search.limit(run)
     if limit is None:
-        span = f"from {constant.text(0)} to {constant.text(constant.steps)}"
-        return f"{labelled.name} is not {what} with any {constant.name} {span}"
-    sign = ">=" if (margins.directions[0] == 1) == labelled.is_good else "<="
-    return f"{labelled.name} is {what} only with {constant.name} {sign} {constant.text(limit)}"
+        range_text = f"from {constant.text(0)} to {constant.text(constant.steps)}"
+        return f"{labelled_run.name} is not {verdict_text} with any {constant.name} {range_text}"
+    sign = ">=" if (margins.directions[0] == 1) == labelled_run.is_good else "<="
+    return f"{labelled_run.name} is {verdict_text} only with {constant.name} {sign} {constant.text(limit)}"
 
 
 def _number(value: Any, duration_ns: int | None) -> float:
