@@ -1,4 +1,4 @@
-"""Relations with limits that all good runs keep, the bad runs that they distinguish, and orders of events."""
+"""Limits of relations that hold in all good runs, bad runs that violate them, and orders of events."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class LimitedRelation:
     other_limit: float | None = None
 
     def text(self, taken: set[str]) -> str:
-        """Return the text of the relation in a specification; no variable has a name in `taken`."""
+        """Return the text of the relation in a specification; variables avoid the names in `taken`."""
         parties = self.quantity.parties
         if not parties:
             name = written_name(self.quantity.signal, RELATION_NAMES)
@@ -170,8 +170,8 @@ class Line:
     """One learned spec: a relation with a temporal pattern, or an order of two relations.
 
     Attributes:
-        fact: relation that holds always, finally or eventually; for "before" and "until", the first one.
-        later: for "before" and "until", relation that does not hold before the first one; else None.
+        fact: relation that holds always, finally or eventually; for "before" and "until", the first relation.
+        later: for "before" and "until", relation that does not hold before `fact`; else None.
     """
 
     pattern: Pattern
@@ -179,7 +179,7 @@ class Line:
     later: LimitedRelation | None = None
 
     def formula(self, taken: set[str]) -> str:
-        """Return the text of the formula; no variable has a name in `taken`."""
+        """Return the text of the formula; variables avoid the names in `taken`."""
         text = self.fact.text(taken)
         if self.later is None:
             return f"{_OPERATORS[self.pattern]} ({text})"
@@ -244,7 +244,7 @@ class FittedLimits:
 
     Attributes:
         quantities: Q quantities.
-        good, bad: measured runs, among them B bad ones.
+        good, bad: measured good runs, and B measured bad runs.
         limits: (3, 2, Q), limits by pattern and direction; NaN if no limit holds in all good runs.
         lowest: (3, 2, Q), lowest values of the good runs.
         margins: (3, 2, Q), margins between lowest values and limits before bad runs move the limits.
@@ -266,13 +266,14 @@ class FittedLimits:
         """Fit limits to the runs.
 
         A limit keeps a margin from the lowest value of the good runs. The margin is three times the mean
-        distance of their values, and at most half of the way to the nearest bad run. If no limit
-        distinguishes a bad run, one limit moves to the middle between that run and the good runs. It is the
-        limit with the greatest gap between them, in margins.
+        distance between their values, and at most half of the distance to the nearest bad run.
+
+        A bad run that no limit distinguishes moves one limit: the limit with the greatest gap, in margins,
+        between that run and the good runs. The limit moves to the middle of the gap.
         """
         good_values = np.stack([_by_pattern(run, 0) for run in good], axis=-1)
         lowest = good_values.min(axis=-1)
-        # unknown values are infinite, and inf - inf is NaN, which `valid` excludes
+        # unknown values are infinite, and inf - inf is NaN, which `is_valid` excludes
         with np.errstate(invalid="ignore"):
             spread = good_values.max(axis=-1) - lowest
             margins = np.maximum(_MARGIN * spread / (len(good) - 1), _FINEST * np.abs(lowest))
@@ -348,7 +349,7 @@ class FittedLimits:
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of quantities: for each quantity of a class, those of the class members; else empty."""
+        """For each quantity of a class, indices of the members' quantities; () for other quantities."""
         names_by_class = members_of(self.good[0].trace)
         index_by_relation = {
             (quantity.relation, parties): index
@@ -451,7 +452,7 @@ class FittedLimits:
         ]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
-        """Return the first samples in which relations certainly hold, and may hold, (F, R) each."""
+        """Return the first samples in which relations certainly hold, and may hold: (F, R) each."""
         first_times = [
             [
                 [run.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for run in runs]
@@ -463,7 +464,7 @@ class FittedLimits:
         return sure_times, possible_times
 
     def orders(self, facts: Sequence[LimitedRelation]) -> list[tuple[Line, int, Booleans]]:
-        """Return the orders of relations that are the same in all good runs.
+        """Return the orders of two relations that all good runs have in common.
 
         Returns:
             For each order: its line, the least number of samples between the relations, and a flag for each
@@ -486,12 +487,16 @@ class FittedLimits:
 
 
 def _by_pattern(run: Observed, end: int) -> Floats:
-    """Return the deciding number of each pattern and direction, (3, 2, Q): least, last and greatest."""
+    """Return the deciding number of each pattern and direction, (3, 2, Q): least, last and greatest.
+
+    Args:
+        end: 0 for lower ends of the numbers, 1 for upper ends.
+    """
     return np.stack((run.least[:, end], run.last[:, end], run.greatest[:, end]))
 
 
 def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
-    """Mark limits as invalid that another quantity expresses better, or that no one would write."""
+    """Invalidate limits that another quantity expresses better, or that nobody would write."""
     inside_by_pair: dict[frozenset[Party], Booleans] = {}
     for index, quantity in enumerate(quantities):
         if quantity.relation == "enclosedin":
@@ -502,12 +507,12 @@ def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Float
         if quantity.relation == "oriented":
             is_valid[:, 1, index] = False
         elif quantity.relation == "dist":
-            # left out are the depth of an overlap, and a large distance at some time
+            # leave out the depth of an overlap, and a large distance at some time
             is_valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
             is_valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
             is_valid[EVENTUALLY, 0, index] = False
         elif quantity.relation == "ovlp":
-            # an object inside another one overlaps it, too
+            # an object inside another object also overlaps it
             is_valid[:, 0, index] &= ~inside_by_pair.get(quantity.pair, np.zeros(3, bool))
             is_valid[:, 1, index] = False
         elif quantity.relation not in WITH_LIMIT:
@@ -528,7 +533,7 @@ def _short(limit: float, margin: float, lowest: float) -> float:
 def _one_digit(limit: float, lowest: float) -> float | None:
     """Return the only number with one digit between a limit and the lowest value; None if there is none.
 
-    People write 0.05 instead of 0.0487, and good runs alone do not decide between the two.
+    People write 0.05 instead of 0.0487, and good runs alone do not decide between these numbers.
     """
     step = Decimal(1).scaleb(floor(log10(max(abs(limit), abs(lowest)) or 1.0)))
     first_multiple = (Decimal(limit) / step).to_integral_value(ROUND_CEILING)

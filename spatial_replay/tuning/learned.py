@@ -69,7 +69,7 @@ def chosen_lines(fit: FittedLimits, most: int) -> tuple[Line, ...]:
 
 
 def _distinctive(fit: FittedLimits, most_lines: int) -> list[Line]:
-    """Return lines, each with the most bad runs that the earlier lines do not distinguish."""
+    """Return lines; each next line distinguishes the most bad runs that the earlier lines miss."""
     limit_indices = np.argwhere((fit.apart > 0.0).any(axis=-1))
     events = fit.events()
     sample_counts = np.array([len(run.trace) for run in fit.bad])
@@ -165,7 +165,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
                 fact = replace(fit.fact(FINALLY, 0, index), other_limit=upper_relation.limit)
             bits = fit.bits_between(index)
             if centre in quantity.parties or any(distance_counts[party] == 1 for party in quantity.parties):
-                # the nearest landmark describes a place best, whatever the path of the object
+                # the nearest landmark describes a place best, for any path of the object
                 bits = max(bits, _LEAST_BITS_PLACED)
             scored_lines.append((bits, index, Line("finally", fact)))
             scored_pairs |= {quantity.pair, *(fit.quantities[member].pair for member in fit.members[index])}
@@ -185,7 +185,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
         if index in covered_indices or not (is_changed or quantity.pair in scored_pairs):
             continue
         if quantity.relation == "ovlp" and quantity.pair in scored_pairs:
-            # an object inside another one overlaps it, too
+            # an object inside another object also overlaps it
             continue
         covered_indices.update(fit.members[index])
         if quantity.relation in _DIRECTIONS:
@@ -216,7 +216,10 @@ def _said_at_end(fit: FittedLimits, index: int) -> float:
 
 
 def _centre(fit: FittedLimits) -> Party | None:
-    """Return the landmark next to which most objects end, such as a plate; None if no landmark has two."""
+    """Return the landmark that is nearest to most objects at the end, such as a plate.
+
+    The result is None if no landmark is nearest to two objects.
+    """
     nearest_landmarks: dict[Party, tuple[float, Party]] = {}
     for index, quantity in enumerate(fit.quantities):
         still_parties = [party for party in quantity.parties if party in fit.landmarks and not party.is_class]
@@ -239,9 +242,9 @@ def _centre(fit: FittedLimits) -> Party | None:
 def _places(
     fit: FittedLimits, quantity: Quantity, distance_counts: Counter[Party], centre: Party | None
 ) -> bool:
-    """Return whether a distance from a landmark helps to define the place of a moved object, and count it.
+    """Return whether a landmark distance helps to define the place of a moved object; if so, count it.
 
-    An object needs at most `_DISTANCES` of them. The distance from the centre is always used.
+    An object needs at most `_DISTANCES` distances. The distance from the centre is always used.
     """
     moved_parties = [party for party in quantity.parties if party not in fit.landmarks]
     if len(moved_parties) != 1 or (
@@ -276,7 +279,7 @@ def _spread(scored_lines: list[tuple[float, Line]], landmarks: frozenset[Party])
 def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool:
     """Return whether all members of a quantity's class have similar limits.
 
-    If so, one line about the class replaces the lines about its members.
+    Then one line about the class replaces the lines about its members.
     """
     limit = abs(float(fit.limits[pattern, direction, index]))
     greatest_ratio = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
@@ -292,7 +295,7 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
     """Yield distances at the end as weight and index.
 
-    With landmarks, the weight is nearness; otherwise it says how well a distance defines a place.
+    With landmarks, the weight is nearness; otherwise it tells how well a distance defines a place.
     """
     for index, quantity in enumerate(fit.quantities):
         lower_limit, negated_upper_limit = fit.limits[FINALLY, :, index]
@@ -341,7 +344,7 @@ def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[f
 
 
 def _invariants(fit: FittedLimits) -> list[Line]:
-    """Return lines with `G`, those closest to failing first; a class replaces its members."""
+    """Return lines with `G`, closest to failing first; lines of a class replace lines of its members."""
     scored_lines = []
     for direction, index in np.argwhere(fit.bits[ALWAYS] >= _LEAST_BITS).tolist():
         fact, bits = fit.fact(ALWAYS, direction, index), float(fit.bits[ALWAYS, direction, index])
@@ -375,12 +378,12 @@ def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line
             yield orders_by_pair[goal_pair][0]
             pending_goal = None
         else:
-            # both goals are reached at the same time, so the next goal is compared with the first of them
+            # both goals are reached at the same time, so the next goal is compared with the earlier goal
             pending_goal = pending_goal or first_goal
 
 
 def _join_limits(lines: Sequence[Line]) -> Iterator[Line]:
-    """Yield lines; lines with the two limits of one distance become one line."""
+    """Yield lines; two lines with the limits of one distance become one line."""
     limits: dict[tuple[str, Quantity, int], LimitedRelation] = {
         (line.pattern, line.fact.quantity, line.fact.direction): line.fact
         for line in lines
@@ -461,7 +464,7 @@ class Learned(Printed):
         specs: specs in the order of the file, the most distinctive first.
         runs: name of each run and whether it is good, in the given order.
         missed: names of bad runs that no line distinguishes.
-        checked: runs that were left out in turn; empty with fewer than three good runs.
+        checked: runs with verdicts by cross-validation; empty with fewer than three good runs.
         left_out: phrases for objects, pairs and signals that were not compared.
     """
 
@@ -623,7 +626,7 @@ def _check(runs: Sequence[LabelledRun]) -> None:
 
 
 def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
-    """Yield phrases for objects that at least half of the good runs have, but not all."""
+    """Yield phrases for objects in at least half of the good runs, but not in all good runs."""
     run_counts = Counter(name for run in good for name in run.trace.names)
     partial_names = [name for name in sorted(run_counts) if len(good) / 2 <= run_counts[name] < len(good)]
     for name in partial_names[:_MOST_NAMED]:
@@ -656,15 +659,15 @@ class _Written(NamedTuple):
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writer of lines as a specification; no spec or variable has a name in `taken`, names of objects."""
+    """Writer of lines as a specification; specs and variables avoid `taken`, the names of objects."""
 
     profile: str
     taken: set[str]
 
     def write_lines(self, lines: Sequence[Line], runs: Sequence[LabelledRun]) -> _Written | None:
-        """Return the lines whose written form all good runs satisfy and some bad run violates.
+        """Return the lines that all good runs satisfy and some bad run violates; None if there are none.
 
-        Without bad runs, the good runs decide. The result is None if no line is left.
+        Each line is evaluated as written, with its rounded limit. Without bad runs, the good runs decide.
         """
         if not lines:
             return None
@@ -674,7 +677,7 @@ class _Writer:
         return _Written(tuple(kept_lines), self._parse(kept_lines)) if kept_lines else None
 
     def order(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
-        """Sort the lines: among lines that the same bad runs violate, shorter ones come first."""
+        """Sort the lines: among lines that the same bad runs violate, shorter lines come first."""
         lines_by_verdicts: dict[tuple[bool, ...], list[Line]] = {}
         verdict_keys = []
         for line, spec in written.pairs:

@@ -68,8 +68,8 @@ class _NeedsParsingError(Exception):
 def formula_with(probes: Sequence[Probe]) -> Callable[[Numbers], Formula] | None:
     """Return a function from values of constants to the formula; None if the text must be parsed for it.
 
-    A number that equals a constant, or a negated one, in all probes is replaced by the value. Texts of atoms
-    stay as in the first probe. Windows whose ends may cross need the parser, which checks their order.
+    A number that equals a constant or its negative in all probes gets the new value of that constant. Texts
+    of atoms stay as in the first probe. Windows whose ends may cross need the parser, which checks the ends.
     """
     try:
         return _fill([probe.formula for probe in probes], [probe.numbers for probe in probes])
@@ -235,7 +235,7 @@ class VariedConstant:
 def varied_constants(
     specification: Specification, ranges: Mapping[str, tuple[Value, Value] | None]
 ) -> tuple[VariedConstant, ...]:
-    """Return the constants to tune: those in `ranges` or, if it is empty, all with a range in the text.
+    """Return the constants in `ranges`; if `ranges` is empty, all constants with a range in the text.
 
     Args:
         ranges: range to try by name; None for the range in the text.
@@ -308,10 +308,10 @@ Direction: TypeAlias = Literal[-1, 0, 1]
 
 
 def direction(before: Specification, after: Specification) -> Direction | None:
-    """Return whether a specification is looser or tighter than another one of the same shape.
+    """Return whether `after` is looser or tighter than `before`, a specification of the same shape.
 
     Returns:
-        Direction of `after`; None if it is looser in some logs and tighter in others, or if unknown.
+        Direction of `after`; None if it is unknown, or differs between logs.
     """
     if before.regions != after.regions or len(before.results) != len(after.results):
         return None
@@ -321,7 +321,7 @@ def direction(before: Specification, after: Specification) -> Direction | None:
 
 
 def _common(directions: Iterable[Direction | None]) -> Direction | None:
-    """Return the direction of a value that increases with each of its parts; None if parts disagree."""
+    """Return the direction of a value that increases with each of its parts; None if directions differ."""
     signs = set(directions) - {0}
     if not signs:
         return 0
@@ -418,7 +418,7 @@ Point: TypeAlias = tuple[int, ...]
 Parse: TypeAlias = Callable[[Mapping[str, Value]], Specification]
 
 _REMEMBERED: Final = 64
-"""Cached specifications; a search returns to recent ones."""
+"""Number of cached specifications; a search returns to recent points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,7 +476,7 @@ def _place(file: LogFile) -> str:
 
 
 class Robustness(NamedTuple):
-    """Lower and upper end of the least robustness of a specification's results over one run."""
+    """Ends of the interval of a specification's least robustness over one run."""
 
     lower: float
     upper: float
@@ -489,7 +489,8 @@ class _Result(NamedTuple):
         order: leaves of the formula in the order of their numbers.
         formula: compiled formula.
         regions: regions of the specification.
-        same_measurements: whether all its measurements are those with the values in the text.
+        same_measurements: whether the specification with the values in the text has all measurements of the
+            formula, in the same regions.
     """
 
     order: Sequence[Atom | Quantified]
@@ -510,7 +511,7 @@ class Margins:
 
     Attributes:
         runs: evaluated runs; methods identify a run by its index.
-        varied: constants in the order of a point; those that count samples have whole numbers.
+        varied: constants in the order of a point; constants that count samples have whole numbers.
         directions: for each constant, 1 if a greater value is looser, -1 if it is tighter, None if unknown.
         axes: indices of the constants that a result depends on, by name of the result.
         evaluations: number of evaluations of a result on a run.
@@ -578,7 +579,7 @@ class Margins:
         return Robustness(lower, upper)
 
     def _of_result(self, run: int, name: str, point: Point) -> Robustness | None:
-        # only the constants of a result are in its key, because others do not change it
+        # the key has only the constants of a result, because other constants do not change the result
         cache_key = run, name, tuple([point[axis] for axis in self.axes[name]])
         if cache_key not in self._robustness:
             result = self._compile(name, point)

@@ -39,13 +39,13 @@ MOST_MEASURED: Final = 1 << 26
 """Maximum number of measurements, pairs times samples; two pairs are always measured."""
 MOST_SIGNALS: Final = 50
 _SAMPLED: Final = 33
-"""Samples of the first run that order the pairs: those that come nearest are measured first."""
+"""Number of samples of the first run that order the pairs; the nearest pairs are measured first."""
 
 Relation: TypeAlias = Literal["dist", "oriented", "signal", "enclosedin", "ovlp", "leftof", "below", "prec"]
 _EITHER_WAY: tuple[Relation, ...] = ("dist", "ovlp", "oriented")
 _ONE_WAY: tuple[Relation, ...] = ("enclosedin", "leftof", "below", "prec")
 WITH_LIMIT: frozenset[Relation] = frozenset({"dist", "oriented", "signal"})
-"""Relations with a learned limit; the others only hold or fail."""
+"""Relations with a learned limit; other relations only hold or fail."""
 _PARAMETERS: Mapping[str, tuple[float | str, ...]] = MappingProxyType({"oriented": (0.0,), "prec": ("z",)})
 
 
@@ -59,14 +59,14 @@ class Party:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Number in every sample: the robustness of a relation, or the number that a limit is learned for.
+    """Number in every sample: the robustness of a relation, or the number whose limit is learned.
 
     Attributes:
         parties: the two sides of the relation; empty for a signal.
         signal: name of a signal, or "".
         formula: formula of the number: the signed distance for "dist", the negated misalignment for
-            "oriented", the signal for "signal". Over classes it is the least number of all members.
-        reach: over classes, the least negated number of all members; else `formula`.
+            "oriented", the signal for "signal". Over classes it is the minimum over all members.
+        reach: over classes, the minimum of the negated number over all members; else `formula`.
     """
 
     relation: Relation
@@ -90,7 +90,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
     """Return the quantities that all runs have, and phrases for the objects and signals that are left out.
 
     Objects are compared by name. A class is compared as a whole, too, as in `forall a, b in class "block"`.
-    For this every run must have two of its objects, or the runs must have different objects of the class.
+    This requires two objects of the class in every run, or different objects of the class in the runs.
 
     Args:
         profile: profile of the relations.
@@ -222,7 +222,7 @@ def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken_names:
 
 
 def variables_of(parties: Sequence[Party], taken: set[str]) -> tuple[str, str]:
-    """Return two names of variables that no object has."""
+    """Return two names for variables that differ from all names of objects."""
     variables = []
     for name in ("a", "b"):
         while name in taken or name in {party.name for party in parties}:
@@ -270,8 +270,8 @@ class Observed:
             quantity or its negative. The second axis is the end.
         sampled: (2, Q, S), lower ends in S samples, by direction.
         travel: (Q,), difference between the greatest and the least value of each quantity.
-        shifts: displacement of each object from the first to the last sample; infinite if it is missing in
-            one of them or its shape changes.
+        shifts: displacement of each object from the first to the last sample; infinite if the
+            object is missing in either sample or its shape changes.
     """
 
     trace: Trace
@@ -309,7 +309,7 @@ class Observed:
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
-        """Return the first sample in which a quantity, or its negative, reaches a limit; T if there is none.
+        """Return the first sample in which a quantity, or its negative, reaches a limit; T if it never does.
 
         Args:
             direction: 0 for the quantity, 1 for its negative.

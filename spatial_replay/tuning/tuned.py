@@ -1,7 +1,7 @@
 """Search for values of constants, and its result.
 
-The search is exact for constants with a direction, and an evolution for others. The result has the values
-with their intervals, the margin of every run, conflicting runs, and surfaces.
+The search is exact for constants with a direction, and evolutionary for other constants. The result has
+the values with their intervals, the margin of every run, conflicting runs, and surfaces.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
 
 
 def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
-    """Return the last number that holds between a number that holds and a number that fails."""
+    """Return the last number that holds, by bisection between `inside` (holds) and `outside` (fails)."""
     while abs(outside - inside) > 1:
         middle = (inside + outside) // 2
         if holds(middle):
@@ -84,7 +84,7 @@ def least_for_all(runs: Iterable[int], most: int, holds: Callable[[int, int], bo
 def evolve(
     cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int], seed: int
 ) -> None:
-    """Search for numbers from 0 to their sizes with the least cost, by SciPy's differential evolution.
+    """Search for numbers from 0 to `sizes` with the least cost, by SciPy's differential evolution.
 
     The caller records the best call of `cost`, so nothing is returned.
 
@@ -112,7 +112,7 @@ _MOST_EVALUATIONS: Final = 8_000
 _MOST_BOXES: Final = 2_000
 """Maximum number of boxes for one margin; neighbouring boxes share cached evaluations."""
 _LEVELS, _PRECISION = 40, 1e-3
-"""Maximum number of margins tried for the widest one, and relative precision of the widest margin."""
+"""Maximum number of margins tried in one search, and relative precision of the widest margin."""
 _CONTRACTION: Final = 4
 """Maximum number of bisections of one side of a box in one contraction."""
 
@@ -121,8 +121,8 @@ class Feasibility(NamedTuple):
     """Answer to the question whether runs have a common point with a margin.
 
     Attributes:
-        looseness: looseness of each constant at such a point; None if none was found.
-        is_proven: without a point, whether none exists; with a widest margin, whether none is wider.
+        looseness: looseness of each constant at a common point; None if no point was found.
+        is_proven: without a point, whether none exists; with the widest margin, whether no margin is wider.
     """
 
     looseness: tuple[int, ...] | None
@@ -130,7 +130,7 @@ class Feasibility(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """Constants that share results, with these results."""
+    """Constants that share results, and these results."""
 
     axes: tuple[int, ...]
     results: tuple[str, ...]
@@ -317,7 +317,7 @@ class Found:
         is_held: whether every run has the right verdict at the point.
         conflict: runs for which no common point was found; empty if `is_held`.
         is_proven: whether no point exists for the conflict; if `is_held`, whether no point is better.
-        alone: runs of the conflict that have the right verdict at no point, even without the others.
+        alone: runs of the conflict that have the right verdict at no point, even without other runs.
     """
 
     point: Point
@@ -357,7 +357,7 @@ class Search:
         """Return the last index at which a run has the right verdict, for one constant with a direction.
 
         Returns:
-            None if the run has it nowhere.
+            None if the run has the right verdict nowhere.
         """
         steps = self._steps[0]
         is_good = self._margins.runs[run].is_good
@@ -425,14 +425,14 @@ class Search:
         return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
 
     def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
-        """Return the runs that fit nowhere: good runs that fail at `loosest`, bad ones at `tightest`."""
+        """Return the runs that fit nowhere: good runs fail even at `loosest`, bad runs even at `tightest`."""
         good = [run for run in self._good if not self._margins.holds(run, loosest)]
         return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
     def _crossing(self, first_looseness: int, last_looseness: int, at: Callable[[int], Point]) -> int:
-        """Return the least looseness at which good runs have the wider margin; `last` if there is none.
+        """Return the least looseness at which good runs have the wider margin, else `last_looseness`.
 
-        The interval is bisected. Runs that cannot have the least margin within it are dropped.
+        The interval is bisected. Runs that cannot have the least margin in the interval are dropped.
         """
         margin = self._margins.margin
         good, bad = self._good, self._bad
@@ -450,13 +450,13 @@ class Search:
         return first_looseness
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
-        """Return the least number from which on every run has the right verdict; at `most` all have it."""
+        """Return the least number from which on every run has the right verdict; `most` always has it."""
         return least_for_all(runs, most, lambda run, number: self._margins.holds(run, at(number)))
 
     # ------------------------------------------------------------------------------------ several constants
 
     def _widest_by_boxes(self) -> Found:
-        """Search exactly over deciding runs, and add the worst other runs until none is worse."""
+        """Search exactly over deciding runs, and add the worst other runs until no other run is worse."""
         unfit_runs = self._alone(self._at(_PARTS), self._at(0))
         if unfit_runs:
             return Found(self._margins.start, is_held=False, conflict=unfit_runs, alone=unfit_runs)
@@ -492,7 +492,7 @@ class Search:
         return tuple(self._number_at(axis, number) for axis, number in enumerate(looseness))
 
     def _widest_of_several(self) -> Found:
-        """Optimise over deciding runs, and add the worst other runs until none is worse."""
+        """Optimise over deciding runs, and add the worst other runs until no other run is worse."""
         start = self._margins.start
         deciding_runs = self._worst(start, [])
         point = start
@@ -507,7 +507,7 @@ class Search:
         return Found(self._centre(point), is_held=True, is_proven=False)
 
     def _worst(self, point: Point, known_runs: Sequence[int]) -> list[int]:
-        """Return the good and the bad run with the least margin, if it is below that of the known runs."""
+        """Return the good and the bad run with the least margin, if it is below all known runs' margins."""
         margin = self._margins.margin
         least_margin = min((margin(run, point) for run in known_runs), default=np.inf)
         worst_runs = [
@@ -551,8 +551,9 @@ class Search:
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
         """Return the best point on a line along an axis, with its margin.
 
-        Towards looser values, margins of good runs rise and margins of bad runs fall. They meet at the best
-        point. Margins are often linear in a threshold, so few secants find the point.
+        Towards looser values, margins of good runs rise and margins of bad runs fall. The least
+        margins of both are equal at the best point. Margins are often linear in a threshold, so few secants
+        find the point.
         """
         if axis is None:
             return self._sides(runs, point)[0], point
@@ -583,7 +584,7 @@ class Search:
         return best_candidate
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
-        """Return the least margin of all given runs, of the good and of the bad ones, limited to `_FAR`."""
+        """Return the least margins of all runs, of good runs and of bad runs, limited to `_FAR`."""
         least_margins = [_FAR, _FAR]
         for run in runs:
             side_index = int(not self._margins.runs[run].is_good)
@@ -612,7 +613,7 @@ class Search:
         return point
 
     def _centre(self, point: Point) -> Point:
-        """Move each number to the middle of the interval that has no lesser margin."""
+        """Move each number to the middle of the interval in which the least margin does not decrease."""
         least_margin = self._least_margin(point)
         for axis, constant in enumerate(self._margins.varied):
             number = constant.roundest(*self.interval(point, axis, least_margin))
@@ -651,7 +652,7 @@ class Search:
         return min(self._margins.margin(run, point) for run in (*self._good, *self._bad))
 
     def _edge_of_each(self, point: Point, axis: int, end: int, least: float) -> int:
-        """Return the last index towards an end at which all runs hold, for an axis with a direction.
+        """Return the last index towards an end at which all runs fit, for an axis with a direction.
 
         Only good runs fail at tighter values, and only bad runs at looser values.
         """
@@ -692,7 +693,7 @@ class TunedConstant:
     Attributes:
         value, written: tuned value and value in the text: numbers, or durations as texts.
         low, high: ends of the interval around the tuned value that fits every run, with the tuned values of
-            the other constants. One step beyond an end some run does not fit, unless the tried range ends.
+            the other constants. A value one step outside does not fit some run, or is not in the tried range.
         tried: tried range.
         step: least difference of two values; seconds for a duration.
         direction: 1 if greater values are looser, -1 if they are tighter, None if unknown.
@@ -735,8 +736,8 @@ class Conflict:
     Attributes:
         runs: names of the runs that cannot all have the right verdict.
         message: needs of each run, as far as they are known.
-        is_proven: whether no values exist; if not, no values were found.
-        alone: names of the runs that fit no values even without the others.
+        is_proven: whether it is proven that no values exist.
+        alone: names of the runs that fit no values, even without other runs.
     """
 
     runs: tuple[str, ...]
@@ -759,10 +760,10 @@ class Conflict:
 
 @dataclass(frozen=True, eq=False)
 class Surface(Displayed):
-    """Margin of every run over the values of one or two constants; the others have their tuned values.
+    """Margin of every run over the values of one or two constants; other constants have their tuned values.
 
     Attributes:
-        names: names of the constants; the first one is along x.
+        names: names of the constants; the first constant is along x.
         x, y: (X,) and (Y,), values of the constants, seconds for durations; y is one NaN for one constant.
         margins: (R, Y, X), margins; -inf where the specification is invalid.
         runs: (R,), name of each run and whether it is good.
@@ -903,9 +904,9 @@ def tune_runs(
     """Find values of constants with which all good runs are satisfied and all bad runs are violated.
 
     With bad runs, the values have the widest margin. The margin is the least of the good runs' robustness and
-    the bad runs' negated robustness. A constant that no bad run keeps from being looser stays as written, or
-    gets the nearest value that fits. Without bad runs, the values are the tightest. All constants are
-    tightened together in proportion to their ranges, and then one by one.
+    the bad runs' negated robustness. If no bad run excludes looser values of a constant, it keeps its
+    value in the text, or gets the nearest value that fits. Without bad runs, the values are the tightest.
+    All constants are tightened together in proportion to their ranges, and then one by one.
 
     Args:
         ranges: range to try by name of the constant; None for the range in the text. If it is empty, all
@@ -940,10 +941,10 @@ def tune_runs(
 
 
 def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict[int, int]:
-    """Return the axes of constants that no bad run decides, with the indices of the values that they keep.
+    """Return the constants that no bad run decides: the index of the value to keep, by axis.
 
-    The widest margin would loosen such a constant to the end of its range. Without bad runs there are none,
-    because the tightest values are decided.
+    The widest margin would loosen such a constant to the end of its range. Without bad runs there are no such
+    constants, because the tightest values are decided.
     """
     kept_numbers: dict[int, int] = {}
     if all(run.is_good for run in margins.runs):
