@@ -70,7 +70,7 @@ class _Result:
         self,
         tree: ReportedTree,
         instance: Instance,
-        kept: SpecAutomaton,
+        spec_automaton: SpecAutomaton,
         file: Specification,
         reporter: EventReporter,
         *,
@@ -79,18 +79,18 @@ class _Result:
     ) -> None:
         self.tree, self.reporter = tree, reporter
         self.requirements = requirements_of(tree.formula, tree.object, settles=settles)
-        parts = requirements_of(tree.formula, tree.object, settles=settles, splits=True)
-        self._shades = ShadeTracker(instance, parts, file.regions)
-        self._since_ns = np.full(len(self.requirements), LATEST_NS)
-        self._names = [node.name for _, _, node in iter_nodes(tree.formula)]
-        self._pairs = (
+        part_requirements = requirements_of(tree.formula, tree.object, settles=settles, splits=True)
+        self._shades = ShadeTracker(instance, part_requirements, file.regions)
+        self._violated_since_ns = np.full(len(self.requirements), LATEST_NS)
+        self._node_names = [node.name for _, _, node in iter_nodes(tree.formula)]
+        self._leaf_pairs = (
             leaf_pairs(instance, self.requirements, file.regions, file.relations) if has_arrow else None
         )
         self.run: AutomatonRun | None = None
-        if kept.automaton is not None:
+        if spec_automaton.automaton is not None:
             leaves = instance.program.leaves
             self.run = AutomatonRun(
-                tree.name, tree.object, kept.automaton, tree.formula, leaves, tree.with_object_name
+                tree.name, tree.object, spec_automaton.automaton, tree.formula, leaves, tree.with_object_name
             )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> list[EncodedEvent]:
@@ -101,19 +101,26 @@ class _Result:
 
     def violate(self, block: SeriesBlock) -> None:
         """Update since when each requirement is permanently violated."""
-        self._since_ns = violated_since(self.requirements, block, self._since_ns)
+        self._violated_since_ns = violated_since(self.requirements, block, self._violated_since_ns)
 
     def robustness(self, block: SeriesBlock, *, final: bool = False) -> Payloads:
         """Return one message on robustness per sample."""
         tree = self.tree
         return encode_robustness(
-            tree.name, tree.object, self._names, block.times_ns, block.series, final=final
+            tree.name, tree.object, self._node_names, block.times_ns, block.series, final=final
         )
 
     def result_for_scene(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
         """Return the numbers of the result that the scene shows."""
-        of = self._since_ns, self.reporter.settled, is_final, self._shades.shades
-        return EvaluatedResult(self.requirements, block, self._pairs, *of)
+        return EvaluatedResult(
+            self.requirements,
+            block,
+            self._leaf_pairs,
+            self._violated_since_ns,
+            self.reporter.settled,
+            is_final,
+            self._shades.shades,
+        )
 
 
 class Annotator:
@@ -152,14 +159,14 @@ class Annotator:
         self._trees = trees
         self._automata = [spec_automaton.automaton for spec_automaton in automata]
         arrow_trees = [tree for tree in trees if tree.is_called(arrow)] or trees
-        self._samples = NewestSamples()
+        self._newest_samples = NewestSamples()
         self._results = [
             _Result(
                 tree,
                 instance,
                 spec_automaton,
                 files[tree.file],
-                EventReporter(tree, instance, files[tree.file], semantics, units, self._samples),
+                EventReporter(tree, instance, files[tree.file], semantics, units, self._newest_samples),
                 settles=semantics == "ltlf",
                 has_arrow=tree in arrow_trees,
             )
@@ -168,15 +175,15 @@ class Annotator:
         self._runs = [result.run for result in self._results]
         self.standing = StandingEncoder(trees, self._runs, units)
         requirements = [requirement for result in self._results for requirement in result.requirements]
-        named = frozenset(name for requirement in requirements for name in requirement.objects)
-        self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
+        named_objects = frozenset(name for requirement in requirements for name in requirement.objects)
+        self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named_objects)
         self.first_event_ns: int | None = None
-        self._latest: tuple[Trace, list[SeriesBlock]] | None = None
+        self._last_sample: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self.standing.zero_ns = self._scene.zero_ns
         self._show = show
-        self._written = dict.fromkeys(DERIVED, 0)
-        self._newest = deque[tuple[RecentEvent, EventFacts]](maxlen=_MOST_RECENT)
+        self._message_counts = dict.fromkeys(DERIVED, 0)
+        self._newest_events = deque[tuple[RecentEvent, EventFacts]](maxlen=_MOST_RECENT)
 
     @property
     def scene(self) -> SceneState:
@@ -195,7 +202,7 @@ class Annotator:
     @property
     def has_samples(self) -> bool:
         """Whether there was at least one sample."""
-        return self._latest is not None
+        return self._last_sample is not None
 
     @property
     def _over(self) -> list[str]:
@@ -221,11 +228,11 @@ class Annotator:
             return []
         self._find_zero(trace)
         messages = []
-        if not self._written[FRAME]:
+        if not self._message_counts[FRAME]:
             messages.append(
                 self._messages(_FRAME, trace.times_ns[:1], [encode_frame(int(trace.times_ns[0]))])
             )
-        if self._trees and not self._written[SPECIFICATION]:
+        if self._trees and not self._message_counts[SPECIFICATION]:
             specification = encode_specification(
                 self._files,
                 self._trees,
@@ -236,14 +243,16 @@ class Annotator:
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
-        running = [(run, block) for run, block in zip(self._runs, blocks, strict=True) if run is not None]
-        states = [run.encode(block) for run, block in running]
-        messages.append(self._in_order(_AUTOMATON, [block for _, block in running], states))
-        changes = self._changes(trace, blocks)
+        runs_with_blocks = [
+            (run, block) for run, block in zip(self._runs, blocks, strict=True) if run is not None
+        ]
+        state_payloads = [run.encode(block) for run, block in runs_with_blocks]
+        messages.append(self._in_order(_AUTOMATON, [block for _, block in runs_with_blocks], state_payloads))
+        events = self._changes(trace, blocks)
         if self._trees:
-            standing = self.standing.encode(trace.times_ns, blocks, self._over)
-            messages.append(self._messages(_STANDING, *standing))
-        messages += self._events(changes)
+            standing_messages = self.standing.encode(trace.times_ns, blocks, self._over)
+            messages.append(self._messages(_STANDING, *standing_messages))
+        messages += self._events(events)
         messages.append(self._scene_messages(trace, blocks))
         self._remember(trace, blocks)
         return messages
@@ -270,8 +279,8 @@ class Annotator:
         if not most_changes or not self._trees:
             self.standing.pass_over(blocks)
             return messages
-        changes = self.standing.encode_changes(blocks, self._over, most_changes)
-        return [*messages, self._messages(_STANDING, *changes)]
+        standing_changes = self.standing.encode_changes(blocks, self._over, most_changes)
+        return [*messages, self._messages(_STANDING, *standing_changes)]
 
     def draw(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Draw the scene at the next sample, without the rate limit of scenes and without other messages."""
@@ -293,40 +302,51 @@ class Annotator:
             results: results of the trees, for the warnings; without results there are no warnings.
         """
         events = list[EncodedEvent]()
-        for follower, final in zip(self._results, finals, strict=True):
-            events += follower.reporter.end(time_ns, final)
-        for follower, result in zip(self._results, results, strict=False):
-            events += follower.reporter.untested_warnings(time_ns, result)
+        for result_state, final_intervals in zip(self._results, finals, strict=True):
+            events += result_state.reporter.end(time_ns, final_intervals)
+        for result_state, result in zip(self._results, results, strict=False):
+            events += result_state.reporter.untested_warnings(time_ns, result)
         return [*self._events(events), *self._finals(time_ns, finals)]
 
     def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
         """Return the last message on robustness of each result, the last standing and the last scene."""
-        if self._latest is None or not self._trees:
+        if self._last_sample is None or not self._trees:
             return []
-        trace, blocks = self._latest
-        ended = [_with_final_intervals(block, final) for block, final in zip(blocks, finals, strict=True)]
-        pairs = zip(self._results, ended, strict=True)
-        robustness = Payloads.concatenate([result.robustness(block, final=True) for result, block in pairs])
+        trace, blocks = self._last_sample
+        final_blocks = [
+            _with_final_intervals(block, final_intervals)
+            for block, final_intervals in zip(blocks, finals, strict=True)
+        ]
+        results_with_blocks = zip(self._results, final_blocks, strict=True)
+        robustness_payloads = Payloads.concatenate(
+            [result.robustness(block, final=True) for result, block in results_with_blocks]
+        )
         last_ns = int(trace.times_ns[-1])
-        numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
-        ending = self.standing.end(last_ns, finals, self._over)
-        standing = self._messages(_STANDING, np.array([time_ns]), [ending])
-        for result, block in zip(self._results, ended, strict=True):
+        robustness_messages = self._messages(
+            _ROBUSTNESS, np.full(len(robustness_payloads), time_ns), robustness_payloads
+        )
+        standing_payload = self.standing.end(last_ns, finals, self._over)
+        standing_messages = self._messages(_STANDING, np.array([time_ns]), [standing_payload])
+        for result, block in zip(self._results, final_blocks, strict=True):
             result.violate(block)
         # without a time of the last scene, the final colours are drawn at once
         self._scene = replace(self._scene, written_ns=None)
-        scene = self._scene_messages(trace, ended, is_final=True)
-        times_ns = np.full(len(scene), time_ns)
-        return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
+        scene_messages = self._scene_messages(trace, final_blocks, is_final=True)
+        times_ns = np.full(len(scene_messages), time_ns)
+        return [
+            robustness_messages,
+            standing_messages,
+            replace(scene_messages, log_time_ns=times_ns, publish_time_ns=times_ns),
+        ]
 
     def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Store the last sample of the trace and of each result, for the messages of `end`."""
-        before = [None] * len(blocks) if self._latest is None else self._latest[1]
-        latest = [
-            _last_of(block) if len(block.times_ns) or earlier is None else earlier
-            for block, earlier in zip(blocks, before, strict=True)
+        earlier_blocks = [None] * len(blocks) if self._last_sample is None else self._last_sample[1]
+        last_blocks = [
+            _last_of(block) if len(block.times_ns) or earlier_block is None else earlier_block
+            for block, earlier_block in zip(blocks, earlier_blocks, strict=True)
         ]
-        self._latest = trace.slice(len(trace) - 1, len(trace)), latest
+        self._last_sample = trace.slice(len(trace) - 1, len(trace)), last_blocks
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message on robustness per sample and result."""
@@ -335,22 +355,25 @@ class Annotator:
 
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
-        self._samples.extend(trace)
-        pairs = zip(self._results, blocks, strict=True)
-        events = [event for result, block in pairs for event in result.extend(trace, block)]
-        return sorted(events, key=lambda each: each.time_ns)
+        self._newest_samples.extend(trace)
+        results_with_blocks = zip(self._results, blocks, strict=True)
+        events = [event for result, block in results_with_blocks for event in result.extend(trace, block)]
+        return sorted(events, key=lambda event: event.time_ns)
 
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
         times_ns = np.array([event.time_ns for event in events], np.int64)
         if len(events) and self.first_event_ns is None:
             self.first_event_ns = events[0].time_ns
-        logs = [event.log.SerializeToString(deterministic=True) for event in events]
-        by_time = groupby(events, attrgetter("time_ns"))
-        recent = {time_ns: self._recent(list(same_time)) for time_ns, same_time in by_time}
+        log_payloads = [event.log.SerializeToString(deterministic=True) for event in events]
+        events_by_time = groupby(events, attrgetter("time_ns"))
+        recent_by_time = {
+            time_ns: self._recent(list(simultaneous_events))
+            for time_ns, simultaneous_events in events_by_time
+        }
         return [
             self._messages(_EVENTS, times_ns, [event.event for event in events]),
-            self._messages(_EVENT_LOG, times_ns, logs),
-            self._messages(_RECENT_EVENTS, np.array([*recent], np.int64), [*recent.values()]),
+            self._messages(_EVENT_LOG, times_ns, log_payloads),
+            self._messages(_RECENT_EVENTS, np.array([*recent_by_time], np.int64), [*recent_by_time.values()]),
         ]
 
     def _recent(self, events: Sequence[EncodedEvent]) -> bytes:
@@ -361,33 +384,37 @@ class Annotator:
         zero_ns = events[0].time_ns if self._scene.zero_ns is None else self._scene.zero_ns
         for event in events:
             seconds = round((event.time_ns - zero_ns) / 1e9, 3)
-            self._newest.appendleft((RecentEvent(at=seconds, event=event.log.message), event.facts))
-        rows, facts = zip(*self._newest, strict=True)
-        return RecentEvents(events=rows, facts=facts).SerializeToString(deterministic=True)
+            self._newest_events.appendleft((RecentEvent(at=seconds, event=event.log.message), event.facts))
+        recent_events, facts = zip(*self._newest_events, strict=True)
+        return RecentEvents(events=recent_events, facts=facts).SerializeToString(deterministic=True)
 
     def _scene_messages(
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
     ) -> Messages:
-        pairs = zip(self._results, blocks, strict=True)
-        results = [result.result_for_scene(block, is_final=is_final) for result, block in pairs]
-        scene_messages = self._encoder.encode(trace, results, self._scene)
+        results_with_blocks = zip(self._results, blocks, strict=True)
+        evaluated_results = [
+            result.result_for_scene(block, is_final=is_final) for result, block in results_with_blocks
+        ]
+        scene_messages = self._encoder.encode(trace, evaluated_results, self._scene)
         if scene_messages.frames is not None:
             self._show(scene_messages.frames)
         self._scene = scene_messages.state
         return self._messages(_SCENE, scene_messages.times_ns, scene_messages.payloads)
 
     def _in_order(
-        self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
+        self, channel: Channel, blocks: Sequence[SeriesBlock], payloads: Sequence[Sequence[bytes]]
     ) -> Messages:
         """Sort the messages of all results by time. Messages of equal times keep the order of results."""
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
-        order = np.argsort(times_ns, kind="stable")
-        return self._messages(channel, times_ns[order], Payloads.concatenate(encoded).select(order))
+        time_order = np.argsort(times_ns, kind="stable")
+        return self._messages(
+            channel, times_ns[time_order], Payloads.concatenate(payloads).select(time_order)
+        )
 
     def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
-        first = self._written[channel.topic]
-        self._written[channel.topic] += len(payloads)
-        return messages_of(channel, times_ns, payloads, first)
+        first_index = self._message_counts[channel.topic]
+        self._message_counts[channel.topic] += len(payloads)
+        return messages_of(channel, times_ns, payloads, first_index)
 
 
 def _last_of(block: SeriesBlock) -> SeriesBlock:
@@ -398,10 +425,10 @@ def _last_of(block: SeriesBlock) -> SeriesBlock:
     )
 
 
-def _with_final_intervals(block: SeriesBlock, final: Floats) -> SeriesBlock:
+def _with_final_intervals(block: SeriesBlock, final_intervals: Floats) -> SeriesBlock:
     """Return the last sample with each node's interval over the finished log, (N, 2)."""
     series = block.series.copy()
-    series[:, 2:] = final[:, :, None]
+    series[:, 2:] = final_intervals[:, :, None]
     return replace(block, series=series)
 
 
@@ -413,8 +440,8 @@ def shown_regions(files: Sequence[Specification]) -> Mapping[str, Outline]:
     outlines: dict[str, Outline] = {}
     for file in files:
         for name, outline in file.regions.items():
-            is_taken = name in outlines and outlines[name] != outline
-            outlines[f"{file.filename}:{name}" if is_taken else name] = outline
+            has_clash = name in outlines and outlines[name] != outline
+            outlines[f"{file.filename}:{name}" if has_clash else name] = outline
     return outlines
 
 
@@ -433,5 +460,5 @@ def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
     """Return the channels of the messages that annotate samples."""
     if not trees:
         return (_FRAME, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _RECENT_EVENTS, _SCENE)
-    events = (_EVENTS, _EVENT_LOG, _RECENT_EVENTS)
-    return (_FRAME, _SPECIFICATION, _ROBUSTNESS, _AUTOMATON, _STANDING, *events, _SCENE)
+    event_channels = (_EVENTS, _EVENT_LOG, _RECENT_EVENTS)
+    return (_FRAME, _SPECIFICATION, _ROBUSTNESS, _AUTOMATON, _STANDING, *event_channels, _SCENE)

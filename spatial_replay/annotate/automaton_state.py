@@ -78,45 +78,50 @@ class AutomatonRun:
             order: leaves in the order of `SeriesBlock.leaves`.
             named: replaces a template's parameter by the object in a text.
         """
-        self._name, self._object, self._named = name, object, named
+        self._name, self._object, self._with_object_name = name, object, named
         self._automaton = automaton
-        self._order = order
+        self._leaf_order = order
         self._table = TransitionTable.of(automaton)
-        numbers = {id(node): number for number, _, node in iter_nodes(formula)}
+        node_ids = {id(node): node_id for node_id, _, node in iter_nodes(formula)}
         self.propositions = tuple(
-            _node_of(proposition.formula, formula, numbers) for proposition in automaton.propositions
+            _node_of(proposition.formula, formula, node_ids) for proposition in automaton.propositions
         )
-        self._is_node = [id(proposition.formula) in numbers for proposition in automaton.propositions]
-        self._possible = np.zeros(len(automaton.states), np.bool_)
-        self._possible[automaton.initial] = True
-        self._are_nodes = all(self._is_node)
+        self._is_proposition_node = [
+            id(proposition.formula) in node_ids for proposition in automaton.propositions
+        ]
+        self._is_possible = np.zeros(len(automaton.states), np.bool_)
+        self._is_possible[automaton.initial] = True
+        self._are_all_nodes = all(self._is_proposition_node)
         self._state: int | None = automaton.initial
         # whether `_state` is newer than `_possible`, because `step` updates only `_state`
         self._is_behind = False
-        self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
-        about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
-        self._about = np.array(
-            [[state in members for members in about] for state in automaton.states], np.bool_
+        self._cached_template = lru_cache(_MOST_TEMPLATES)(self._made_template)
+        state_sets = (automaton.accepting, automaton.can_accept, automaton.can_reject)
+        self._state_flags = np.array(
+            [[state in state_set for state_set in state_sets] for state in automaton.states], np.bool_
         )
-        self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
-        self._text = lru_cache(_MOST_TEMPLATES)(self._description)
+        self._states_after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
+        self._cached_description = lru_cache(_MOST_TEMPLATES)(self._description)
 
     def encode(self, block: SeriesBlock) -> Sequence[bytes]:
         """Add the next samples, and return one message per sample."""
         if not len(block.times_ns):
             return []
-        values = self._values(block)
-        before, after = self._steps(values)
-        encoded = []
-        for members in _alike(before, after):
-            sources, targets = (tuple(_members(steps[members[0]]).tolist()) for steps in (before, after))
-            template = self._template(sources, targets)
-            marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
-            marks[:, :-3] = _TRUTHS[values[:, members]].T
-            marks[:, -3:] = self._summary(after[members[0]])
-            words = block.times_ns[members].astype(np.uint64)[:, None]
-            encoded.append((members, template.encode(words, marks)))
-        return join_in_order(encoded)
+        truth_values = self._values(block)
+        states_before, states_after = self._steps(truth_values)
+        indices_and_payloads = []
+        for sample_indices in _alike(states_before, states_after):
+            sources, targets = (
+                tuple(_members(states[sample_indices[0]]).tolist())
+                for states in (states_before, states_after)
+            )
+            template = self._cached_template(sources, targets)
+            marks = np.empty((len(sample_indices), len(self.propositions) + 3), np.uint8)
+            marks[:, :-3] = _TRUTHS[truth_values[:, sample_indices]].T
+            marks[:, -3:] = self._summary(states_after[sample_indices[0]])
+            words = block.times_ns[sample_indices].astype(np.uint64)[:, None]
+            indices_and_payloads.append((sample_indices, template.encode(words, marks)))
+        return join_in_order(indices_and_payloads)
 
     def pass_over(self, block: SeriesBlock) -> None:
         """Add the next samples, and write no messages for them."""
@@ -136,92 +141,96 @@ class AutomatonRun:
             numbers: (N, 4), numbers of the formula's nodes after the sample.
             leaves: returns (C, A, 1), the leaves of the sample; called only for the slow way.
         """
-        now = [numbers.item(node, _NOW) for node in self.propositions]
-        if self._state is None or not self._are_nodes or any(map(math.isnan, now)):
+        current_numbers = [numbers.item(node, _NOW) for node in self.propositions]
+        if self._state is None or not self._are_all_nodes or any(map(math.isnan, current_numbers)):
             block = SeriesBlock(np.array([time_ns]), numbers[:, :, None], leaves())
             return tuple(_members(self.states(block)[-1]).tolist())
-        self._state = self._automaton.step(self._state, [number >= 0.0 for number in now])
+        self._state = self._automaton.step(self._state, [number >= 0.0 for number in current_numbers])
         self._is_behind = True
         return (self._state,)
 
     def words(self) -> tuple[list[str], Integers]:
         """Return the distinct states of the last block in words, and (T,) the index of words per sample."""
-        texts, which = list[str](), np.empty(len(self._after), np.int64)
-        for members in _alike(self._after, self._after):
-            which[members] = len(texts)
-            texts.append(self._text(self._after_states(int(members[0]))))
-        return texts, which
+        texts, text_indices = list[str](), np.empty(len(self._states_after), np.int64)
+        for sample_indices in _alike(self._states_after, self._states_after):
+            text_indices[sample_indices] = len(texts)
+            texts.append(self._cached_description(self._after_states(int(sample_indices[0]))))
+        return texts, text_indices
 
     @property
     def latest_words(self) -> str:
         """The states after the last sample, in words."""
-        return self._text(self._after_states(-1))
+        return self._cached_description(self._after_states(-1))
 
     def _after_states(self, sample: int) -> tuple[int, ...]:
-        return tuple(_members(self._after[sample]).tolist())
+        return tuple(_members(self._states_after[sample]).tolist())
 
     def _description(self, states: tuple[int, ...]) -> str:
         """Return states in words: their verdicts, or the guard of the next step to acceptance."""
-        numbers = listing([*map(str, states)], _MOST_NAMED)
-        title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
-        accepting, can_accept, can_reject = self._about[list(states)].T
-        possible = {
+        state_list = listing([*map(str, states)], _MOST_NAMED)
+        title = f"state {state_list}" if len(states) == 1 else f"one of the states {state_list}"
+        accepting, can_accept, can_reject = self._state_flags[list(states)].T
+        possible_meanings = {
             "permanently satisfied": ~can_reject,
             "satisfied if nothing more came": accepting & can_reject,
             "not satisfied yet": ~accepting & can_accept & can_reject,
             "permanently violated": ~can_accept,
         }
-        *others, last = [meaning for meaning, holds in possible.items() if holds.any()]
-        if others:
-            return f"{title}: either {'; or '.join([*others, last])}"
+        *other_meanings, last_meaning = [
+            meaning for meaning, is_possible in possible_meanings.items() if is_possible.any()
+        ]
+        if other_meanings:
+            return f"{title}: either {'; or '.join([*other_meanings, last_meaning])}"
         is_searched = len(states) == 1 and len(self._automaton.states) <= _MOST_SEARCHED
-        if last == "not satisfied yet" and is_searched:
-            [first, *_] = next(self._automaton.paths(states[0]))
-            last = f"still to come: {_shorten(self._guard(first), _LONGEST_STEP)}"
-        return f"{title}: {last}"
+        if last_meaning == "not satisfied yet" and is_searched:
+            [first_move, *_] = next(self._automaton.paths(states[0]))
+            last_meaning = f"still to come: {_shorten(self._guard(first_move), _LONGEST_STEP)}"
+        return f"{title}: {last_meaning}"
 
     def _guard(self, move: Transition) -> str:
-        return self._named(self._automaton.guard_words(move))
+        return self._with_object_name(self._automaton.guard_words(move))
 
     def _values(self, block: SeriesBlock) -> Flags:
         """Return (P, T), each proposition in each sample as TRUE, FALSE or UNKNOWN."""
-        now = block.series[list(self.propositions), _NOW]
-        values = np.where(now >= 0.0, TRUE, FALSE).astype(np.int8)
-        unclear = np.isnan(now) | ~np.array(self._is_node, dtype=np.bool_)[:, None]
-        for number in np.flatnonzero(unclear.any(axis=1)).tolist():
+        current_values = block.series[list(self.propositions), _NOW]
+        truth_values = np.where(current_values >= 0.0, TRUE, FALSE).astype(np.int8)
+        is_unclear = np.isnan(current_values) | ~np.array(self._is_proposition_node, dtype=np.bool_)[:, None]
+        for proposition_index in np.flatnonzero(is_unclear.any(axis=1)).tolist():
             # a number that is not determined can still have a determined sign
-            formula = self._automaton.propositions[number].formula
-            evaluation = evaluate_offline(formula, self._order, block.leaves, block.times_ns)
-            low, high = evaluation.ends(0, wide=False)
-            values[number, unclear[number]] = UNKNOWN
-            values[number, unclear[number] & (low >= 0.0)] = TRUE
-            values[number, unclear[number] & (high < 0.0)] = FALSE
-        return values
+            formula = self._automaton.propositions[proposition_index].formula
+            evaluation = evaluate_offline(formula, self._leaf_order, block.leaves, block.times_ns)
+            lows, highs = evaluation.ends(0, wide=False)
+            truth_values[proposition_index, is_unclear[proposition_index]] = UNKNOWN
+            truth_values[proposition_index, is_unclear[proposition_index] & (lows >= 0.0)] = TRUE
+            truth_values[proposition_index, is_unclear[proposition_index] & (highs < 0.0)] = FALSE
+        return truth_values
 
-    def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
+    def _steps(
+        self, truth_values: Flags
+    ) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         """Return the states before and after each sample: (T,), or as sets of states (T, S)."""
         if self._is_behind:
-            self._possible = np.arange(len(self._possible)) == self._state
+            self._is_possible = np.arange(len(self._is_possible)) == self._state
             self._is_behind = False
-        states = np.flatnonzero(self._possible)
-        if len(states) == 1 and not (values == UNKNOWN).any():
-            first = int(states[0])
-            self._after = after = self._table.states(first, values)
-            self._state = int(after[-1])
-            self._possible = np.arange(len(self._possible)) == self._state
-            return np.concatenate([[first], after[:-1]]), after
-        self._after = sets = self._table.state_sets(self._possible, values)
-        before = np.concatenate([self._possible[None], sets[:-1]])
-        self._possible = sets[-1].copy()
-        members = np.flatnonzero(self._possible)
-        self._state = int(members[0]) if len(members) == 1 else None
-        return before, sets
+        possible_states = np.flatnonzero(self._is_possible)
+        if len(possible_states) == 1 and not (truth_values == UNKNOWN).any():
+            first_state = int(possible_states[0])
+            self._states_after = states_after = self._table.states(first_state, truth_values)
+            self._state = int(states_after[-1])
+            self._is_possible = np.arange(len(self._is_possible)) == self._state
+            return np.concatenate([[first_state], states_after[:-1]]), states_after
+        self._states_after = state_sets = self._table.state_sets(self._is_possible, truth_values)
+        sets_before = np.concatenate([self._is_possible[None], state_sets[:-1]])
+        self._is_possible = state_sets[-1].copy()
+        last_states = np.flatnonzero(self._is_possible)
+        self._state = int(last_states[0]) if len(last_states) == 1 else None
+        return sets_before, state_sets
 
-    def _summary(self, after: NDArray[np.bool_] | Integers) -> NDArray[np.uint8]:
+    def _summary(self, states: NDArray[np.bool_] | Integers) -> NDArray[np.uint8]:
         """Return (3,): whether a state or set of states is accepting, can accept and can reject."""
-        about = self._about[_members(after)]
-        values = np.where(about.all(axis=0), TRUE, np.where(about.any(axis=0), UNKNOWN, FALSE))
-        return _TRUTHS[values]
+        flags = self._state_flags[_members(states)]
+        truth_values = np.where(flags.all(axis=0), TRUE, np.where(flags.any(axis=0), UNKNOWN, FALSE))
+        return _TRUTHS[truth_values]
 
     def _made_template(self, sources: tuple[int, ...], targets: tuple[int, ...]) -> WireTemplate:
         """Return the template of one step, with a value in every field that differs between samples."""
@@ -257,15 +266,15 @@ def states_of_result(
     return machine, run.states(SeriesBlock(result.times_ns, result.series, result.leaves))
 
 
-def _node_of(proposition: Formula, formula: Formula, numbers: Mapping[int, int]) -> int:
+def _node_of(proposition: Formula, formula: Formula, node_ids: Mapping[int, int]) -> int:
     """Return the id of a proposition's node, or of the atom of a rate that the proposition tests."""
-    if id(proposition) in numbers:
-        return numbers[id(proposition)]
+    if id(proposition) in node_ids:
+        return node_ids[id(proposition)]
     if isinstance(proposition, Boolean):
-        return numbers[id(proposition.operands[-1])]
+        return node_ids[id(proposition.operands[-1])]
     (rate,) = rates_of(proposition)
     atoms = (node for node in nodes_of(formula) if isinstance(node, Atom | Quantified))
-    return next(numbers[id(atom)] for atom in atoms if rate in rates_of(atom))
+    return next(node_ids[id(atom)] for atom in atoms if rate in rates_of(atom))
 
 
 _LONGEST_GUARD = 500
@@ -285,14 +294,16 @@ def _members(states: NDArray[np.bool_] | Integers) -> Integers:
     return np.atleast_1d(np.flatnonzero(states) if states.ndim else states.astype(np.int64))
 
 
-def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers) -> Iterator[Integers]:
+def _alike(
+    states_before: NDArray[np.bool_] | Integers, states_after: NDArray[np.bool_] | Integers
+) -> Iterator[Integers]:
     """Yield the samples of each distinct pair of states before and after."""
-    if before.ndim == 1:
-        return equal_places(combined_code([before, after], len(before)))
+    if states_before.ndim == 1:
+        return equal_places(combined_code([states_before, states_after], len(states_before)))
     # each row becomes one opaque value, so that np.unique compares values instead of columns
-    rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
-    _, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
-    return equal_places(groups.ravel())
+    packed_rows = np.packbits(np.concatenate([states_before, states_after], axis=1), axis=1)
+    _, group_indices = np.unique(packed_rows.view(f"V{packed_rows.shape[1]}").ravel(), return_inverse=True)
+    return equal_places(group_indices.ravel())
 
 
 _STORED = ".json"
@@ -337,14 +348,16 @@ def automata_of(
         compiled_before: attachments of a log, whose automata replace compilations with MONA.
         known: compiled automata of specs in these files.
     """
-    stored = [attachment.data for attachment in compiled_before if _is_stored(attachment)]
-    by_formula = {id(spec_automaton.spec.formula): spec_automaton for spec_automaton in known}
+    stored_payloads = [attachment.data for attachment in compiled_before if _is_stored(attachment)]
+    automata_by_formula = {id(spec_automaton.spec.formula): spec_automaton for spec_automaton in known}
     for tree in trees:
-        if id(tree.formula) not in by_formula:
+        if id(tree.formula) not in automata_by_formula:
             file = files[tree.file]
             spec = next(named_spec for named_spec in file.results if named_spec.formula is tree.formula)
-            by_formula[id(tree.formula)] = _spec_automaton(tree.name, file, spec, semantics, stored)
-    return [by_formula[id(tree.formula)] for tree in trees]
+            automata_by_formula[id(tree.formula)] = _spec_automaton(
+                tree.name, file, spec, semantics, stored_payloads
+            )
+    return [automata_by_formula[id(tree.formula)] for tree in trees]
 
 
 def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list[Attachment]:
@@ -357,27 +370,29 @@ def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list
     for spec_automaton in {spec_automaton.name: spec_automaton for spec_automaton in automata}.values():
         if spec_automaton.automaton is None:
             continue
-        texts = {
+        files_by_suffix = {
             _STORED: (
                 "application/json",
                 stored_text(spec_automaton.automaton, spec_automaton.specification, spec_automaton.spec),
             )
         }
         if _has_few_literals(spec_automaton.automaton):
-            texts[".dot"] = ("text/vnd.graphviz", spec_automaton.automaton.to_dot())
-            texts[".hoa"] = ("text/plain", spec_automaton.automaton.to_hoa())
-        for suffix, (kind, text) in texts.items():
+            files_by_suffix[".dot"] = ("text/vnd.graphviz", spec_automaton.automaton.to_dot())
+            files_by_suffix[".hoa"] = ("text/plain", spec_automaton.automaton.to_hoa())
+        for suffix, (media_type, text) in files_by_suffix.items():
             attachments.append(
-                Attachment(f"{AUTOMATA_PREFIX}{prefix}{spec_automaton.name}{suffix}", kind, text.encode())
+                Attachment(
+                    f"{AUTOMATA_PREFIX}{prefix}{spec_automaton.name}{suffix}", media_type, text.encode()
+                )
             )
     return attachments
 
 
 def _has_few_literals(automaton: Automaton) -> bool:
-    literals = 0
+    literal_count = 0
     for move in automaton.iter_transitions():
-        literals += sum(map(len, move.guard))
-        if move.is_cut or literals > _MOST_LITERALS:
+        literal_count += sum(map(len, move.guard))
+        if move.is_cut or literal_count > _MOST_LITERALS:
             return False
     return True
 
@@ -387,11 +402,11 @@ def _is_stored(attachment: Attachment) -> bool:
 
 
 def _spec_automaton(
-    name: str, file: Specification, spec: NamedSpec, semantics: Semantics, stored: Sequence[bytes]
+    name: str, file: Specification, spec: NamedSpec, semantics: Semantics, stored_payloads: Sequence[bytes]
 ) -> SpecAutomaton:
     if semantics != "ltlf":
         return SpecAutomaton(name, file, spec, None, "an automaton is of the semantics ltlf")
     try:
-        return SpecAutomaton(name, file, spec, automaton(file, spec.name, stored=stored))
+        return SpecAutomaton(name, file, spec, automaton(file, spec.name, stored=stored_payloads))
     except NoAutomatonError as error:
         return SpecAutomaton(name, file, spec, None, error.reason)

@@ -35,68 +35,79 @@ class SampleHash:
 
     def add(self, trace: Trace) -> None:
         """Add the next samples."""
-        _take_in(self._times, _integers(trace.times_ns))
-        classes = np.array([list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8)
-        for name, rows in zip(trace.names, trace.rows.T, strict=True):
-            seen = np.flatnonzero(rows != ABSENT)
-            if not len(seen):
+        _update(self._times, _integers(trace.times_ns))
+        class_digests = np.array(
+            [list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8
+        )
+        for name, footprint_rows in zip(trace.names, trace.rows.T, strict=True):
+            seen_samples = np.flatnonzero(footprint_rows != ABSENT)
+            if not len(seen_samples):
                 continue
             # unreadable observations are stored under the row number -2 - row
-            observations = np.where(rows < ABSENT, -2 - rows, rows)[seen]
-            shapes = trace.footprints.select(observations)
+            observations = np.where(footprint_rows < ABSENT, -2 - footprint_rows, footprint_rows)[
+                seen_samples
+            ]
+            footprints = trace.footprints.select(observations)
             columns = (
-                _integers(trace.times_ns[seen]),
-                _integers(np.diff(shapes.part_start)),
-                _integers(np.diff(shapes.vertex_start)),
-                _floats(shapes.vertices),
-                _floats(shapes.radius),
-                _floats(shapes.bottom),
-                _floats(shapes.top),
+                _integers(trace.times_ns[seen_samples]),
+                _integers(np.diff(footprints.part_start)),
+                _integers(np.diff(footprints.vertex_start)),
+                _floats(footprints.vertices),
+                _floats(footprints.radius),
+                _floats(footprints.bottom),
+                _floats(footprints.top),
                 _floats(trace.yaw[observations]),
                 _floats(trace.uncertainty[observations]),
-                classes[trace.class_code[observations]],
+                class_digests[trace.class_code[observations]],
             )
-            if name in trace.lasting and (rows >= 0).any():
+            if name in trace.lasting and (footprint_rows >= 0).any():
                 self._lasting.add(name)
             if trace.reported_ns is not None:
                 self._add_reports(
-                    name, trace.times_ns, trace.reported_ns[:, trace.names.index(name)], rows >= 0
+                    name, trace.times_ns, trace.reported_ns[:, trace.names.index(name)], footprint_rows >= 0
                 )
             hashes = self._objects.setdefault(name, [hashlib.sha256() for _ in columns])
-            for hashed, column in zip(hashes, columns, strict=True):
-                _take_in(hashed, column)
-        for name, values in trace.signals.items():
-            places = np.flatnonzero(~np.isnan(values))
-            if len(places):
-                hashed = self._signals.setdefault(name, hashlib.sha256())
-                pairs = np.rec.fromarrays([trace.times_ns[places], values[places]])
-                _take_in(hashed, pairs.tobytes())
+            for hasher, column in zip(hashes, columns, strict=True):
+                _update(hasher, column)
+        for name, signal_values in trace.signals.items():
+            known_samples = np.flatnonzero(~np.isnan(signal_values))
+            if len(known_samples):
+                hasher = self._signals.setdefault(name, hashlib.sha256())
+                time_value_pairs = np.rec.fromarrays(
+                    [trace.times_ns[known_samples], signal_values[known_samples]]
+                )
+                _update(hasher, time_value_pairs.tobytes())
         for name, reported_ns in trace.signals_reported_ns.items():
             is_known = ~np.isnan(trace.signals[name])
             self._add_reports(f"signal {name}", trace.times_ns, reported_ns, is_known)
 
-    def _add_reports(self, what: str, times_ns: Integers, reported_ns: Integers, is_known: Booleans) -> None:
+    def _add_reports(
+        self, report_name: str, times_ns: Integers, reported_ns: Integers, is_known: Booleans
+    ) -> None:
         """Add the times of reports that differ from the time of their sample; many logs have none."""
-        earlier = np.flatnonzero(is_known & (reported_ns != times_ns))
-        if len(earlier):
-            hashed = self._reports.setdefault(what, hashlib.sha256())
-            _take_in(
-                hashed, np.column_stack([times_ns[earlier], reported_ns[earlier]]).astype("<i8").tobytes()
+        earlier_samples = np.flatnonzero(is_known & (reported_ns != times_ns))
+        if len(earlier_samples):
+            hasher = self._reports.setdefault(report_name, hashlib.sha256())
+            _update(
+                hasher,
+                np.column_stack([times_ns[earlier_samples], reported_ns[earlier_samples]])
+                .astype("<i8")
+                .tobytes(),
             )
 
     def hexdigest(self) -> str:
-        total = hashlib.sha256(self._times.digest())
+        total_hash = hashlib.sha256(self._times.digest())
         for name in sorted(self._objects):
-            total.update(_text(name))
-            for hashed in self._objects[name]:
-                total.update(hashed.digest())
+            total_hash.update(_text(name))
+            for hasher in self._objects[name]:
+                total_hash.update(hasher.digest())
         for name in sorted(self._signals):
-            total.update(_text(name) + self._signals[name].digest())
-        for what in sorted(self._reports):
-            total.update(_text(what) + self._reports[what].digest())
+            total_hash.update(_text(name) + self._signals[name].digest())
+        for report_name in sorted(self._reports):
+            total_hash.update(_text(report_name) + self._reports[report_name].digest())
         for name in sorted(self._lasting):
-            total.update(_text(f"lasting {name}"))
-        return total.hexdigest()
+            total_hash.update(_text(f"lasting {name}"))
+        return total_hash.hexdigest()
 
 
 class MessageHash:
@@ -112,21 +123,21 @@ class MessageHash:
 
     def add(self, messages: Messages) -> None:
         """Add the next messages."""
-        for topic, rows in messages.by_topic():
-            payloads = [messages.payloads[row] for row in rows.tolist()]
+        for topic, message_indices in messages.by_topic():
+            payloads = [messages.payloads[message_index] for message_index in message_indices.tolist()]
             lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
             hashes = self._topics.setdefault(topic, (hashlib.sha256(), hashlib.sha256(), hashlib.sha256()))
-            _take_in(hashes[0], _integers(messages.log_time_ns[rows]))
-            _take_in(hashes[1], _integers(lengths))
-            _take_in(hashes[2], b"".join(payloads))
+            _update(hashes[0], _integers(messages.log_time_ns[message_indices]))
+            _update(hashes[1], _integers(lengths))
+            _update(hashes[2], b"".join(payloads))
 
     def hexdigest(self) -> str:
-        total = hashlib.sha256()
+        total_hash = hashlib.sha256()
         for topic in sorted(self._topics):
-            total.update(_text(topic))
-            for hashed in self._topics[topic]:
-                total.update(hashed.digest())
-        return total.hexdigest()
+            total_hash.update(_text(topic))
+            for hasher in self._topics[topic]:
+                total_hash.update(hasher.digest())
+        return total_hash.hexdigest()
 
 
 PLAN_SHA256 = "plan_sha256"
@@ -170,8 +181,8 @@ class EvaluationHashes:
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Add the next numbers of each result, sample by sample, node by node."""
-        for (_, hashed), block in zip(self._results, results, strict=True):
-            _take_in(hashed, _floats(block.series.transpose(2, 0, 1)))
+        for (_, hasher), block in zip(self._results, results, strict=True):
+            _update(hasher, _floats(block.series.transpose(2, 0, 1)))
 
     def certificate(
         self,
@@ -185,26 +196,26 @@ class EvaluationHashes:
             plan: metadata of a planned run; None without a plan.
             doubts: titles of the doubts about the log.
         """
-        titles = ", ".join(sorted(doubts))
-        specifications, results = hashlib.sha256(), hashlib.sha256()
+        doubt_titles = ", ".join(sorted(doubts))
+        specifications_hash, results_hash = hashlib.sha256(), hashlib.sha256()
         for file in files:
-            specifications.update(_text(format_specification(file)))
-        for name, hashed in self._results:
-            results.update(name + hashed.digest())
+            specifications_hash.update(_text(format_specification(file)))
+        for encoded_name, hasher in self._results:
+            results_hash.update(encoded_name + hasher.digest())
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),
-            "specification_sha256": specifications.hexdigest(),
-            "results_sha256": results.hexdigest(),
+            "specification_sha256": specifications_hash.hexdigest(),
+            "results_sha256": results_hash.hexdigest(),
             **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
-            **({"doubts": titles} if titles else {}),
+            **({"doubts": doubt_titles} if doubt_titles else {}),
             "spatial_replay_version": __version__,
         }
 
 
-def _take_in(hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
+def _update(hasher: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
     # hashlib accepts an array as a buffer, but its type stub does not
-    hashed.update(cast(bytes, buffer))
+    hasher.update(cast(bytes, buffer))
 
 
 def _integers(values: Integers) -> NDArray[np.generic]:
@@ -214,9 +225,9 @@ def _integers(values: Integers) -> NDArray[np.generic]:
 
 def _floats(values: Floats) -> NDArray[np.generic]:
     """Return contiguous little-endian float64, with equal bits for all NaN."""
-    ordered = np.ascontiguousarray(values, "<f8")
-    unknown = np.isnan(ordered)
-    return np.where(unknown, np.nan, ordered) if unknown.any() else ordered
+    little_endian = np.ascontiguousarray(values, "<f8")
+    is_nan = np.isnan(little_endian)
+    return np.where(is_nan, np.nan, little_endian) if is_nan.any() else little_endian
 
 
 def _text(text: str | None) -> bytes:

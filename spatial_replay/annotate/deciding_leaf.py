@@ -102,15 +102,15 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
     Args:
         leaves: the program's leaves, without duplicates.
     """
-    numbers = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
+    leaf_indices = {leaf_key(leaf): index for index, leaf in enumerate(leaves)}
     nodes = nodes_with_operands(formula)
     entries_of_nodes: list[dict[tuple[int, int], None]] = [{} for _ in nodes]
-    for own_leaves, (node, operands) in zip(entries_of_nodes[::-1], nodes[::-1], strict=True):
+    for node_entries, (node, operands) in zip(entries_of_nodes[::-1], nodes[::-1], strict=True):
         if isinstance(node, Atom | Quantified):
-            own_leaves[numbers[leaf_key(node)], 1] = None
-        for place, operand in enumerate(operands):
-            for sign in operand_signs(node, place):
-                own_leaves.update(
+            node_entries[leaf_indices[leaf_key(node)], 1] = None
+        for operand_index, operand in enumerate(operands):
+            for sign in operand_signs(node, operand_index):
+                node_entries.update(
                     dict.fromkeys((leaf, leaf_sign * sign) for leaf, leaf_sign in entries_of_nodes[operand])
                 )
     return [_columns(list(entries)) for entries in entries_of_nodes]
@@ -130,15 +130,15 @@ def find_leaf(
     if np.isinf(number):
         return None
     lows, highs = (end[below.indices] for end in ends)
-    numbers = np.where((below.signs > 0.0) == low, lows, highs)
+    leaf_ends = np.where((below.signs > 0.0) == low, lows, highs)
     is_unknown = (lows == -np.inf) & (highs == np.inf)
-    hits = np.flatnonzero(is_unknown if np.isnan(number) else numbers * below.signs == number)
-    if not len(hits):
+    equal_indices = np.flatnonzero(is_unknown if np.isnan(number) else leaf_ends * below.signs == number)
+    if not len(equal_indices):
         return None
-    end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
+    end = End.LOW if (below.signs[equal_indices[0]] > 0.0) == low else End.HIGH
     # adding 0.0 turns -0.0 into 0.0
-    leaf_number = number if np.isnan(number) else float(numbers[hits[0]]) + 0.0
-    return DecidingLeaf(int(below.indices[hits[0]]), leaf_number, end, time_ns)
+    leaf_number = number if np.isnan(number) else float(leaf_ends[equal_indices[0]]) + 0.0
+    return DecidingLeaf(int(below.indices[equal_indices[0]]), leaf_number, end, time_ns)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
@@ -159,14 +159,14 @@ class NewestSamples:
     def __init__(self) -> None:
         """Start before the first sample."""
         self._blocks: deque[Trace] = deque()
-        self._older = 0
+        self._sample_count = 0
 
     def extend(self, trace: Trace) -> None:
         """Add the next samples."""
-        while self._blocks and self._older - len(self._blocks[0]) >= _RECENT:
-            self._older -= len(self._blocks.popleft())
+        while self._blocks and self._sample_count - len(self._blocks[0]) >= _RECENT:
+            self._sample_count -= len(self._blocks.popleft())
         self._blocks.append(trace)
-        self._older += len(trace)
+        self._sample_count += len(trace)
 
     def deciding_atom(
         self, leaf: Formula, found: DecidingLeaf, now_ns: int, regions: Mapping[str, Outline]
@@ -184,23 +184,23 @@ class NewestSamples:
         sample = self.sample(found.time_ns, now_ns)
         if sample is None or look_back([leaf]):
             return None
-        decided = deciding_atom(TraceScene(sample, regions), leaf, found.end)
-        if decided is None:
+        deciding = deciding_atom(TraceScene(sample, regions), leaf, found.end)
+        if deciding is None:
             return None
-        is_turned = decided.end is not found.end
+        is_turned = deciding.end is not found.end
         number = -found.number if is_turned else found.number
-        ends = decided.value, decided.lower if decided.end is End.LOW else decided.upper
-        return (decided.atom, number) if number in ends else None
+        atom_ends = deciding.value, deciding.lower if deciding.end is End.LOW else deciding.upper
+        return (deciding.atom, number) if number in atom_ends else None
 
     def sample(self, time_ns: int, now_ns: int) -> Trace | None:
         """Return the sample at a time, if it is at most `_RECENT` samples before `now_ns`; else None."""
-        between = 0
+        sample_distance = 0
         for trace in reversed(self._blocks):
-            at, now = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
-            between += now - at
-            if at:
-                is_there = trace.times_ns[at - 1] == time_ns and between < _RECENT
-                return trace.slice(at - 1, at) if is_there else None
+            end_index, now_index = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
+            sample_distance += now_index - end_index
+            if end_index:
+                is_recent = trace.times_ns[end_index - 1] == time_ns and sample_distance < _RECENT
+                return trace.slice(end_index - 1, end_index) if is_recent else None
         return None
 
 
@@ -251,21 +251,22 @@ class LeafHistory:
         """
         self._bindings = bindings or {}
         self._formula = formula
-        self._order = order
+        self._leaf_order = order
         self._nodes = nodes_of(formula)
-        numbers = {leaf_key(leaf): index for index, leaf in enumerate(order)}
-        self._leaf_of = [
-            numbers[leaf_key(node)] if isinstance(node, Atom | Quantified) else None for node in self._nodes
+        leaf_indices = {leaf_key(leaf): index for index, leaf in enumerate(order)}
+        self._leaf_by_node = [
+            leaf_indices[leaf_key(node)] if isinstance(node, Atom | Quantified) else None
+            for node in self._nodes
         ]
         self._blocks: list[SeriesBlock] = []
-        self._samples = 0
+        self._sample_count = 0
         # four channels always, so that the limit does not depend on whether a block has uncertain leaves
-        self._most = MOST_NUMBERS // max(4 * len(order), 1)
+        self._sample_limit = MOST_NUMBERS // max(4 * len(order), 1)
 
     def extend(self, block: SeriesBlock) -> None:
         """Add the next samples. Beyond `MOST_NUMBERS`, all stored samples are dropped."""
-        self._samples += len(block.times_ns)
-        if self._samples > self._most:
+        self._sample_count += len(block.times_ns)
+        if self._sample_count > self._sample_limit:
             self._blocks.clear()
         elif len(block.times_ns):
             empty = np.empty((len(block.series), 4, 0))
@@ -274,7 +275,7 @@ class LeafHistory:
     @property
     def is_complete(self) -> bool:
         """Whether all samples so far are stored."""
-        return self._samples <= self._most
+        return self._sample_count <= self._sample_limit
 
     def settling_leaf(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
         """Return the leaf that settled a node's verdict at a sample; None beyond `MOST_NUMBERS`.
@@ -284,14 +285,14 @@ class LeafHistory:
         Args:
             series: (N, 4), numbers of all nodes at that sample.
         """
-        samples = self._until(time_ns)
-        if samples is None:
+        block = self._until(time_ns)
+        if block is None:
             return None
         if verdict is Verdict.VIOLATED:
             conjuncts = conjuncts_of(self._nodes[node], "", node)
             node = next(conjunct.node for conjunct in conjuncts if series[conjunct.node, 3] < 0.0)
-        evaluation = evaluate_prefix(self._formula, self._order, samples.leaves, samples.times_ns)
-        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
+        evaluation = evaluate_prefix(self._formula, self._leaf_order, block.leaves, block.times_ns)
+        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), block, evaluation, verdict)
 
     def final_leaf(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return the deciding leaf of a node that was pending at the end; None beyond `MOST_NUMBERS`.
@@ -302,15 +303,15 @@ class LeafHistory:
             values: (N,), each node's value on the whole log.
             final: (N, 2), lower and upper end of each node's value over the finished log.
         """
-        samples = self._until(None)
+        block = self._until(None)
         verdict = final_verdict(*final[node].tolist())
-        if samples is None or verdict not in _END_OF:
+        if block is None or verdict not in _END_OF:
             return None
         if verdict is Verdict.VIOLATED:
             pending, conjuncts = np.full(final.shape, NEVER), conjuncts_of(self._nodes[node], "", node)
             node = find_causes(conjuncts, values, final, pending)[0].node
-        evaluation = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
-        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), samples, evaluation, verdict)
+        evaluation = evaluate_offline(self._formula, self._leaf_order, block.leaves, block.times_ns)
+        return self._leaf(deciding_path(evaluation, node, _END_OF[verdict]), block, evaluation, verdict)
 
     def _until(self, time_ns: int | None) -> SeriesBlock | None:
         """Return the samples up to a time, or all samples; None without stored samples."""
@@ -320,35 +321,35 @@ class LeafHistory:
         return self._blocks[0] if time_ns is None else self._blocks[0].between(0, time_ns + 1)
 
     def _leaf(
-        self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes, verdict: Verdict
+        self, path: DecidingPath, block: SeriesBlock, evaluation: OfflineNodes, verdict: Verdict
     ) -> DecidingLeaf | None:
         """Return the leaf at the end of a path, with the missed response of a violation.
 
         None if the leaf has no finite number.
         """
-        deciding = self._end_of(path, samples)
-        if deciding is None or verdict is not Verdict.VIOLATED:
-            return deciding
-        missed, closest = missed_response(path, done, self._bindings)
-        response = None if closest is None else self._end_of(closest, samples)
-        return deciding._replace(missed=missed, response=response)
+        deciding_leaf = self._end_of(path, block)
+        if deciding_leaf is None or verdict is not Verdict.VIOLATED:
+            return deciding_leaf
+        missed, closest_path = missed_response(path, evaluation, self._bindings)
+        response = None if closest_path is None else self._end_of(closest_path, block)
+        return deciding_leaf._replace(missed=missed, response=response)
 
-    def _end_of(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:
+    def _end_of(self, path: DecidingPath, block: SeriesBlock) -> DecidingLeaf | None:
         node, sample = path.steps[-1].node, path.steps[-1].sample
-        index = self._leaf_of[node]
-        if index is None:
+        leaf_index = self._leaf_by_node[node]
+        if leaf_index is None:
             return None
-        low, high = low_and_high(len(samples.leaves), wide=True)
-        bound = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        low, high = low_and_high(len(block.leaves), wide=True)
+        bound = float(block.leaves[high if path.end is End.HIGH else low, leaf_index, sample])
         if not math.isfinite(bound):
             return None
-        low, high = low_and_high(len(samples.leaves), wide=False)
-        number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        low, high = low_and_high(len(block.leaves), wide=False)
+        number = float(block.leaves[high if path.end is End.HIGH else low, leaf_index, sample])
         # a nominal number of the other sign would contradict the verdict
         if not math.isfinite(number) or (number >= 0.0) != (bound >= 0.0):
             number = bound
-        time_ns = int(samples.times_ns[sample])
-        return DecidingLeaf(index, number + 0.0, path.end, time_ns, node, bound + 0.0)
+        time_ns = int(block.times_ns[sample])
+        return DecidingLeaf(leaf_index, number + 0.0, path.end, time_ns, node, bound + 0.0)
 
 
 class Pair(NamedTuple):
@@ -402,13 +403,13 @@ def leaf_pairs(
     Args:
         relations: names of relations that the file defines.
     """
-    below = leaves_below(instance.formula, instance.program.leaves)
+    leaves_by_node = leaves_below(instance.formula, instance.program.leaves)
     leaves = tuple(substitute(leaf, instance.bindings) for leaf in instance.program.leaves)
     pairs, relation_names = tuple(map(pair_of, leaves)), RELATION_NAMES | relations
     texts = tuple(format_formula(leaf, relations=relation_names) for leaf in leaves)
     divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
-    of_requirements = tuple(below[requirement.node] for requirement in requirements)
-    return LeafPairs(leaves, pairs, of_requirements, regions, divisors, texts, relation_names)
+    leaves_by_requirement = tuple(leaves_by_node[requirement.node] for requirement in requirements)
+    return LeafPairs(leaves, pairs, leaves_by_requirement, regions, divisors, texts, relation_names)
 
 
 def pair_of(leaf: Formula) -> Pair | None:
@@ -425,11 +426,11 @@ def pair_of(leaf: Formula) -> Pair | None:
 
 
 def _pairs(atom: Atom) -> Iterator[Pair]:
-    for part in iter_expressions(atom.expression):
-        match part:
+    for expression in iter_expressions(atom.expression):
+        match expression:
             case SignedDistance():
-                yield Pair(part.first, part.second, False)
+                yield Pair(expression.first, expression.second, False)
             case Protrusion():
-                yield Pair(part.inner, part.outer, True)
+                yield Pair(expression.inner, expression.outer, True)
     if len(atom.terms) > 1:
         yield Pair(atom.terms[0], atom.terms[1], False)

@@ -138,12 +138,14 @@ class AnnotatedEvaluation:
                 extent = extent.with_points(ring)
         has_states = [spec_automaton.automaton is not None for spec_automaton in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
-        derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
+        derived_topics = {SCENE, *(DERIVED if self.trees else ())} - set(
+            () if any(has_states) else (AUTOMATON,)
+        )
         return LayoutContents(
             self.trees,
             has_states,
             extent,
-            derived | set(topics),
+            derived_topics | set(topics),
             axes,
             images=sorted(images),
             units=self.units,
@@ -170,17 +172,17 @@ class AnnotatedEvaluation:
         """
         from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
 
-        extent, standing = self.annotator.extent, self.annotator.standing
+        extent, standing_encoder = self.annotator.extent, self.annotator.standing
         contents = self.contents(extent, topics, axes, images)
         contents = contents._replace(planned_for=planned_for, planned=planned)
         if not self.annotator.has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
-        zero = TextZero(self.annotator.scene.zero_ns or 0, *start)
+        text_zero = TextZero(self.annotator.scene.zero_ns or 0, *start)
         return layout_attachment(
             contents._replace(
-                outcomes=standing.outcomes,
-                order=standing.order,
-                zero=zero,
+                outcomes=standing_encoder.outcomes,
+                order=standing_encoder.order,
+                zero=text_zero,
                 first_event_ns=self.annotator.first_event_ns,
             )
         )

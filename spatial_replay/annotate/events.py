@@ -145,20 +145,22 @@ def track(
         settles: whether an interval on one side of 0 is a final verdict.
     """
     integers, worst = before.integers.copy(), before.worst.copy()
-    places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
+    worst_places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
     # a change takes `LASTING` samples, the first may have begun before the block, and a verdict takes one
-    room = len(nodes) * (len(times_ns) // LASTING + 2)
-    change_rows, numbers = np.empty((room, 10), np.int64), np.empty((room, 2))
-    count = _track(times_ns, series, nodes, settles, integers, worst, places, change_rows, numbers)
+    capacity = len(nodes) * (len(times_ns) // LASTING + 2)
+    change_rows, worst_numbers = np.empty((capacity, 10), np.int64), np.empty((capacity, 2))
+    change_count = _track(
+        times_ns, series, nodes, settles, integers, worst, worst_places, change_rows, worst_numbers
+    )
     changes = []
     for row, (worst_before, worst_after) in zip(
-        change_rows[:count].tolist(), numbers[:count].tolist(), strict=True
+        change_rows[:change_count].tolist(), worst_numbers[:change_count].tolist(), strict=True
     ):
-        node, sample, code, start, end, place, next_code, next_start, next_end, next_place = row
-        period = Period(code, start, end, worst_before, place) if code != START else None
-        after = Period(next_code, next_start, next_end, worst_after, next_place)
-        changes.append(Change(node, sample, period, after))
-    return TrackedChanges(NodeStates(integers, worst), changes, places)
+        node, sample, code, start, end, worst_place, next_code, next_start, next_end, next_place = row
+        former_period = Period(code, start, end, worst_before, worst_place) if code != START else None
+        new_period = Period(next_code, next_start, next_end, worst_after, next_place)
+        changes.append(Change(node, sample, former_period, new_period))
+    return TrackedChanges(NodeStates(integers, worst), changes, worst_places)
 
 
 @kernel
@@ -170,51 +172,54 @@ def _track(
     integers: Integers,
     worst: Floats,
     places: Integers,
-    found: Integers,
-    numbers: Floats,
+    change_rows: Integers,
+    worst_numbers: Floats,
 ) -> int:
-    """Update the state in place (see `NodeStates`) and return how many rows of `found` are filled."""
-    count = 0
-    for k in range(nodes.shape[0]):
-        value, lower, upper = series[nodes[k], 0], series[nodes[k], 2], series[nodes[k], 3]
-        state = integers[k]
-        for t in range(times_ns.shape[0]):
+    """Update the state in place (see `NodeStates`) and return the number of filled `change_rows`."""
+    change_count = 0
+    for node in range(nodes.shape[0]):
+        value, lower, upper = series[nodes[node], 0], series[nodes[node], 2], series[nodes[node], 3]
+        state = integers[node]
+        for sample in range(times_ns.shape[0]):
             if state[_CODE] >= SATISFIED:
                 break
             code, number = START if state[_CODE] == START else UNKNOWN, np.inf
-            if settles and lower[t] >= 0.0:
-                code, number = SATISFIED, lower[t]
-            elif settles and upper[t] < 0.0:
-                code, number = VIOLATED, upper[t]
-            elif value[t] >= 0.0:
-                code, number = HOLDING, value[t]
-            elif value[t] < 0.0:
-                code, number = FAILING, value[t]
+            if settles and lower[sample] >= 0.0:
+                code, number = SATISFIED, lower[sample]
+            elif settles and upper[sample] < 0.0:
+                code, number = VIOLATED, upper[sample]
+            elif value[sample] >= 0.0:
+                code, number = HOLDING, value[sample]
+            elif value[sample] < 0.0:
+                code, number = FAILING, value[sample]
             if code == state[_CODE]:
-                state[_COUNT], state[_UNTIL] = 0, times_ns[t]
-                if number < worst[k, 0]:
-                    worst[k, 0], places[k, 0] = number, t
+                state[_COUNT], state[_UNTIL] = 0, times_ns[sample]
+                if number < worst[node, 0]:
+                    worst[node, 0], places[node, 0] = number, sample
                 continue
             if state[_COUNT] == 0 or state[_NEXT] != code:
-                state[_NEXT], state[_COUNT], state[_NEXT_SINCE] = code, 0, times_ns[t]
-                worst[k, 1], places[k, 1] = number, t
-            elif number < worst[k, 1]:
-                worst[k, 1], places[k, 1] = number, t
+                state[_NEXT], state[_COUNT], state[_NEXT_SINCE] = code, 0, times_ns[sample]
+                worst[node, 1], places[node, 1] = number, sample
+            elif number < worst[node, 1]:
+                worst[node, 1], places[node, 1] = number, sample
             state[_COUNT] += 1
             is_first = state[_CODE] == START and code < SATISFIED
             if not is_first and code < SATISFIED and state[_COUNT] < LASTING:
                 continue
             if not is_first:
-                row = found[count]
-                row[0], row[1] = k, t
-                row[2], row[3], row[4], row[5] = state[_CODE], state[_SINCE], state[_UNTIL], places[k, 0]
-                row[6], row[7], row[8], row[9] = code, state[_NEXT_SINCE], times_ns[t], places[k, 1]
-                numbers[count, 0], numbers[count, 1] = worst[k, 0], worst[k, 1]
-                count += 1
-            state[_CODE], state[_SINCE], state[_UNTIL] = code, state[_NEXT_SINCE], times_ns[t]
-            worst[k, 0], places[k, 0] = worst[k, 1], places[k, 1]
+                row = change_rows[change_count]
+                row[0], row[1] = node, sample
+                row[2], row[3], row[4], row[5] = state[_CODE], state[_SINCE], state[_UNTIL], places[node, 0]
+                row[6], row[7], row[8], row[9] = code, state[_NEXT_SINCE], times_ns[sample], places[node, 1]
+                worst_numbers[change_count, 0], worst_numbers[change_count, 1] = (
+                    worst[node, 0],
+                    worst[node, 1],
+                )
+                change_count += 1
+            state[_CODE], state[_SINCE], state[_UNTIL] = code, state[_NEXT_SINCE], times_ns[sample]
+            worst[node, 0], places[node, 0] = worst[node, 1], places[node, 1]
             state[_COUNT] = 0
-    return count
+    return change_count
 
 
 _NOW: Final[Mapping[int, str]] = {
@@ -235,13 +240,13 @@ def change_sentence(title: str, after: Period, witness: str, unit: str = "") -> 
         unit: declared unit of the number, or "".
     """
     is_short = after.code == FAILING
-    because = ""
+    reason = ""
     if math.isfinite(after.worst):
         number = with_unit(abs(after.worst), unit)
-        because = f", {number} short of holding" if is_short else f", by {number}"
+        reason = f", {number} short of holding" if is_short else f", by {number}"
     if witness:
-        because = f": {witness}"
-    return f"{title} {_NOW[after.code]}{because}."
+        reason = f": {witness}"
+    return f"{title} {_NOW[after.code]}{reason}."
 
 
 def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str, unit: str) -> str:
@@ -251,27 +256,28 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
         ends: ends of the interval of the value; NaN if not determined.
         unit: declared unit of the ends, or "".
     """
-    amount, because = "", f": {witness}" if witness else ""
-    number = ends[verdict is Verdict.VIOLATED]
+    amount, reason = "", f": {witness}" if witness else ""
+    deciding_end = ends[verdict is Verdict.VIOLATED]
     if verdict is Verdict.UNKNOWN:
-        low, high = (with_unit(end, unit) for end in ends)
-        because = f": robustness {'not determined' if math.isnan(number) else f'between {low} and {high}'}"
-    elif not witness and math.isfinite(number):
-        amount = f" by {with_unit(abs(number), unit)}"
-    return f"{title} is {verdict}{amount}, for the log has ended{because}."
+        low_text, high_text = (with_unit(end, unit) for end in ends)
+        range_text = f"between {low_text} and {high_text}"
+        reason = f": robustness {'not determined' if math.isnan(deciding_end) else range_text}"
+    elif not witness and math.isfinite(deciding_end):
+        amount = f" by {with_unit(abs(deciding_end), unit)}"
+    return f"{title} is {verdict}{amount}, for the log has ended{reason}."
 
 
 def past_sentence(before: Period, until_ns: int, witness: str, unit: str) -> str:
     """Return a sentence on the former period, which lasted until `until_ns`."""
-    seconds = time_text(until_ns, before.start_ns)
+    duration = time_text(until_ns, before.start_ns)
     if before.code in (FAILING, UNKNOWN):
-        return f"Before, it was {'pending' if before.code == FAILING else 'unknown'} for {seconds}."
-    worst = ""
+        return f"Before, it was {'pending' if before.code == FAILING else 'unknown'} for {duration}."
+    worst_text = ""
     if witness:
-        worst = f"; its worst was that {witness}"
+        worst_text = f"; its worst was that {witness}"
     elif math.isfinite(before.worst):
-        worst = f", by {with_unit(abs(before.worst), unit)} or more"
-    return f"Before, it held for {seconds}{worst}."
+        worst_text = f", by {with_unit(abs(before.worst), unit)} or more"
+    return f"Before, it held for {duration}{worst_text}."
 
 
 class ReportedNode(NamedTuple):
@@ -346,11 +352,11 @@ def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
     """Encode an external event, such as a lost connection."""
     # changes of verdicts that the event causes are reported with the samples
     facts = {"occurrence": what, "verdict": str(Verdict.UNKNOWN), "message": sentence}
-    at = _stamp(time_ns)
-    event = Event(start_time=at, end_time=at)
-    for key, text in facts.items():
-        event.metadata.add(key=key, value=text)
-    log = Log(timestamp=at, level=Log.WARNING, message=sentence, name=what)
+    stamp = _stamp(time_ns)
+    event = Event(start_time=stamp, end_time=stamp)
+    for key, value in facts.items():
+        event.metadata.add(key=key, value=value)
+    log = Log(timestamp=stamp, level=Log.WARNING, message=sentence, name=what)
     return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
 
@@ -383,18 +389,22 @@ class EventReporter:
         """
         self._units, self._regions = units, file.regions
         self._samples = samples or NewestSamples()
-        self._settles = semantics == "ltlf"  # the paper's semantics has no verdict over all continuations
+        self._has_final_verdicts = (
+            semantics == "ltlf"
+        )  # the paper's semantics has no verdict over all continuations
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._leaves = instance.program.leaves
-        below = leaves_below(tree.formula, self._leaves)
-        self._reported = _reported_nodes(tree, below, file, units)
-        self._nodes = np.array([reported.node for reported in self._reported], np.int64)
-        self._history = LeafHistory(tree.formula, self._leaves, instance.bindings) if self._settles else None
-        self._values = np.empty(0)
+        leaves_by_node = leaves_below(tree.formula, self._leaves)
+        self._reported_nodes = _reported_nodes(tree, leaves_by_node, file, units)
+        self._node_ids = np.array([reported.node for reported in self._reported_nodes], np.int64)
+        self._history = (
+            LeafHistory(tree.formula, self._leaves, instance.bindings) if self._has_final_verdicts else None
+        )
+        self._last_values = np.empty(0)
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
-        self._states = NodeStates.begin(len(self._reported))
-        self._carried: dict[tuple[int, int], DecidingLeaf | None] = {}
+        self._states = NodeStates.begin(len(self._reported_nodes))
+        self._last_deciding_leaves: dict[tuple[int, int], DecidingLeaf | None] = {}
         self._last_ns: int | None = None
         self.settled: SettledViolation | None = None
         self.over = ""
@@ -405,19 +415,23 @@ class EventReporter:
             self._history = None
         if not len(block.times_ns) or self._states.are_final:
             return []
-        self._values = block.series[:, 0, -1].copy()
+        self._last_values = block.series[:, 0, -1].copy()
         if self._history is not None:
             self._history.extend(block)
-        tracked = track(self._states, block.times_ns, block.series, self._nodes, settles=self._settles)
+        tracked = track(
+            self._states, block.times_ns, block.series, self._node_ids, settles=self._has_final_verdicts
+        )
         self._states = tracked.states
         events = [self._event(change, block) for change in tracked.changes]
-        carried = {}
-        for node, places in enumerate(tracked.places.tolist()):
-            codes = tracked.states.integers[node, [0, 3]].tolist()
-            for slot, (code, place) in enumerate(zip(codes, places, strict=True)):
-                period = Period(code, 0, 0, float(tracked.states.worst[node, slot]), place)
-                carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._deciding_leaf(node, period, block)
-        self._carried = carried
+        deciding_leaves = {}
+        for node, worst_places in enumerate(tracked.places.tolist()):
+            state_codes = tracked.states.integers[node, [0, 3]].tolist()
+            for slot, (code, worst_place) in enumerate(zip(state_codes, worst_places, strict=True)):
+                period = Period(code, 0, 0, float(tracked.states.worst[node, slot]), worst_place)
+                deciding_leaves[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._deciding_leaf(
+                    node, period, block
+                )
+        self._last_deciding_leaves = deciding_leaves
         self._last_ns = int(block.times_ns[-1])
         return events
 
@@ -438,7 +452,7 @@ class EventReporter:
         Args:
             time_ns: time of the end of the log.
         """
-        root = self._reported[0]
+        root = self._reported_nodes[0]
         facts = self._facts(root) | {"verdict": str(result.verdict), "tested": result.tested}
         return [
             self._message(
@@ -455,86 +469,94 @@ class EventReporter:
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> DecidingLeaf | None:
         """Return the leaf with the worst number of a period; None if no leaf has it."""
         if period.place < 0:
-            return self._carried.get((node, period.place))
+            return self._last_deciding_leaves.get((node, period.place))
         leaves = block.leaves[:, :, period.place]
-        low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
-        ends = leaves[low], leaves[high]
+        low_channel, high_channel = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
+        leaf_ends = leaves[low_channel], leaves[high_channel]
         number = math.nan if period.code == UNKNOWN else period.worst
-        below, time_ns = self._reported[node].below, int(block.times_ns[period.place])
-        return find_leaf(below, ends, number, time_ns, low=period.code != VIOLATED)
+        leaves_of_node, time_ns = self._reported_nodes[node].below, int(block.times_ns[period.place])
+        return find_leaf(leaves_of_node, leaf_ends, number, time_ns, low=period.code != VIOLATED)
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
-        reported, after, before = self._reported[change.node], change.after, change.before
-        time_ns, settled = int(block.times_ns[change.sample]), None
-        if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
-            series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
-            settled = self._history.settling_leaf(reported.node, series, time_ns, verdict)
-            witness, because = self._settling_words(settled, verdict, time_ns, time_ns)
+        reported, new_period, former_period = self._reported_nodes[change.node], change.after, change.before
+        time_ns, settling_leaf = int(block.times_ns[change.sample]), None
+        if self._history is not None and self._history.is_complete and new_period.code in _VERDICTS:
+            series, verdict = block.series[:, :, change.sample], _VERDICTS[new_period.code]
+            settling_leaf = self._history.settling_leaf(reported.node, series, time_ns, verdict)
+            witness, reason = self._settling_words(settling_leaf, verdict, time_ns, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
-                self.settled = self._violation(settled, time_ns)
-            self._remember(change.node, settled, time_ns)
+                self.settled = self._violation(settling_leaf, time_ns)
+            self._remember(change.node, settling_leaf, time_ns)
         else:
-            deciding = self._deciding_leaf(change.node, after, block)
-            witness = because = self._words(deciding, time_ns)
-            if after.code in _VERDICTS:
-                self._remember(change.node, deciding, time_ns)
-        now = PeriodText(
-            after, witness, change_sentence(reported.title, after, because, reported.unit), settled
+            deciding_leaf = self._deciding_leaf(change.node, new_period, block)
+            witness = reason = self._words(deciding_leaf, time_ns)
+            if new_period.code in _VERDICTS:
+                self._remember(change.node, deciding_leaf, time_ns)
+        new_text = PeriodText(
+            new_period,
+            witness,
+            change_sentence(reported.title, new_period, reason, reported.unit),
+            settling_leaf,
         )
-        past = None
-        if before is not None:
-            worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
-            said = past_sentence(before, after.start_ns, worst, reported.unit)
-            past = PeriodText(before, worst, said)
-        return self._encode(reported, time_ns, now, past)
+        former_text = None
+        if former_period is not None:
+            worst_words = self._words(
+                self._deciding_leaf(change.node, former_period, block), time_ns, is_past=True
+            )
+            former_sentence = past_sentence(former_period, new_period.start_ns, worst_words, reported.unit)
+            former_text = PeriodText(former_period, worst_words, former_sentence)
+        return self._encode(reported, time_ns, new_text, former_text)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
-        reported, before = self._reported[node], self._states.period(node)
+        reported, former_period = self._reported_nodes[node], self._states.period(node)
         lower, upper = final[reported.node].tolist()
         verdict = final_verdict(lower, upper)
-        low, witness, because, decided = verdict is not Verdict.VIOLATED, "", "", None
+        is_satisfied, witness, reason, deciding_leaf = verdict is not Verdict.VIOLATED, "", "", None
         if self._history is not None and self._history.is_complete:
-            decided = self._history.final_leaf(reported.node, self._values, final)
-            witness, because = self._settling_words(decided, verdict, last_ns, time_ns)
-            self._remember(node, decided, time_ns)
-        after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
-        sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
-        now = PeriodText(after, witness, sentence, decided)
-        past = None
-        if before.code not in (START, after.code) and before.start_ns < last_ns:
-            worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
-            said = past_sentence(before, last_ns, worst, reported.unit)
-            past = PeriodText(before, worst, said)
-        return self._encode(reported, time_ns, now, past)
+            deciding_leaf = self._history.final_leaf(reported.node, self._last_values, final)
+            witness, reason = self._settling_words(deciding_leaf, verdict, last_ns, time_ns)
+            self._remember(node, deciding_leaf, time_ns)
+        final_period = Period(_ENDED[verdict], last_ns, last_ns, lower if is_satisfied else upper, OF_CURRENT)
+        sentence = end_sentence(reported.title, verdict, (lower, upper), reason, reported.unit)
+        new_text = PeriodText(final_period, witness, sentence, deciding_leaf)
+        former_text = None
+        if former_period.code not in (START, final_period.code) and former_period.start_ns < last_ns:
+            worst_words = self._words(self._last_deciding_leaves[node, OF_CURRENT], time_ns, is_past=True)
+            former_sentence = past_sentence(former_period, last_ns, worst_words, reported.unit)
+            former_text = PeriodText(former_period, worst_words, former_sentence)
+        return self._encode(reported, time_ns, new_text, former_text)
 
     def _encode(
-        self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
+        self, reported: ReportedNode, time_ns: int, new_text: PeriodText, former_text: PeriodText | None
     ) -> EncodedEvent:
-        period, witness, sentence, decided = now
+        period, witness, sentence, deciding_leaf = new_text
         facts = self._facts(reported) | self._facts_of(period, witness, "")
-        if decided is not None:
-            leaf = decided.shown
+        if deciding_leaf is not None:
+            leaf = deciding_leaf.shown
             facts |= {"witness_node": str(leaf.node), "witness_ns": str(leaf.time_ns)}
-        if past is not None:
-            before, sentence = past.period, f"{sentence} {past.sentence}"
-            facts |= self._facts_of(before, past.witness, "_before")
-            facts |= {"start_ns_before": str(before.start_ns), "end_ns_before": str(before.end_ns)}
-        span = period.start_ns, period.end_ns
+        if former_text is not None:
+            former_period, sentence = former_text.period, f"{sentence} {former_text.sentence}"
+            facts |= self._facts_of(former_period, former_text.witness, "_before")
+            facts |= {
+                "start_ns_before": str(former_period.start_ns),
+                "end_ns_before": str(former_period.end_ns),
+            }
+        span_ns = period.start_ns, period.end_ns
         level = _LEVELS[period.code] if reported.is_needed else Log.INFO
-        return self._message(reported, time_ns, span, level, facts, sentence)
+        return self._message(reported, time_ns, span_ns, level, facts, sentence)
 
     def _message(
         self,
         reported: ReportedNode,
         time_ns: int,
-        span: tuple[int, int],
+        span_ns: tuple[int, int],
         level: Log.Level.ValueType,
         facts: Mapping[str, str],
         sentence: str,
     ) -> EncodedEvent:
-        event = Event(start_time=_stamp(span[0]), end_time=_stamp(span[1]))
-        for key, text in {**facts, "message": sentence}.items():
-            event.metadata.add(key=key, value=text)
+        event = Event(start_time=_stamp(span_ns[0]), end_time=_stamp(span_ns[1]))
+        for key, value in {**facts, "message": sentence}.items():
+            event.metadata.add(key=key, value=value)
         log = Log(
             timestamp=_stamp(time_ns),
             level=level,
@@ -545,76 +567,83 @@ class EventReporter:
         )
         return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
-    def _remember(self, node: int, found: DecidingLeaf | None, now_ns: int) -> None:
+    def _remember(self, node: int, deciding_leaf: DecidingLeaf | None, now_ns: int) -> None:
         """Store the deciding atom or missed response of the root's verdict, under LTLf semantics."""
-        if self._reported[node].node or found is None or not self._settles:
+        if self._reported_nodes[node].node or deciding_leaf is None or not self._has_final_verdicts:
             return
-        leaf, _ = self._leaf(found.shown, now_ns)
+        leaf, _ = self._leaf(deciding_leaf.shown, now_ns)
         self.over = self._leaf_text(leaf)
-        if found.missed and found.missed.is_condition:
-            self.over = f"missed {found.missed.response}"
+        if deciding_leaf.missed and deciding_leaf.missed.is_condition:
+            self.over = f"missed {deciding_leaf.missed.response}"
 
-    def _violation(self, found: DecidingLeaf | None, time_ns: int) -> SettledViolation:
+    def _violation(self, deciding_leaf: DecidingLeaf | None, time_ns: int) -> SettledViolation:
         """Return the violation of the root with the deciding atom and its sample."""
-        if found is None:
-            return SettledViolation(time_ns, found)
-        atom, _ = self._leaf(found.shown, time_ns)
-        return SettledViolation(time_ns, found, atom, self._samples.sample(found.shown.time_ns, time_ns))
+        if deciding_leaf is None:
+            return SettledViolation(time_ns, deciding_leaf)
+        atom, _ = self._leaf(deciding_leaf.shown, time_ns)
+        return SettledViolation(
+            time_ns, deciding_leaf, atom, self._samples.sample(deciding_leaf.shown.time_ns, time_ns)
+        )
 
-    def _leaf(self, found: DecidingLeaf, now_ns: int) -> tuple[Formula, float]:
+    def _leaf(self, deciding_leaf: DecidingLeaf, now_ns: int) -> tuple[Formula, float]:
         """Return a leaf with its number; for a quantifier, its deciding atom with the atom's number."""
-        leaf = substitute(self._leaves[found.leaf], self._bindings)
-        decided = None
+        leaf = substitute(self._leaves[deciding_leaf.leaf], self._bindings)
+        atom_and_number = None
         if isinstance(leaf, Quantified):
-            decided = self._samples.deciding_atom(leaf, found, now_ns, self._regions)
-        return decided or (leaf, found.number)
+            atom_and_number = self._samples.deciding_atom(leaf, deciding_leaf, now_ns, self._regions)
+        return atom_and_number or (leaf, deciding_leaf.number)
 
     def _leaf_text(self, leaf: Formula) -> str:
         return format_formula(leaf, relations=self._relations)
 
     def _settling_words(
-        self, found: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
+        self, settling_leaf: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
     ) -> tuple[str, str]:
         """Return the deciding leaf in words, and a longer text with its condition and the time since then.
 
         Both are "" for None.
         """
-        if found is None:
+        if settling_leaf is None:
             return "", ""
-        missed, deciding = found.missed, found.shown
-        before_ns = since_ns - deciding.time_ns
+        missed, deciding_leaf = settling_leaf.missed, settling_leaf.shown
+        elapsed_ns = since_ns - deciding_leaf.time_ns
         is_violated = verdict is Verdict.VIOLATED and (missed is None or not missed.is_condition)
-        words = self._words(deciding, now_ns, past=before_ns > 0, is_violated=is_violated)
-        if abs(deciding.bound) < abs(deciding.number):
-            leaf, _ = self._leaf(deciding, now_ns)
-            words += uncertain_text(amount_text(abs(deciding.bound), leaf, self._units))
-        ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
-        response = ""
+        leaf_words = self._words(deciding_leaf, now_ns, is_past=elapsed_ns > 0, is_violated=is_violated)
+        if abs(deciding_leaf.bound) < abs(deciding_leaf.number):
+            leaf, _ = self._leaf(deciding_leaf, now_ns)
+            leaf_words += uncertain_text(amount_text(abs(deciding_leaf.bound), leaf, self._units))
+        ago_text = f" ({time_text(elapsed_ns)} earlier)" if elapsed_ns else ""
+        response_text = ""
         if missed is not None:
-            response = f"`{missed.response}` did not hold when its condition `{missed.condition}` held: "
-        return words, f"{response}{words}{ago}"
+            response_text = f"`{missed.response}` did not hold when its condition `{missed.condition}` held: "
+        return leaf_words, f"{response_text}{leaf_words}{ago_text}"
 
     def _words(
-        self, found: DecidingLeaf | None, now_ns: int, *, past: bool = False, is_violated: bool = False
+        self,
+        deciding_leaf: DecidingLeaf | None,
+        now_ns: int,
+        *,
+        is_past: bool = False,
+        is_violated: bool = False,
     ) -> str:
         """Return a leaf with its number in words (see `how_text`); "" for None."""
-        if found is None:
+        if deciding_leaf is None:
             return ""
-        leaf, number = self._leaf(found, now_ns)
-        how = f"{'was' if past else 'is'} unknown"
+        leaf, number = self._leaf(deciding_leaf, now_ns)
+        how_words = f"{'was' if is_past else 'is'} unknown"
         if not math.isnan(number):
-            how = how_text(number, leaf, self._units, past=past, is_violated=is_violated)
-        return f"`{self._leaf_text(leaf)}` {how}"
+            how_words = how_text(number, leaf, self._units, past=is_past, is_violated=is_violated)
+        return f"`{self._leaf_text(leaf)}` {how_words}"
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
-        of = {} if self._tree.object is None else {"object": self._tree.object}
-        about = {"requirement": reported.requirement, "title": reported.sentence}
+        object_fact = {} if self._tree.object is None else {"object": self._tree.object}
+        requirement_facts = {"requirement": reported.requirement, "title": reported.sentence}
         return {
             "specification": self._tree.name,
-            **of,
+            **object_fact,
             "node": str(reported.node),
             "name": reported.name,
-            **{key: text for key, text in about.items() if text is not None},
+            **{key: value for key, value in requirement_facts.items() if value is not None},
         }
 
     def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
@@ -622,47 +651,49 @@ class EventReporter:
             return {f"verdict{suffix}": "unknown"}
         sign = "positive" if period.code in (HOLDING, SATISFIED) else "negative"
         verdict = "pending"
-        if not self._settles or period.code in (SATISFIED, VIOLATED):
+        if not self._has_final_verdicts or period.code in (SATISFIED, VIOLATED):
             verdict = "satisfied" if sign == "positive" else "violated"
         facts = {"verdict": verdict, "sign": sign, "robustness": repr(period.worst)}
         if witness:
             facts["witness"] = witness
-        return {f"{key}{suffix}": text for key, text in facts.items()}
+        return {f"{key}{suffix}": value for key, value in facts.items()}
 
 
 def _reported_nodes(
-    tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification, units: Mapping[str, str]
+    tree: ReportedTree, leaves_by_node: Sequence[LeavesBelow], file: Specification, units: Mapping[str, str]
 ) -> list[ReportedNode]:
     """Return the root, and the first node of each named spec that later samples can change.
 
     Args:
-        below: leaves below each node of the tree.
+        leaves_by_node: leaves below each node of the tree.
     """
     specs = {spec.name: spec for spec in file.specs}
     reported_nodes: list[ReportedNode] = []
-    root = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
-    names: set[str] = set()
-    needed = {0}
+    root_title = f"`{tree.name}`" + (f" for {tree.object}" if tree.object is not None else "")
+    reported_names: set[str] = set()
+    needed_ids = {0}
     operators = {identifier: operator_of(node) for identifier, _, node in iter_nodes(tree.formula)}
     for identifier, parent, node in iter_nodes(tree.formula):
-        if parent in needed and operators[parent] in ("and", "spec"):
-            needed.add(identifier)
+        if parent in needed_ids and operators[parent] in ("and", "spec"):
+            needed_ids.add(identifier)
         if parent is None:
-            title = root
-        elif node.name and node.name not in names and looks_ahead(node):
-            title = f"`{node.name}` in {root}"
+            title = root_title
+        elif node.name and node.name not in reported_names and looks_ahead(node):
+            title = f"`{node.name}` in {root_title}"
         else:
             continue
         name = tree.name if parent is None else node.name or ""
-        names.add(node.name or name)
+        reported_names.add(node.name or name)
         spec = specs.get(node.name or name)
         line = 0 if spec is None else _line(file.source, spec.span.start, spec.span.end)
-        about = (None, None) if spec is None else (spec.id, spec.title)
-        if any(about):
-            title = f"{title} ({requirement_text(*about)})"
-        is_needed, unit = identifier in needed, declared_unit(node, units)
+        requirement = (None, None) if spec is None else (spec.id, spec.title)
+        if any(requirement):
+            title = f"{title} ({requirement_text(*requirement)})"
+        is_needed, unit = identifier in needed_ids, declared_unit(node, units)
         reported_nodes.append(
-            ReportedNode(identifier, title, name, line, below[identifier], *about, is_needed, unit)
+            ReportedNode(
+                identifier, title, name, line, leaves_by_node[identifier], *requirement, is_needed, unit
+            )
         )
     return reported_nodes
 

@@ -84,7 +84,7 @@ def scene_panel(
 
     The planner's redone decisions are hidden; a viewer can show them instead.
     """
-    displays: dict[str, Config] = {
+    settings_by_topic: dict[str, Config] = {
         SCENE: {},
         GRADIENT_MAP: {"colorMode": "rgba-fields"},
         MAP_DRAWING: {},
@@ -98,14 +98,18 @@ def scene_panel(
         "followMode": "follow-none",
         "followTf": FRAMES[0],
         "topics": {
-            topic: {"visible": True, **display} for topic, display in displays.items() if topic in topics
+            topic: {"visible": True, **settings}
+            for topic, settings in settings_by_topic.items()
+            if topic in topics
         },
         # viewers draw axes of 1 m, which do not fit every scene
         "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
-    of = f" of {planned_for} as recorded" if planned_for else ""
-    legend = f" (map{of}: vermillion fails, white is 0, blue holds)" if GRADIENT_MAP in topics else ""
+    origin_text = f" of {planned_for} as recorded" if planned_for else ""
+    legend = (
+        f" (map{origin_text}: vermillion fails, white is 0, blue holds)" if GRADIENT_MAP in topics else ""
+    )
     return _title_panel(
         "3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config
     )
@@ -120,8 +124,8 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     """
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
-        {"operator": "=", "rawValue": str(number), "color": colour, "label": words}
-        for number, (words, colour) in _STANDING_COLOURS.items()
+        {"operator": "=", "rawValue": str(standing), "color": colour, "label": words}
+        for standing, (words, colour) in _STANDING_COLOURS.items()
     ]
     return [
         _title_panel(
@@ -147,7 +151,7 @@ def sample_curves(
     results = [(tree.title, tree.formula) for tree in trees]
     return [
         panel
-        for name, title, formulas in (
+        for name, title, titled_formulas in (
             ("robustness", "Robustness of results", results),
             ("parts", "Robustness of named specs", _parts(trees)),
         )
@@ -156,7 +160,7 @@ def sample_curves(
             title,
             [
                 _Curve(label, _standing_path(label, "robustness"), unit_of(node, units))
-                for label, node in formulas
+                for label, node in titled_formulas
             ],
             zero,
         )
@@ -179,10 +183,10 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
         for identifier, node in curved_nodes(tree.formula).items()
         if identifier
     ]
-    times = {"enabled": True, "value": f"{CURVES_TOPIC}.time[:]"}
-    whole = {"xAxisVal": "currentCustom", "xAxisPath": times, "isSynced": False}
+    time_axis = {"enabled": True, "value": f"{CURVES_TOPIC}.time[:]"}
+    axis_settings = {"xAxisVal": "currentCustom", "xAxisPath": time_axis, "isSynced": False}
     return [
-        Panel(panel.identifier, {**panel.config, **whole})
+        Panel(panel.identifier, {**panel.config, **axis_settings})
         for panel in _plots("whole", "Robustness over the whole log", curves)
     ]
 
@@ -194,24 +198,28 @@ def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Pa
         by_stamp: whether strips read the time in the header of messages. A live source needs that, because
             after a seek its earlier messages arrive at the new time.
     """
-    strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
-    more = [(title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)]
-    # Foxglove takes its colours from these settings, Lichtblick from the numbers
-    states = [
-        {"value": str(number), "label": words, "color": colour}
-        for number, (words, colour) in _STANDING_COLOURS.items()
+    result_strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
+    spec_strips = [
+        (title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)
     ]
-    paths = [
+    # Foxglove takes its colours from these settings, Lichtblick from the numbers
+    state_settings = [
+        {"value": str(standing), "label": words, "color": colour}
+        for standing, (words, colour) in _STANDING_COLOURS.items()
+    ]
+    strip_settings = [
         {
             "enabled": True,
             "label": label,
             "timestampMethod": "headerStamp" if by_stamp else "receiveTime",
             "value": path,
-            "customStates": {"type": "discrete", "states": states},
+            "customStates": {"type": "discrete", "states": state_settings},
         }
-        for label, path in [*strips, *more[:_MOST_STRIPS]]
+        for label, path in [*result_strips, *spec_strips[:_MOST_STRIPS]]
     ]
-    return _title_panel("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
+    return _title_panel(
+        "StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": strip_settings}
+    )
 
 
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
@@ -219,26 +227,29 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
 
     A log without annotated images gets a panel for its first topic with images.
     """
-    cameras = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
-    copied = iter([image for image in images if image not in cameras])
+    camera_topics = {
+        topic_of_camera(CAMERA_VIDEO, camera_number) for camera_number in range(1, len(images) + 1)
+    }
+    other_images = iter([image for image in images if image not in camera_topics])
     panels = []
-    for number in range(1, len(images) + 1):
+    for camera_number in range(1, len(images) + 1):
         video, calibration, annotations = (
-            topic_of_camera(topic, number) for topic in (CAMERA_VIDEO, CAMERA_CALIBRATION, CAMERA_ANNOTATIONS)
+            topic_of_camera(topic, camera_number)
+            for topic in (CAMERA_VIDEO, CAMERA_CALIBRATION, CAMERA_ANNOTATIONS)
         )
-        if number > 1 and annotations not in topics:
+        if camera_number > 1 and annotations not in topics:
             break
-        image = video if video in images else next(copied, None)
+        image = video if video in images else next(other_images, None)
         if image is None:
             continue
-        mode: Config = {"imageTopic": image}
+        image_mode: Config = {"imageTopic": image}
         if calibration in topics:
-            mode["calibrationTopic"] = calibration
+            image_mode["calibrationTopic"] = calibration
         if annotations in topics:
-            mode["annotations"] = {annotations: {"visible": True}}
-        name = "camera" if number == 1 else f"camera{number}"
-        title = "Camera" if number == 1 else f"Camera {number}"
-        panels.append(_title_panel(f"Image!{name}", title, {"imageMode": mode, "synchronize": False}))
+            image_mode["annotations"] = {annotations: {"visible": True}}
+        name = "camera" if camera_number == 1 else f"camera{camera_number}"
+        title = "Camera" if camera_number == 1 else f"Camera {camera_number}"
+        panels.append(_title_panel(f"Image!{name}", title, {"imageMode": image_mode, "synchronize": False}))
     return panels
 
 
@@ -247,11 +258,11 @@ def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
 
     The sentence comes last, because viewers cut long titles at the end.
     """
-    title, words = tree.title, f": {tree.sentence}" if tree.sentence else ""
+    title, sentence_text = tree.title, f": {tree.sentence}" if tree.sentence else ""
     if outcome is None or outcome.standing != VIOLATED or not math.isfinite(outcome.by):
-        return f"{title}{words}"
-    unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
-    return f"{title}, worst {number_text(-outcome.by)}{unit} at {_with_clock(outcome.at)}{words}"
+        return f"{title}{sentence_text}"
+    unit_text = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
+    return f"{title}, worst {number_text(-outcome.by)}{unit_text} at {_with_clock(outcome.at)}{sentence_text}"
 
 
 def _with_clock(at: Instant) -> str:
@@ -284,8 +295,8 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
     panels = []
     for index, unit in enumerate(list(dict.fromkeys(curve.unit for curve in curves))[:_MOST_PLOTS]):
         same_unit = [curve for curve in curves if curve.unit == unit][:_MOST_CURVES]
-        words = unit_words(unit)
-        paths = [
+        unit_text = unit_words(unit)
+        curve_settings = [
             {
                 # viewers draw samples as dots of this colour darkened, which cover a dense curve
                 "color": lighter(CURVES[index % len(CURVES)]),
@@ -296,9 +307,15 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
             }
             for index, curve in enumerate(same_unit)
         ]
-        zero = {"color": _ZERO, "enabled": True, "label": "0", "timestampMethod": "receiveTime", "value": "0"}
+        zero_line = {
+            "color": _ZERO,
+            "enabled": True,
+            "label": "0",
+            "timestampMethod": "receiveTime",
+            "value": "0",
+        }
         config = {
-            "paths": [*paths, zero],
+            "paths": [*curve_settings, zero_line],
             "isSynced": True,
             "showLegend": True,
             "showPlotValuesInLegend": True,
@@ -306,9 +323,9 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
             "sidebarDimension": _LEGEND_PIXELS,
             "xAxisVal": "timestamp",
             "xAxisLabel": f"time [s]; texts count from {offset}" if offset else "time [s]",
-            "yAxisLabel": words,
+            "yAxisLabel": unit_text,
         }
-        panels.append(_title_panel(f"Plot!{name}{index or ''}", f"{title} [{words}]", config))
+        panels.append(_title_panel(f"Plot!{name}{index or ''}", f"{title} [{unit_text}]", config))
     return panels
 
 
@@ -317,8 +334,8 @@ def _standing_path(title: str, field: str) -> str:
 
 
 def _curves_path(tree: ReportedTree, identifier: int) -> str:
-    which = f"{{name=={_quote(tree.name)}}}{{object=={_quote(tree.object or '')}}}"
-    return f"{CURVES_TOPIC}.specifications[:]{which}.nodes[:]{{id=={identifier}}}"
+    selector = f"{{name=={_quote(tree.name)}}}{{object=={_quote(tree.object or '')}}}"
+    return f"{CURVES_TOPIC}.specifications[:]{selector}.nodes[:]{{id=={identifier}}}"
 
 
 def _quote(text: str) -> str:
@@ -396,21 +413,21 @@ class LayoutContents(NamedTuple):
         if not self.outcomes or any(outcome.standing == VIOLATED for outcome in self.outcomes):
             return "violated"
         start_ns = 0 if self.zero is None else self.zero.start_ns
-        is_at_once = self.first_event_ns is not None and self.first_event_ns <= start_ns + _OPENING_NS
-        return "events" if is_at_once else "specification"
+        has_early_event = self.first_event_ns is not None and self.first_event_ns <= start_ns + _OPENING_NS
+        return "events" if has_early_event else "specification"
 
     def worst_first(self) -> LayoutContents:
         """Return the contents sorted by outcome, so that the worst results have lights and curves.
 
         The result that a planner worked for comes before all others.
         """
-        order = sorted(
-            self.order or range(len(self.trees)), key=lambda place: self.trees[place].name != self.planned
+        tree_order = sorted(
+            self.order or range(len(self.trees)), key=lambda tree: self.trees[tree].name != self.planned
         )
         return self._replace(
-            trees=[self.trees[place] for place in order],
-            has_states=[self.has_states[place] for place in order],
-            outcomes=[self.outcomes[place] for place in order] if self.outcomes else (),
+            trees=[self.trees[index] for index in tree_order],
+            has_states=[self.has_states[index] for index in tree_order],
+            outcomes=[self.outcomes[index] for index in tree_order] if self.outcomes else (),
             order=(),
         )
 
@@ -463,25 +480,25 @@ def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
         layout: layout of the log without the extension (see `viewer_layout`).
         planned: name of the result that a planner worked for, which panels show first; "" without one.
     """
-    state = {"result": planned} if planned else {}
+    panel_state = {"result": planned} if planned else {}
     configs = {"3D!scene": layout["configById"]["3D!scene"]}
     curves = [
         Panel(identifier, config)
         for identifier, config in layout["configById"].items()
         if identifier.startswith("Plot!")
     ]
-    automaton = ("automaton", Panel(_PANELS.format("automaton", "automaton"), state))
-    titled = [automaton]
+    automaton = ("automaton", Panel(_PANELS.format("automaton", "automaton"), panel_state))
+    titled_panels = [automaton]
     if "RawMessages!decision" in layout["configById"]:
         decisions = ("decisions", Panel(_PANELS.format("decisions", "decisions"), {}))
-        titled = [decisions, automaton] if planned else [automaton, decisions]
-    titled += [(_tab_title(plot), plot) for plot in curves]
-    tabs, panels = _tabs("Tab!panels", titled)
-    tree = Panel(_PANELS.format("specification", "tree"), state)
+        titled_panels = [decisions, automaton] if planned else [automaton, decisions]
+    titled_panels += [(_tab_title(plot), plot) for plot in curves]
+    tabs, panels = _tabs("Tab!panels", titled_panels)
+    tree = Panel(_PANELS.format("specification", "tree"), panel_state)
     configs |= {panel.identifier: panel.config for panel in (tree, *panels)}
-    right = _split("column", [(tree.identifier, 6.0), (tabs, 4.0)])
-    whole = {"direction": "row", "first": "3D!scene", "second": right, "splitPercentage": 45}
-    return {**layout, "configById": configs, "layout": whole}
+    right_side = _split("column", [(tree.identifier, 6.0), (tabs, 4.0)])
+    root_split = {"direction": "row", "first": "3D!scene", "second": right_side, "splitPercentage": 45}
+    return {**layout, "configById": configs, "layout": root_split}
 
 
 _Details = list[tuple[str, Panel]]
@@ -492,28 +509,30 @@ def _details(contents: LayoutContents) -> _Details:
     """Return the panels in tabs. The first panel is the one that is open at first."""
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
     # the seconds in both tables count from another zero than the axes
-    clock = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
-    rows = list[tuple[str, str, str, str]]()
+    zero_text = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
+    tab_rows = list[tuple[str, str, str, str]]()
     if trees:
-        rows.append(("violated", "Table!violated", f"Violated results{clock}", f"{STANDING}.violated"))
+        tab_rows.append(
+            ("violated", "Table!violated", f"Violated results{zero_text}", f"{STANDING}.violated")
+        )
     if trees and RECENT_EVENTS in contents.topics:
-        rows.append(("events", "Table!events", f"Events{clock}", f"{RECENT_EVENTS}.events"))
+        tab_rows.append(("events", "Table!events", f"Events{zero_text}", f"{RECENT_EVENTS}.events"))
     if trees:
         # a viewer centres a list of texts, but not a single text
-        which = "0" if all(tree.file == 0 for tree in trees) else ":"
-        sources = f"{SPECIFICATION}.files[{which}].source"
+        file_selector = "0" if all(tree.file == 0 for tree in trees) else ":"
+        sources = f"{SPECIFICATION}.files[{file_selector}].source"
         title = "Specification" if zero is None else f"Specification; {zero}"
-        rows.append(("specification", "RawMessages!specification", title, sources))
+        tab_rows.append(("specification", "RawMessages!specification", title, sources))
     if any(contents.has_states[:1] if contents.planned else contents.has_states):
         title = trees[contents.has_states.index(True)].title
         path = _standing_path(title, "automaton")
-        rows.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
+        tab_rows.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
     if PLAN_DECISION in contents.topics:
-        of = f", for {planned_for} as recorded" if planned_for else ""
-        why = f"Why the planner decided so{of}"
-        rows.append(("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason"))
-    rows.sort(key=lambda row: row[0] != contents.first_tab)
-    details = [(tab, _title_panel(panel, title, {"topicPath": path})) for tab, panel, title, path in rows]
+        origin_text = f", for {planned_for} as recorded" if planned_for else ""
+        decision_title = f"Why the planner decided so{origin_text}"
+        tab_rows.append(("decision", "RawMessages!decision", decision_title, f"{PLAN_DECISION}.reason"))
+    tab_rows.sort(key=lambda row: row[0] != contents.first_tab)
+    details = [(tab, _title_panel(panel, title, {"topicPath": path})) for tab, panel, title, path in tab_rows]
     cameras = image_panels(contents.images, contents.topics)
     return details + [(camera.config["foxglovePanelTitle"].lower(), camera) for camera in cameras]
 
@@ -538,28 +557,28 @@ def _layout(
     lights = indicators(contents.trees, contents.outcomes)
     scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes, contents.planned_for)
     panels = [*lights, scene]
-    left: list[tuple[_Tree, float]] = [(scene.identifier, 7.0)]
+    left_parts: list[tuple[_Tree, float]] = [(scene.identifier, 7.0)]
     if below is not None:
         panels.append(below)
-        left.append((below.identifier, 3.0))
-    right: list[tuple[_Tree, float]] = []
+        left_parts.append((below.identifier, 3.0))
+    right_parts: list[tuple[_Tree, float]] = []
     if curves:
         plots, tab_panels = _tabs("Tab!curves", [(_tab_title(plot), plot) for plot in curves])
         panels += [*tab_panels, states]
         # curves have at least 140 pixels on a screen of 1280 × 720
         # a strip has about 50 pixels
-        right += [(plots, 4.5), (states.identifier, min(len(states.config["paths"]), 2) + 1.0)]
+        right_parts += [(plots, 4.5), (states.identifier, min(len(states.config["paths"]), 2) + 1.0)]
     if details:
         tabs, tab_panels = _tabs("Tab!details", details)
         panels += tab_panels
-        right.append((tabs, 4.0))
-    tree = _split("column", left)
-    if right:
-        second = _split("column", right)
-        tree = {"direction": "row", "first": tree, "second": second, "splitPercentage": 50}
+        right_parts.append((tabs, 4.0))
+    tree = _split("column", left_parts)
+    if right_parts:
+        right_side = _split("column", right_parts)
+        tree = {"direction": "row", "first": tree, "second": right_side, "splitPercentage": 50}
     if lights:
-        row = _split("row", [(panel.identifier, 1.0) for panel in lights])
-        tree = _split("column", [(row, 1.0), (tree, _LIT_SHARE)])
+        light_row = _split("row", [(panel.identifier, 1.0) for panel in lights])
+        tree = _split("column", [(light_row, 1.0), (tree, _LIT_SHARE)])
     return {
         "configById": {panel.identifier: panel.config for panel in panels},
         "globalVariables": {},
@@ -595,15 +614,15 @@ _LIT_SHARE: Final = 9.0
 
 def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:
     """Return panels next to or below each other, as nested splits of two parts."""
-    (first, share), *rest = parts
-    if not rest:
-        return first
-    whole = share + sum(part_share for _, part_share in rest)
+    (first_panel, first_share), *other_parts = parts
+    if not other_parts:
+        return first_panel
+    total_share = first_share + sum(part_share for _, part_share in other_parts)
     return {
         "direction": direction,
-        "first": first,
-        "second": _split(direction, rest),
-        "splitPercentage": round(100.0 * share / whole),
+        "first": first_panel,
+        "second": _split(direction, other_parts),
+        "splitPercentage": round(100.0 * first_share / total_share),
     }
 
 

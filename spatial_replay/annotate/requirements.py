@@ -141,19 +141,19 @@ class Requirement(NamedTuple):
         return self._numbers(series, at)[1]
 
     def _numbers(self, series: Floats, at: Integers) -> tuple[NDArray[np.uint8], Floats]:
-        now = self.sign * series[self.node, 1, at]
-        standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
-        standing[now >= 0.0] = Standing.HOLDING
-        is_pending = np.full(now.shape, not self.can_violate)
+        numbers_now = self.sign * series[self.node, 1, at]
+        standing = np.full(numbers_now.shape, Standing.UNKNOWN, np.uint8)
+        standing[numbers_now >= 0.0] = Standing.HOLDING
+        is_pending = np.full(numbers_now.shape, not self.can_violate)
         for obligation in (self.conjunct if self.can_violate else None, self.obligation):
             if obligation is not None:
                 is_pending |= obligation.is_open(series, at)
-        fails = now < 0.0
-        standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
+        is_failing = numbers_now < 0.0
+        standing[is_failing] = np.where(is_pending[is_failing], Standing.PENDING, Standing.VIOLATED)
         if self.obligation is not None:
             standing[self.obligation.is_fulfilled(series, at)] = Standing.FULFILLED
-        counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
-        return standing, np.where(counts, now, np.nan)
+        is_counted = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
+        return standing, np.where(is_counted, numbers_now, np.nan)
 
     def outcome(self, series: Floats, at: Integers) -> Floats:
         """Return (S,), the robustness of its obligation over the finished log, times the obligation's sign.
@@ -165,11 +165,11 @@ class Requirement(NamedTuple):
             at: (S,) indices of samples.
         """
         obligation = self.obligation or Obligation(self.node, self.sign)
-        low, high = (series[obligation.node, 2, at], series[obligation.node, 3, at])
+        lows, highs = (series[obligation.node, 2, at], series[obligation.node, 3, at])
         if obligation.sign < 0.0:
-            low, high = -high, -low
-        fails = (high < 0.0) & ~self.conjunct.is_open(series, at)
-        return np.where(low >= 0.0, low, np.where(fails, high, np.nan))
+            lows, highs = -highs, -lows
+        is_failing = (highs < 0.0) & ~self.conjunct.is_open(series, at)
+        return np.where(lows >= 0.0, lows, np.where(is_failing, highs, np.nan))
 
 
 def requirements_of(
@@ -184,46 +184,52 @@ def requirements_of(
         settles: whether the semantics has final verdicts; otherwise a goal is pending up to the end.
         splits: whether each conjunct of a requirement is a requirement of its own.
     """
-    places = _places(formula)
-    is_plain = [is_spatial(place.formula) for place in places]
-    located = [
-        (identifier, place)
-        for identifier, place in enumerate(places)
-        if place.sign and is_plain[identifier] and (place.parent is None or not is_plain[place.parent])
+    positions = _positions(formula)
+    is_plain = [is_spatial(position.formula) for position in positions]
+    requirement_positions = [
+        (identifier, position)
+        for identifier, position in enumerate(positions)
+        if position.sign
+        and is_plain[identifier]
+        and (position.parent is None or not is_plain[position.parent])
     ]
     if splits:
-        located = [
-            (conjunct, places[conjunct])
-            for identifier, _ in located
-            for conjunct in _conjuncts(places, identifier)
+        requirement_positions = [
+            (conjunct, positions[conjunct])
+            for identifier, _ in requirement_positions
+            for conjunct in _conjuncts(positions, identifier)
         ]
-    invariant = {
-        None if place.obligation is None else place.obligation.node for _, place in located if place.always
+    invariant_obligations = {
+        None if position.obligation is None else position.obligation.node
+        for _, position in requirement_positions
+        if position.needs_all_above
     }
     requirements = []
-    for identifier, place in located:
-        obligation = place.obligation
-        is_goal = not place.always and obligation is not None
-        beside = is_goal and obligation is not None and obligation.node in invariant
-        requirement = _requirement(identifier, place, object)
-        requirements.append(requirement._replace(can_violate=not (is_goal and (beside or not settles))))
+    for identifier, position in requirement_positions:
+        obligation = position.obligation
+        is_goal = not position.needs_all_above and obligation is not None
+        is_beside_invariant = is_goal and obligation is not None and obligation.node in invariant_obligations
+        requirement = _requirement(identifier, position, object)
+        requirements.append(
+            requirement._replace(can_violate=not (is_goal and (is_beside_invariant or not settles)))
+        )
     return tuple(requirements)
 
 
-def _conjuncts(places: Sequence[_Place], identifier: int) -> list[int]:
+def _conjuncts(positions: Sequence[_Position], identifier: int) -> list[int]:
     """Return the parts of a requirement that are all needed: operands of `and`, or of `or` under sign -1."""
-    operands = [child for child, place in enumerate(places) if place.parent == identifier]
-    if not operands or not _needs_all(places[identifier]):
+    operands = [index for index, position in enumerate(positions) if position.parent == identifier]
+    if not operands or not _needs_all(positions[identifier]):
         return [identifier]
-    return [conjunct for operand in operands for conjunct in _conjuncts(places, operand)]
+    return [conjunct for operand in operands for conjunct in _conjuncts(positions, operand)]
 
 
-class _Place(NamedTuple):
+class _Position(NamedTuple):
     """The position of a node in a formula.
 
     Attributes:
         sign: sign in which the formula needs the node; 0 for both signs.
-        always: whether all operators above need all of their operands (see `_NEEDS_ALL`).
+        needs_all_above: whether all operators above need all of their operands (see `_NEEDS_ALL`).
         is_condition, is_invariant: see `Requirement`.
     """
 
@@ -232,37 +238,49 @@ class _Place(NamedTuple):
     sign: float
     obligation: Obligation | None
     conjunct: Obligation
-    always: bool
+    needs_all_above: bool
     is_condition: bool
     is_invariant: bool = True
 
 
-def _places(formula: Formula) -> list[_Place]:
+def _positions(formula: Formula) -> list[_Position]:
     """Return the position of each node, by id."""
-    places: list[_Place] = []
-    passed: list[int] = []
+    positions: list[_Position] = []
+    operand_counts: list[int] = []
     for identifier, parent, node in iter_nodes(formula):
-        passed.append(0)
+        operand_counts.append(0)
         if parent is None:
-            sign, above, conjunct, always = 1.0, None, Obligation(0, 1.0), True
+            sign, obligation_above, conjunct, needs_all_above = 1.0, None, Obligation(0, 1.0), True
             is_condition, is_invariant = False, True
         else:
-            up = places[parent]
-            is_implied = operator_of(up.formula) == "->" and up.sign > 0.0
-            is_condition = up.is_condition or (is_implied and not passed[parent])
-            always_of = "G" if up.sign > 0.0 else "F"
-            is_always = operator_of(up.formula) == always_of and _is_endless(up.formula)
-            is_invariant = up.is_invariant and _needs_all_now(up, is_always)
-            sign = up.sign * _sign(up.formula, passed[parent])
-            above, conjunct, always = up.obligation, up.conjunct, up.always and _needs_all(up)
-            if conjunct == Obligation(parent, up.sign) and isinstance(up.formula, Boolean) and _needs_all(up):
+            parent_position = positions[parent]
+            is_implied = operator_of(parent_position.formula) == "->" and parent_position.sign > 0.0
+            is_condition = parent_position.is_condition or (is_implied and not operand_counts[parent])
+            always_operator = "G" if parent_position.sign > 0.0 else "F"
+            is_always = operator_of(parent_position.formula) == always_operator and _is_endless(
+                parent_position.formula
+            )
+            is_invariant = parent_position.is_invariant and _needs_all_now(parent_position, is_always)
+            sign = parent_position.sign * _sign(parent_position.formula, operand_counts[parent])
+            obligation_above, conjunct, needs_all_above = (
+                parent_position.obligation,
+                parent_position.conjunct,
+                parent_position.needs_all_above and _needs_all(parent_position),
+            )
+            if (
+                conjunct == Obligation(parent, parent_position.sign)
+                and isinstance(parent_position.formula, Boolean)
+                and _needs_all(parent_position)
+            ):
                 conjunct = Obligation(identifier, sign)
-            passed[parent] += 1
-        starts = above is None and isinstance(node, Temporal)
-        obligation = Obligation(identifier, sign) if starts else above
-        place = _Place(node, parent, sign, obligation, conjunct, always, is_condition, is_invariant)
-        places.append(place)
-    return places
+            operand_counts[parent] += 1
+        is_obligation = obligation_above is None and isinstance(node, Temporal)
+        obligation = Obligation(identifier, sign) if is_obligation else obligation_above
+        position = _Position(
+            node, parent, sign, obligation, conjunct, needs_all_above, is_condition, is_invariant
+        )
+        positions.append(position)
+    return positions
 
 
 _NEEDS_ALL: Final[Mapping[float, frozenset[str]]] = MappingProxyType(
@@ -282,18 +300,18 @@ def _is_endless(formula: Formula) -> bool:
     )
 
 
-def _needs_all(place: _Place) -> bool:
-    return operator_of(place.formula) in _NEEDS_ALL.get(place.sign, frozenset())
+def _needs_all(position: _Position) -> bool:
+    return operator_of(position.formula) in _NEEDS_ALL.get(position.sign, frozenset())
 
 
-def _needs_all_now(place: _Place, is_always: bool) -> bool:
+def _needs_all_now(position: _Position, is_always: bool) -> bool:
     """Return whether operands of a node may be invariants of their obligation.
 
     They may below an unbounded operator that needs every sample, above all obligations, and below Boolean
     operators that need all operands.
     """
-    is_outside = place.obligation is None and not isinstance(place.formula, Temporal)
-    return is_always or is_outside or (isinstance(place.formula, Boolean) and _needs_all(place))
+    is_outside = position.obligation is None and not isinstance(position.formula, Temporal)
+    return is_always or is_outside or (isinstance(position.formula, Boolean) and _needs_all(position))
 
 
 def _sign(parent: Formula, operand: int) -> float:
@@ -302,12 +320,14 @@ def _sign(parent: Formula, operand: int) -> float:
     return float(signs[0]) if len(signs) == 1 else 0.0
 
 
-def _requirement(identifier: int, place: _Place, object: str | None) -> Requirement:
+def _requirement(identifier: int, position: _Position, object: str | None) -> Requirement:
     objects: set[str] = set()
     regions: set[str] = set()
     groups: set[ClassMembers] = set()
-    for node, around in iter_bound(place.formula):
-        bindings = {name: base_of(quantifier.group) for quantifier in around for name in quantifier.variables}
+    for node, quantifiers in iter_bound(position.formula):
+        bindings = {
+            name: base_of(quantifier.group) for quantifier in quantifiers for name in quantifier.variables
+        }
         terms: tuple[Term, ...] = node.terms if isinstance(node, Atom) else ()
         if isinstance(node, Quantified):
             terms = (node.group,)
@@ -322,23 +342,23 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
                 case Variable() if object is not None:
                     objects.add(object)
                 case Group() as group:
-                    excluded = _excluded_names(group, object)
+                    excluded_names = _excluded_names(group, object)
                     if group.members is None:
-                        groups.add(ClassMembers((group.class_name or ANY_CLASS).casefold(), excluded))
+                        groups.add(ClassMembers((group.class_name or ANY_CLASS).casefold(), excluded_names))
                     else:
-                        objects.update(set(group.members) - excluded)
+                        objects.update(set(group.members) - excluded_names)
                 case _:
                     pass
     return Requirement(
         identifier,
-        place.sign,
-        place.obligation,
+        position.sign,
+        position.obligation,
         frozenset(objects),
         frozenset(regions),
         frozenset(groups),
-        place.conjunct,
-        is_condition=place.is_condition,
-        is_invariant=place.is_invariant and place.obligation is not None,
+        position.conjunct,
+        is_condition=position.is_condition,
+        is_invariant=position.is_invariant and position.obligation is not None,
     )
 
 

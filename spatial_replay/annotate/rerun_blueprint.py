@@ -44,8 +44,10 @@ class BlueprintRow(NamedTuple):
 def blueprint_rows(standing: StandingUpdate) -> list[BlueprintRow]:
     """Return the rows of a message. All messages of its log have equal rows, in the same order."""
     return [
-        BlueprintRow(result.name, result.unit, f".results[{place}]", CURVES[place % len(CURVES)])
-        for place, result in enumerate(standing.results)
+        BlueprintRow(
+            result.name, result.unit, f".results[{result_index}]", CURVES[result_index % len(CURVES)]
+        )
+        for result_index, result in enumerate(standing.results)
     ]
 
 
@@ -97,25 +99,25 @@ def write_blueprint(
 def _write_recording(log: Path, path: Path, layout: Any, scenes: Iterable[SceneUpdate]) -> None:
     import rerun
 
-    times, moments = list[int](), defaultdict[str, dict[int, list[_Strip]]](dict)
+    times_ns, strips_by_entity = list[int](), defaultdict[str, dict[int, list[_Strip]]](dict)
     for scene in scenes:
         stamps = [entity.timestamp for entity in scene.entities] or [
             deletion.timestamp for deletion in scene.deletions
         ]
-        times += [stamp.ToNanoseconds() for stamp in stamps[:1]]
+        times_ns += [stamp.ToNanoseconds() for stamp in stamps[:1]]
         for entity in scene.entities:
             strips = [strip for line in entity.lines for strip in _strips(line)]
             if strips:
-                moments[entity.id][len(times) - 1] = strips
-    index = rerun.TimeColumn(_TIMELINE, timestamp=np.array(times, "datetime64[ns]"))
+                strips_by_entity[entity.id][len(times_ns) - 1] = strips
+    time_column = rerun.TimeColumn(_TIMELINE, timestamp=np.array(times_ns, "datetime64[ns]"))
     with rerun.RecordingStream(log.stem, recording_id=log.stem) as stream:
         stream.save(path, default_blueprint=layout)
         stream.log_file_from_path(log)
-        for name, rows in moments.items():
-            corners, colours = zip(*chain(*rows.values()), strict=True)
-            columns = rerun.LineStrips3D.columns(strips=corners, colors=colours)
-            counts = [len(rows.get(number, ())) for number in range(len(times))]
-            stream.send_columns(f"{SCENE}/{name}", [index], columns.partition(counts))
+        for name, strips_by_scene in strips_by_entity.items():
+            corners, colours = zip(*chain(*strips_by_scene.values()), strict=True)
+            strip_columns = rerun.LineStrips3D.columns(strips=corners, colors=colours)
+            strip_counts = [len(strips_by_scene.get(scene_index, ())) for scene_index in range(len(times_ns))]
+            stream.send_columns(f"{SCENE}/{name}", [time_column], strip_columns.partition(strip_counts))
 
 
 def _strips(line: LinePrimitive) -> list[_Strip]:
@@ -140,9 +142,9 @@ def _curves(unit: str, rows: Sequence[BlueprintRow]) -> Any:
         )
         for row in rows
     ]
-    words = unit or "footprint units"
+    unit_text = unit or "footprint units"
     return blueprint.TimeSeriesView(
-        origin=STANDING, contents=STANDING, name=f"Robustness [{words}]", overrides={STANDING: lines}
+        origin=STANDING, contents=STANDING, name=f"Robustness [{unit_text}]", overrides={STANDING: lines}
     )
 
 

@@ -116,7 +116,9 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
     Raises:
         LogError: a message of another type.
     """
-    rows: dict[tuple[str, str | None, tuple[int, ...], tuple[str | None, ...]], list[Robustness]] = {}
+    messages_by_heading: dict[
+        tuple[str, str | None, tuple[int, ...], tuple[str | None, ...]], list[Robustness]
+    ] = {}
     for index, payload in enumerate(payloads):
         try:
             message = Robustness.FromString(payload)
@@ -133,7 +135,7 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
                 ids,
                 tuple(name or None for name in names),
             )
-            rows.setdefault(heading, []).append(message)
+            messages_by_heading.setdefault(heading, []).append(message)
     return [
         RobustnessSeries(
             name,
@@ -150,7 +152,7 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
             .reshape(len(messages), -1, 4)
             .transpose(1, 2, 0),
         )
-        for (name, object, ids, names), messages in rows.items()
+        for (name, object, ids, names), messages in messages_by_heading.items()
     ]
 
 
@@ -173,10 +175,10 @@ class Thinning:
             most: limit of points in a curve, at least 2.
         """
         self._times_ns = times_ns
-        count = len(times_ns)
-        self._is_needed = count > most
-        self._starts = np.linspace(0, count, most // 2, endpoint=False).astype(np.int64)
-        self._ends = np.append(self._starts[1:], count) - 1
+        sample_count = len(times_ns)
+        self._is_needed = sample_count > most
+        self._starts = np.linspace(0, sample_count, most // 2, endpoint=False).astype(np.int64)
+        self._ends = np.append(self._starts[1:], sample_count) - 1
 
     def seconds(self, first_ns: int) -> Floats:
         """Return the times of the points in seconds after `first_ns`."""
@@ -190,16 +192,16 @@ class Thinning:
             times_ns: (S,) int64, a stretch of the log's samples.
             numbers: (S,).
         """
-        whole = np.full(len(self._times_ns), np.nan)
-        first = int(np.searchsorted(self._times_ns, times_ns[0])) if len(times_ns) else 0
-        whole[first : first + len(numbers)] = numbers
+        all_numbers = np.full(len(self._times_ns), np.nan)
+        first_index = int(np.searchsorted(self._times_ns, times_ns[0])) if len(times_ns) else 0
+        all_numbers[first_index : first_index + len(numbers)] = numbers
         if not self._is_needed:
-            return whole
-        low = np.fmin.reduceat(whole, self._starts)
-        high = np.fmax.reduceat(whole, self._starts)
+            return all_numbers
+        least = np.fmin.reduceat(all_numbers, self._starts)
+        greatest = np.fmax.reduceat(all_numbers, self._starts)
         # the order of both points within a stretch follows the curve, so that slopes keep their direction
-        falls = whole[self._starts] > whole[self._ends]
-        return self._interleave(np.where(falls, high, low), np.where(falls, low, high))
+        is_falling = all_numbers[self._starts] > all_numbers[self._ends]
+        return self._interleave(np.where(is_falling, greatest, least), np.where(is_falling, least, greatest))
 
     def _interleave(self, first: Floats, second: Floats) -> Floats:
         return np.column_stack([first, second]).reshape(-1)
@@ -215,9 +217,9 @@ def encode_curves(
         first_ns: zero of the seconds.
         summary: all results in words.
     """
-    curves = 2 * sum(len(curved_nodes(result.formula)) for result in results)
-    most = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curves, 1)))
-    thinning = Thinning(times_ns, most)
+    curve_count = 2 * sum(len(curved_nodes(result.formula)) for result in results)
+    point_limit = min(MOST_POINTS, max(_FEWEST_POINTS, _MOST_NUMBERS // max(curve_count, 1)))
+    thinning = Thinning(times_ns, point_limit)
     message = Curves(
         time=thinning.seconds(first_ns),
         specifications=[_result(result, thinning) for result in results],

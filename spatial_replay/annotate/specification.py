@@ -98,27 +98,27 @@ class ReportedTree(NamedTuple):
     def calls(self, source: str) -> dict[int, str]:
         """Return the text of each node that is a call of a `def`, as the file writes it, by id."""
         nodes, spec_text = list(iter_nodes(self.formula)), self.written_texts(source)
-        spans, defined = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
+        spans, defined_names = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
         # the parser gives the body of a `def` the span of its call
-        expanded = {
+        expanded_ids = {
             identifier
             for identifier, parent, _ in nodes
             if parent is not None and spans[parent] == spans[identifier]
         }
-        above = {parent for identifier, parent, _ in nodes if identifier in expanded}
+        call_parents = {parent for identifier, parent, _ in nodes if identifier in expanded_ids}
         return {
             identifier: spec_text[identifier]
             for identifier, _, node in nodes
             if node.name is None
-            and identifier not in expanded
-            and (identifier in above or _is_call(node, spec_text[identifier], defined))
+            and identifier not in expanded_ids
+            and (identifier in call_parents or _is_call(node, spec_text[identifier], defined_names))
         }
 
 
-def _is_call(node: Formula, written: str, defined: Collection[str]) -> bool:
+def _is_call(node: Formula, written_text: str, defined_names: Collection[str]) -> bool:
     """Return whether an atom was written as a call of one of these `def` names."""
-    call = _CALL.match(written) if isinstance(node, Atom) else None
-    return call is not None and call[1] in defined
+    call = _CALL.match(written_text) if isinstance(node, Atom) else None
+    return call is not None and call[1] in defined_names
 
 
 def reported_trees(
@@ -129,15 +129,18 @@ def reported_trees(
     Args:
         instances: instances of each file, in the order of evaluation.
     """
-    names = [spec.name for file in files for spec in file.results]
+    spec_names = [spec.name for file in files for spec in file.results]
     trees = []
-    for index, (file, file_instances) in enumerate(zip(files, instances, strict=True)):
+    for file_index, (file, file_instances) in enumerate(zip(files, instances, strict=True)):
         for instance in file_instances:
-            clashes = names.count(instance.name) > 1
-            name = f"{PurePath(file.filename).stem}.{instance.name}" if clashes else instance.name
+            has_clash = spec_names.count(instance.name) > 1
+            name = f"{PurePath(file.filename).stem}.{instance.name}" if has_clash else instance.name
             spec = instance.spec
-            of = spec.id, spec.title, spec.parameter
-            trees.append(ReportedTree(name, instance.object, index, spec.formula, *of))
+            trees.append(
+                ReportedTree(
+                    name, instance.object, file_index, spec.formula, spec.id, spec.title, spec.parameter
+                )
+            )
     return trees
 
 
@@ -168,11 +171,11 @@ def encode_specification(
             canonical=format_specification(file),
             profile=file.profile,
         )
-    for index, tree in enumerate(trees):
+    for tree_index, tree in enumerate(trees):
         result = message.results.add(name=tree.name, object=tree.object or "", file=tree.file)
-        result.propositions.extend(propositions[index] if propositions is not None else ())
+        result.propositions.extend(propositions[tree_index] if propositions is not None else ())
         _add_nodes(result, tree, files[tree.file], units or {})
-        tree_automaton = automata[index] if automata else None
+        tree_automaton = automata[tree_index] if automata else None
         if tree_automaton is not None:
             _add_automaton(result, tree, tree_automaton)
     return message.SerializeToString(deterministic=True)
@@ -224,8 +227,8 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
     from spatial_replay.automata.automaton import abbreviate, meanings
     from spatial_replay.automata.drawing import draw_automaton, guard_of
 
-    drawing, short = draw_automaton(automaton), abbreviate(automaton)
-    result.automaton.legend.extend(map(tree.with_object_name, meanings(short)))
+    drawing, short_names = draw_automaton(automaton), abbreviate(automaton)
+    result.automaton.legend.extend(map(tree.with_object_name, meanings(short_names)))
     result.automaton.summary = drawing.summary
     result.automaton.left_out = drawing.left_out
     for state in drawing.states:
@@ -239,7 +242,7 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
             distance=state.distance,
         )
     for move in drawing.moves:
-        guard, label = tree.with_object_name(move.guard), tree.with_object_name(guard_of(short, move))
+        guard, label = tree.with_object_name(move.guard), tree.with_object_name(guard_of(short_names, move))
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
@@ -247,10 +250,10 @@ def _declared_unit(unit: Unit, units: Mapping[str, str]) -> str:
     """Return the declared unit of an atom's number, or words instead."""
     if unit.divisor is not None or unit.kind == "orientation":
         return DIMENSIONLESS
-    declared = plain_unit(units.get(unit.signal or FOOTPRINT_UNITS, ""))
+    declared_unit = plain_unit(units.get(unit.signal or FOOTPRINT_UNITS, ""))
     if unit.kind == "rate":
-        return per_second(declared or f"units of {unit.signal or 'lengths'}")
-    return declared if unit.kind == "length" else declared or f"units of {unit.signal}"
+        return per_second(declared_unit or f"units of {unit.signal or 'lengths'}")
+    return declared_unit if unit.kind == "length" else declared_unit or f"units of {unit.signal}"
 
 
 def logged_specifications(files: Sequence[Specification], units: Mapping[str, str]) -> list[Specification]:
@@ -270,14 +273,14 @@ def logged_specifications(files: Sequence[Specification], units: Mapping[str, st
     stems: set[str] = set()
     for file in files:
         path = PurePath(file.filename)
-        first, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
-        stem, count = first, 1
+        first_stem, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
+        stem, copy_number = first_stem, 1
         while stem in stems:
-            count += 1
-            stem = f"{first}-{count}"
+            copy_number += 1
+            stem = f"{first_stem}-{copy_number}"
         stems.add(stem)
-        contained = replace(_logged_copy(_Same(file)), filename=f"{stem}{suffix}")
-        logged.append(with_numbers(contained, units))
+        logged_copy = replace(_logged_copy(_Same(file)), filename=f"{stem}{suffix}")
+        logged.append(with_numbers(logged_copy, units))
     return logged
 
 

@@ -65,9 +65,9 @@ class StagesOfStates:
 
     def stage_of(self, states: Sequence[int]) -> tuple[int, float]:
         """Return the index of the stage of a run in one of some states, and the progress that is certain."""
-        numbers = {self.numbers[state] for state in states}
-        number = numbers.pop() if len(numbers) == 1 else len(self.stages) - 1
-        return number, min(self.progress[state] for state in states)
+        stage_numbers = {self.numbers[state] for state in states}
+        stage_number = stage_numbers.pop() if len(stage_numbers) == 1 else len(self.stages) - 1
+        return stage_number, min(self.progress[state] for state in states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +119,8 @@ class LiveStages:
         Args:
             numbers, leaves: see `AutomatonRun.step`.
         """
-        number, progress = self._stage_of(self._run.step(time_ns, numbers, leaves))
-        return self._stages.stages[number], progress
+        stage_number, progress = self._stage_of(self._run.step(time_ns, numbers, leaves))
+        return self._stages.stages[stage_number], progress
 
 
 def stages(
@@ -149,21 +149,24 @@ def stages_of_result(
     """Return the stages of a result of a specification (see `stages`)."""
     if rate_hz is None and counts_seconds(result.formula):
         rate_hz = _even_rate(result.times_ns)
-    machine, after = states_of_result(result, specification, rate_hz=rate_hz)
-    of_states = stages_of_automaton(machine)
-    if after.ndim == 1:
-        numbers = np.array(of_states.numbers, np.int64)[after]
-        progress = np.array(of_states.progress)[after]
+    machine, states_after = states_of_result(result, specification, rate_hz=rate_hz)
+    automaton_stages = stages_of_automaton(machine)
+    if states_after.ndim == 1:
+        stage_numbers = np.array(automaton_stages.numbers, np.int64)[states_after]
+        progress = np.array(automaton_stages.progress)[states_after]
     else:
-        rows, places = np.unique(after, axis=0, return_inverse=True)
-        pairs = [of_states.stage_of(np.flatnonzero(row).tolist()) for row in rows]
-        numbers = np.array([number for number, _ in pairs], np.int64)[places.ravel()]
-        progress = np.array([share for _, share in pairs])[places.ravel()]
+        state_sets, set_indices = np.unique(states_after, axis=0, return_inverse=True)
+        stages_and_progress = [
+            automaton_stages.stage_of(np.flatnonzero(state_set).tolist()) for state_set in state_sets
+        ]
+        numbers_of_sets, progress_of_sets = zip(*stages_and_progress, strict=True)
+        stage_numbers = np.array(numbers_of_sets, np.int64)[set_indices.ravel()]
+        progress = np.array(progress_of_sets)[set_indices.ravel()]
     return Stages(
         result.title,
-        of_states.stages,
+        automaton_stages.stages,
         result.times_ns,
-        read_only_integers(numbers),
+        read_only_integers(stage_numbers),
         read_only_floats(progress),
     )
 
@@ -173,10 +176,10 @@ def _even_rate(times_ns: Integers) -> float | None:
 
     Gaps may differ by 1 ns, because times are rounded to nanoseconds.
     """
-    gaps = np.diff(times_ns)
-    if not len(gaps) or np.ptp(gaps) > 1:
+    gaps_ns = np.diff(times_ns)
+    if not len(gaps_ns) or np.ptp(gaps_ns) > 1:
         return None
-    return round(len(gaps) * 1e9 / float(times_ns[-1] - times_ns[0]), 6)
+    return round(len(gaps_ns) * 1e9 / float(times_ns[-1] - times_ns[0]), 6)
 
 
 @lru_cache(maxsize=64)
@@ -190,23 +193,30 @@ def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
         NoAutomatonError: the automaton is too large.
     """
     moves = _cheapest_moves(automaton)
-    left, ways = _ways(automaton, moves)
-    start = ways[automaton.initial]
-    unmet = _unmet_propositions(automaton)
+    owed_counts, owed_propositions = _ways(automaton, moves)
+    initial_propositions = owed_propositions[automaton.initial]
+    unmet_by_state = _unmet_propositions(automaton)
     stage_of_state = {
-        state: _stage(automaton, state, start, way, unmet[state]) for state, way in ways.items()
+        state: _stage(automaton, state, initial_propositions, propositions, unmet_by_state[state])
+        for state, propositions in owed_propositions.items()
     }
     # a state that does not accept owes at least one change, for example a proposition that must become false
-    left = {state: count or int(automaton.distances[state] > 0) for state, count in left.items()}
-    most = left[automaton.initial] or max(left.values()) or 1
+    owed_counts = {
+        state: owed_count or int(automaton.distances[state] > 0) for state, owed_count in owed_counts.items()
+    }
+    most_owed = owed_counts[automaton.initial] or max(owed_counts.values()) or 1
     # among states of one stage, the state that owes most gives the stage its place
-    order = sorted(stage_of_state, key=lambda state: (-left[state], state))
-    ordered = [*dict.fromkeys(stage_of_state[state] for state in order), Stage(LOST), Stage(UNKNOWN)]
+    states_by_owed = sorted(stage_of_state, key=lambda state: (-owed_counts[state], state))
+    ordered_stages = [
+        *dict.fromkeys(stage_of_state[state] for state in states_by_owed),
+        Stage(LOST),
+        Stage(UNKNOWN),
+    ]
     return StagesOfStates(
-        tuple(ordered),
-        tuple(ordered.index(stage_of_state.get(state, Stage(LOST))) for state in automaton.states),
-        tuple(left.get(state, most) for state in automaton.states),
-        tuple(max(0.0, 1.0 - left.get(state, most) / most) for state in automaton.states),
+        tuple(ordered_stages),
+        tuple(ordered_stages.index(stage_of_state.get(state, Stage(LOST))) for state in automaton.states),
+        tuple(owed_counts.get(state, most_owed) for state in automaton.states),
+        tuple(max(0.0, 1.0 - owed_counts.get(state, most_owed) / most_owed) for state in automaton.states),
     )
 
 
@@ -215,37 +225,44 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
 
     Propositions are in the order of the text.
     """
-    alive = automaton.can_accept
+    live_states = automaton.can_accept
     tables: list[dict[int, tuple[int, ...]]] = []
-    required: list[frozenset[int] | None] = []
+    required_sets: list[frozenset[int] | None] = []
 
-    def table(place: int) -> dict[int, tuple[int, ...]]:
-        return tables[place] if place >= 0 else {~place: ()} if ~place in alive else {}
+    def table(entry: int) -> dict[int, tuple[int, ...]]:
+        return tables[entry] if entry >= 0 else {~entry: ()} if ~entry in live_states else {}
 
-    def requires(place: int) -> frozenset[int] | None:
+    def requires(entry: int) -> frozenset[int] | None:
         """Return the propositions without which a move loses acceptance; None if every move loses it."""
-        return required[place] if place >= 0 else frozenset() if ~place in alive else None
+        return required_sets[entry] if entry >= 0 else frozenset() if ~entry in live_states else None
 
-    size = 0
+    entry_count = 0
     for proposition, low, high in automaton.decisions:
         targets = dict(table(low))
-        for target, rest in table(high).items():
-            if target not in targets or len(rest) + 1 < len(targets[target]):
-                targets[target] = (proposition, *rest)
-        size += len(targets)
-        if size > _MOST_WAYS:
+        for target, propositions in table(high).items():
+            if target not in targets or len(propositions) + 1 < len(targets[target]):
+                targets[target] = (proposition, *propositions)
+        entry_count += len(targets)
+        if entry_count > _MOST_WAYS:
             raise NoAutomatonError(f"the automaton of {automaton.name} is too large for stages")
         tables.append(targets)
-        false, true = requires(low), requires(high)
-        if true is not None:
-            true |= {proposition}
-        required.append(true if false is None else false if true is None else false & true)
+        if_false, if_true = requires(low), requires(high)
+        if if_true is not None:
+            if_true |= {proposition}
+        required_sets.append(
+            if_true if if_false is None else if_false if if_true is None else if_false & if_true
+        )
     moves: list[dict[int, tuple[int, ...]]] = []
     for state, entry in enumerate(automaton.entries):
         targets = table(entry)
         # propositions that the run needs to stay in the state must only stay true
-        constant = (requires(entry) or frozenset()) if state in targets else frozenset()
-        moves.append({target: tuple(p for p in way if p not in constant) for target, way in targets.items()})
+        constant_propositions = (requires(entry) or frozenset()) if state in targets else frozenset()
+        moves.append(
+            {
+                target: tuple(p for p in move_propositions if p not in constant_propositions)
+                for target, move_propositions in targets.items()
+            }
+        )
     return moves
 
 
@@ -260,47 +277,53 @@ def _ways(
     for state, targets in enumerate(moves):
         for target in targets:
             sources.setdefault(target, []).append(state)
-    left: dict[int, int] = {}
-    ways: dict[int, tuple[int, ...]] = {}
-    waiting = [(0, state) for state, steps in automaton.distances.items() if steps == 0]
-    while waiting:
-        count, state = heappop(waiting)
-        if state in left:
+    owed_counts: dict[int, int] = {}
+    owed_propositions: dict[int, tuple[int, ...]] = {}
+    heap = [(0, state) for state, distance in automaton.distances.items() if distance == 0]
+    while heap:
+        owed_count, state = heappop(heap)
+        if state in owed_counts:
             continue
-        left[state] = count
-        ways[state] = () if automaton.distances[state] == 0 else _way(moves[state], left, ways, state)
+        owed_counts[state] = owed_count
+        owed_propositions[state] = (
+            ()
+            if automaton.distances[state] == 0
+            else _way(moves[state], owed_counts, owed_propositions, state)
+        )
         for source in sources.get(state, ()):
-            if source not in left:
-                heappush(waiting, (count + len(moves[source][state]), source))
-    return left, ways
+            if source not in owed_counts:
+                heappush(heap, (owed_count + len(moves[source][state]), source))
+    return owed_counts, owed_propositions
 
 
 def _way(
     targets: Mapping[int, Sequence[int]],
-    left: Mapping[int, int],
-    ways: Mapping[int, tuple[int, ...]],
+    owed_counts: Mapping[int, int],
+    owed_propositions: Mapping[int, tuple[int, ...]],
     state: int,
 ) -> tuple[int, ...]:
     """Return the propositions that a state owes, in the order of a path with few propositions per sample."""
     nearest = [
         target
-        for target, way in targets.items()
-        if target != state and target in ways and len(way) + left[target] == left[state]
+        for target, propositions in targets.items()
+        if target != state
+        and target in owed_propositions
+        and len(propositions) + owed_counts[target] == owed_counts[state]
     ]
     # a path with one proposition per sample shows the order of the formula; a single step hides it
     target = min(nearest, key=lambda target: (len(targets[target]) or len(targets), target))
-    return (*targets[target], *ways[target])
+    return (*targets[target], *owed_propositions[target])
 
 
 def _unmet_propositions(automaton: Automaton) -> list[frozenset[int]]:
     """Return, for each state, the propositions that were never true on any path to the state."""
-    count = len(automaton.propositions)
-    unmet: list[set[int]] = [set(range(count)) for _ in automaton.states]
-    for proposition in range(count):
-        symbol: list[bool | None] = [None] * count
+    proposition_count = len(automaton.propositions)
+    unmet: list[set[int]] = [set(range(proposition_count)) for _ in automaton.states]
+    for proposition in range(proposition_count):
+        symbol: list[bool | None] = [None] * proposition_count
         symbol[proposition] = True
-        after = automaton.step_set(automaton.states, symbol)
-        pending = set(after)
+        states_after = automaton.step_set(automaton.states, symbol)
+        pending = set(states_after)
         while pending:
             state = pending.pop()
             unmet[state].discard(proposition)
@@ -309,30 +332,41 @@ def _unmet_propositions(automaton: Automaton) -> list[frozenset[int]]:
 
 
 def _stage(
-    automaton: Automaton, state: int, start: Sequence[int], way: Sequence[int], unmet: frozenset[int]
+    automaton: Automaton,
+    state: int,
+    initial_propositions: Sequence[int],
+    owed_propositions: Sequence[int],
+    unmet_propositions: frozenset[int],
 ) -> Stage:
     """Return the stage of a state that can accept.
 
     Args:
-        start, way: propositions that the initial state and this state owe.
-        unmet: propositions that were never true on any path to the state.
+        initial_propositions, owed_propositions: propositions that the initial state and this state owe.
+        unmet_propositions: propositions that were never true on any path to the state.
     """
-    words = [p.name or shortened_formula(p.text) for p in automaton.propositions]
-    if not way and automaton.distances[state]:
+    proposition_texts = [
+        proposition.name or shortened_formula(proposition.text) for proposition in automaton.propositions
+    ]
+    if not owed_propositions and automaton.distances[state]:
         # the state owes only propositions that must become false
         (move, *_) = next(automaton.paths(state))
         return Stage(
-            f"{words[start[-1]]}, not finished" if start else "not finished", automaton.guard_words(move, 80)
+            f"{proposition_texts[initial_propositions[-1]]}, not finished"
+            if initial_propositions
+            else "not finished",
+            automaton.guard_words(move, 80),
         )
-    if not way:
-        return Stage(words[start[-1]] if start else "nothing owed")
-    owed = words[way[0]]
-    if tuple(start[-len(way) :]) == tuple(way):
-        past = start[: -len(way)]
+    if not owed_propositions:
+        return Stage(proposition_texts[initial_propositions[-1]] if initial_propositions else "nothing owed")
+    owed_text = proposition_texts[owed_propositions[0]]
+    if tuple(initial_propositions[-len(owed_propositions) :]) == tuple(owed_propositions):
+        met_propositions = initial_propositions[: -len(owed_propositions)]
     else:
-        past = list((Counter(start) - Counter(way)).elements())
-    if not past:
-        return Stage(f"{'never' if way[0] in unmet else 'not'} {owed}", owed)
-    if past[-1] == way[0]:
-        return Stage(f"{owed}, not long enough", owed)
-    return Stage(f"{words[past[-1]]}, not {owed}", owed)
+        met_propositions = list((Counter(initial_propositions) - Counter(owed_propositions)).elements())
+    if not met_propositions:
+        return Stage(
+            f"{'never' if owed_propositions[0] in unmet_propositions else 'not'} {owed_text}", owed_text
+        )
+    if met_propositions[-1] == owed_propositions[0]:
+        return Stage(f"{owed_text}, not long enough", owed_text)
+    return Stage(f"{proposition_texts[met_propositions[-1]]}, not {owed_text}", owed_text)

@@ -48,8 +48,8 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     ranks = _RANKS[codes]
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
     # minus 1 puts the worst rank before other ranks, also without a violation
-    order = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
-    return np.asarray(order.argmin(axis=0), np.int64)
+    priorities = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
+    return np.asarray(priorities.argmin(axis=0), np.int64)
 
 
 class _Entry(NamedTuple):
@@ -132,13 +132,13 @@ class StandingEncoder:
                 title, unit = part_title(formula, tree), unit_of(formula, units)
                 if node:
                     self._entries.append(_Entry(title, unit, index, node, 0 if looks_ahead(formula) else 1))
-        self._last = [np.full((len(list(iter_nodes(tree.formula))), 4, 1), np.nan) for tree in trees]
-        self._words = [""] * len(trees)
-        self._violated_ns = [LATEST_NS] * len(trees)
-        self._least, self._least_ns = [math.inf] * len(trees), [0] * len(trees)
+        self._last_series = [np.full((len(list(iter_nodes(tree.formula))), 4, 1), np.nan) for tree in trees]
+        self._automaton_words = [""] * len(trees)
+        self._violated_since_ns = [LATEST_NS] * len(trees)
+        self._least_ends, self._least_ns = [math.inf] * len(trees), [0] * len(trees)
         self.zero_ns: int | None = None
         self._written_ns: int | None = None
-        self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
+        self._cached_template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         self.outcomes: tuple[FinalStanding, ...] = ()
         self.order: Sequence[int] = ()
 
@@ -170,8 +170,8 @@ class StandingEncoder:
             most: limit of changes.
         """
         changes_ns = [np.empty(0, np.int64)]
-        for index, block in enumerate(blocks):
-            nodes = [entry.node for entry in self._entries if entry.tree == index]
+        for tree_index, block in enumerate(blocks):
+            nodes = [entry.node for entry in self._entries if entry.tree == tree_index]
             codes = standing_codes(block.series[nodes])
             is_change = np.ones(len(block.times_ns), np.bool_)
             is_change[1:] = (codes[:, 1:] != codes[:, :-1]).any(axis=0)
@@ -183,55 +183,63 @@ class StandingEncoder:
         self, shown_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
     ) -> Sequence[bytes]:
         """Add the next samples, and return the messages at `shown_ns`."""
-        series, words, since, least = [], [], [], []
-        for index, block in enumerate(blocks):
-            at = np.searchsorted(block.times_ns, shown_ns, side="right")
-            series.append(self._numbers(index, block, at))
-            words.append(self._descriptions(index, block, at))
-            since.append(np.append(self._violated_ns[index], self._violated_since(index, block))[at])
-            least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
+        series, automaton_words, since_ns, least_ns = [], [], [], []
+        for tree_index, block in enumerate(blocks):
+            sample_counts = np.searchsorted(block.times_ns, shown_ns, side="right")
+            series.append(self._numbers(tree_index, block, sample_counts))
+            automaton_words.append(self._descriptions(tree_index, block, sample_counts))
+            since_ns.append(
+                np.append(self._violated_since_ns[tree_index], self._violated_since(tree_index, block))[
+                    sample_counts
+                ]
+            )
+            least_ns.append(
+                np.append(self._least_ns[tree_index], self._became_least(tree_index, block))[sample_counts]
+            )
         self.pass_over(blocks)
         if not len(shown_ns):
             return []
-        return self._messages(shown_ns, series, words, np.array([since, least]), over)
+        return self._messages(shown_ns, series, automaton_words, np.array([since_ns, least_ns]), over)
 
-    def _numbers(self, index: int, block: SeriesBlock, at: Integers) -> Floats:
-        """Return (N, 4, S), the numbers of a result after `at` samples of a block.
+    def _numbers(self, tree_index: int, block: SeriesBlock, sample_counts: Integers) -> Floats:
+        """Return (N, 4, S), the numbers of a result after some counts of samples (S,) in a block.
 
-        At 0 they are the numbers of the last sample before the block.
+        After 0 samples they are the numbers of the last sample before the block.
         """
         if not len(block.times_ns):
-            return np.repeat(self._last[index], len(at), axis=2)
-        numbers = block.series[:, :, np.maximum(at - 1, 0)]
-        numbers[:, :, at == 0] = self._last[index]
+            return np.repeat(self._last_series[tree_index], len(sample_counts), axis=2)
+        numbers = block.series[:, :, np.maximum(sample_counts - 1, 0)]
+        numbers[:, :, sample_counts == 0] = self._last_series[tree_index]
         return numbers
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
         """Add the next samples, and write no messages for them."""
-        for index, block in enumerate(blocks):
+        for tree_index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
-            self._violated_ns[index] = int(self._violated_since(index, block)[-1])
-            self._least_ns[index] = int(self._became_least(index, block)[-1])
-            self._least[index] = float(np.fmin.reduce(block.series[0, 3], initial=self._least[index]))
-            self._last[index] = block.series[:, :, -1:].copy()
-            run = self._runs[index]
+            self._violated_since_ns[tree_index] = int(self._violated_since(tree_index, block)[-1])
+            self._least_ns[tree_index] = int(self._became_least(tree_index, block)[-1])
+            self._least_ends[tree_index] = float(
+                np.fmin.reduce(block.series[0, 3], initial=self._least_ends[tree_index])
+            )
+            self._last_series[tree_index] = block.series[:, :, -1:].copy()
+            run = self._runs[tree_index]
             if run is not None:
-                self._words[index] = run.latest_words
+                self._automaton_words[tree_index] = run.latest_words
 
-    def _violated_since(self, index: int, block: SeriesBlock) -> Integers:
+    def _violated_since(self, tree_index: int, block: SeriesBlock) -> Integers:
         """Return (T,), the start of the violation at each sample of a block; `LATEST_NS` without one."""
         is_violated = block.series[0, 3] < 0.0
-        begins = is_violated & ~np.append(self._violated_ns[index] < LATEST_NS, is_violated)[:-1]
-        begun = np.maximum.accumulate(np.where(begins, np.arange(len(begins)), -1))
-        since_ns = np.where(begun < 0, self._violated_ns[index], block.times_ns[begun])
+        is_begin = is_violated & ~np.append(self._violated_since_ns[tree_index] < LATEST_NS, is_violated)[:-1]
+        last_begins = np.maximum.accumulate(np.where(is_begin, np.arange(len(is_begin)), -1))
+        since_ns = np.where(last_begins < 0, self._violated_since_ns[tree_index], block.times_ns[last_begins])
         return np.where(is_violated, since_ns, LATEST_NS)
 
-    def _became_least(self, index: int, block: SeriesBlock) -> Integers:
+    def _became_least(self, tree_index: int, block: SeriesBlock) -> Integers:
         """Return (T,), the time of the least upper end of a result so far, at each sample of a block."""
-        upper = np.append(self._least[index], block.series[0, 3])
+        upper = np.append(self._least_ends[tree_index], block.series[0, 3])
         is_less = upper[1:] < np.fmin.accumulate(upper)[:-1]
-        return np.maximum.accumulate(np.where(is_less, block.times_ns, self._least_ns[index]))
+        return np.maximum.accumulate(np.where(is_less, block.times_ns, self._least_ns[tree_index]))
 
     def end(self, time_ns: int, finals: Sequence[Floats], over: Sequence[str]) -> bytes:
         """Return the message about the finished log.
@@ -242,35 +250,40 @@ class StandingEncoder:
             over: deciding atom of each tree, or "".
         """
         zero_ns = time_ns if self.zero_ns is None else self.zero_ns
-        since_ns = self._violated_ns
-        for place, final in enumerate(finals):
-            if final[0, 1] < self._least[place]:
-                self._least_ns[place] = time_ns
+        since_ns = self._violated_since_ns
+        for tree_index, final in enumerate(finals):
+            if final[0, 1] < self._least_ends[tree_index]:
+                self._least_ns[tree_index] = time_ns
         outcomes, series = [], []
-        for last, final in zip(self._last, finals, strict=True):
-            ended = last.copy()
-            ended[:, 2:, 0] = final
-            series.append(ended)
-        for unit, ended, least_ns in zip(self._units, series, self._least_ns, strict=True):
-            code = int(standing_codes(ended[:1], final=True)[0, 0])
-            low, high = ended[0, 2:, 0].tolist()
-            by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
-            outcomes.append(FinalStanding(code, by, Instant(min(least_ns, time_ns), zero_ns), unit))
+        for last, final in zip(self._last_series, finals, strict=True):
+            final_series = last.copy()
+            final_series[:, 2:, 0] = final
+            series.append(final_series)
+        for unit, final_series, least_ns in zip(self._units, series, self._least_ns, strict=True):
+            code = int(standing_codes(final_series[:1], final=True)[0, 0])
+            low, high = final_series[0, 2:, 0].tolist()
+            magnitude = -high if code == VIOLATED else low if code == SATISFIED else math.nan
+            outcomes.append(FinalStanding(code, magnitude, Instant(min(least_ns, time_ns), zero_ns), unit))
         self.outcomes, codes = tuple(outcomes), [outcome.standing for outcome in outcomes]
-        since = [at_ns if code == VIOLATED else 0 for code, at_ns in zip(codes, since_ns, strict=True)]
-        self.order = np.lexsort((np.array(since), _RANKS[codes])).tolist()
-        words, times_ns = [([text], np.zeros(1, np.int64)) for text in self._words], np.array([time_ns])
-        instants = np.array([since_ns, self._least_ns])[:, :, None]
-        [payload] = self._messages(times_ns, series, words, instants, over, final=True)
+        order_ns = [at_ns if code == VIOLATED else 0 for code, at_ns in zip(codes, since_ns, strict=True)]
+        self.order = np.lexsort((np.array(order_ns), _RANKS[codes])).tolist()
+        words, times_ns = (
+            [([text], np.zeros(1, np.int64)) for text in self._automaton_words],
+            np.array([time_ns]),
+        )
+        instants_ns = np.array([since_ns, self._least_ns])[:, :, None]
+        [payload] = self._messages(times_ns, series, words, instants_ns, over, final=True)
         return payload
 
-    def _descriptions(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
-        """Return the states of an automaton in words, and (S,) the index of the words after `at` samples."""
-        run = self._runs[index]
+    def _descriptions(
+        self, tree_index: int, block: SeriesBlock, sample_counts: Integers
+    ) -> tuple[list[str], Integers]:
+        """Return the states of an automaton in words, and (S,) the index of words by count of samples."""
+        run = self._runs[tree_index]
         if run is None or not len(block.times_ns):
-            return [self._words[index]], np.zeros(len(at), np.int64)
-        texts, which = run.words()
-        return [self._words[index], *texts], np.append(0, which + 1)[at]
+            return [self._automaton_words[tree_index]], np.zeros(len(sample_counts), np.int64)
+        texts, text_indices = run.words()
+        return [self._automaton_words[tree_index], *texts], np.append(0, text_indices + 1)[sample_counts]
 
     def _messages(
         self,
@@ -288,47 +301,64 @@ class StandingEncoder:
             instants_ns: (2, R, S), time since which each result is violated, and time of its least upper end.
         """
         since_ns = instants_ns[0]
-        codes = [standing_codes(node_series, final=final) for node_series in series]
-        of_results = np.array([node_codes[0] for node_codes in codes])
-        worst = worst_results(of_results, since_ns)
+        codes_by_tree = [standing_codes(node_series, final=final) for node_series in series]
+        result_codes = np.array([node_codes[0] for node_codes in codes_by_tree])
+        worst = worst_results(result_codes, since_ns)
         # the earliest violation first
-        order = np.argsort(
-            np.where(of_results == VIOLATED, np.minimum(since_ns, LATEST_NS - 1), LATEST_NS),
+        violation_order = np.argsort(
+            np.where(result_codes == VIOLATED, np.minimum(since_ns, LATEST_NS - 1), LATEST_NS),
             axis=0,
             kind="stable",
         )
-        counts = (of_results == VIOLATED).sum(axis=0)
-        marks = [codes[entry.tree][entry.node, :, None] for entry in self._entries]
-        numbers = [_finite(series[entry.tree][entry.node, entry.number, :, None]) for entry in self._entries]
-        encoded, of_violated = [], dict[int, tuple[Floats, Floats, Floats]]()
-        is_listed = np.arange(len(order))[:, None] < counts
-        keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
-        for members in equal_places(combined_code(keys, len(times_ns))):
-            first = int(members[0])
-            violated = tuple((place, over[place]) for place in order[: counts[first], first].tolist())
-            said = tuple(texts[which[first]] for texts, which in words)
-            layout = _Layout(int(worst[first]), said, violated, final)
-            columns = [column[members] for column in (times_ns[:, None], *numbers)]
-            stamps = np.divmod(times_ns[members, None], 10**9)
-            for place, _ in layout.violated:
-                if place not in of_violated:
-                    seconds = (np.minimum(instants_ns[:, place], times_ns) - (self.zero_ns or 0)) / 1e9
-                    since, at = np.round(seconds, 3)[:, :, None]
-                    of_violated[place] = since, round_numbers(_finite(-series[place][0, 3, :, None])), at
-                columns += [column[members] for column in of_violated[place]]
-            own_marks = np.concatenate([mark[members] for mark in marks], axis=1)
-            columns += [numbers.astype(np.float64) for numbers in stamps]
-            encoded.append((members, self._template(layout).encode(words_of(columns), own_marks)))
-        return join_in_order(encoded)
+        violated_counts = (result_codes == VIOLATED).sum(axis=0)
+        mark_columns = [codes_by_tree[entry.tree][entry.node, :, None] for entry in self._entries]
+        robustness_columns = [
+            _finite(series[entry.tree][entry.node, entry.number, :, None]) for entry in self._entries
+        ]
+        indices_and_payloads, columns_by_tree = [], dict[int, tuple[Floats, Floats, Floats]]()
+        is_listed = np.arange(len(violation_order))[:, None] < violated_counts
+        layout_keys = [
+            worst,
+            *(text_indices for _, text_indices in words),
+            *np.where(is_listed, violation_order, -1),
+        ]
+        for sample_indices in equal_places(combined_code(layout_keys, len(times_ns))):
+            first_sample = int(sample_indices[0])
+            violated_entries = tuple(
+                (tree_index, over[tree_index])
+                for tree_index in violation_order[: violated_counts[first_sample], first_sample].tolist()
+            )
+            automaton_words = tuple(texts[text_indices[first_sample]] for texts, text_indices in words)
+            layout = _Layout(int(worst[first_sample]), automaton_words, violated_entries, final)
+            columns = [column[sample_indices] for column in (times_ns[:, None], *robustness_columns)]
+            stamps = np.divmod(times_ns[sample_indices, None], 10**9)
+            for tree_index, _ in layout.violated:
+                if tree_index not in columns_by_tree:
+                    seconds = (np.minimum(instants_ns[:, tree_index], times_ns) - (self.zero_ns or 0)) / 1e9
+                    since_s, least_s = np.round(seconds, 3)[:, :, None]
+                    columns_by_tree[tree_index] = (
+                        since_s,
+                        round_numbers(_finite(-series[tree_index][0, 3, :, None])),
+                        least_s,
+                    )
+                columns += [column[sample_indices] for column in columns_by_tree[tree_index]]
+            sample_marks = np.concatenate([mark[sample_indices] for mark in mark_columns], axis=1)
+            columns += [robustness_columns.astype(np.float64) for robustness_columns in stamps]
+            indices_and_payloads.append(
+                (sample_indices, self._cached_template(layout).encode(words_of(columns), sample_marks))
+            )
+        return join_in_order(indices_and_payloads)
 
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""
         # each number that is set becomes a slot, whatever its value
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
-        for number, (title, unit, *_) in enumerate(self._entries):
-            said = words[number] if number < len(words) else ""
-            message.results.add(name=title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=said)
+        for entry_index, (title, unit, *_) in enumerate(self._entries):
+            entry_words = words[entry_index] if entry_index < len(words) else ""
+            message.results.add(
+                name=title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=entry_words
+            )
         for index, over in violated:
             name, unit = self._trees[index].title, self._units[index]
             message.violated.add(name=name, since=1.0, by=1.0, unit=unit, over=over, at=1.0)

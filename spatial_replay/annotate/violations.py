@@ -106,9 +106,9 @@ class ShadeTracker:
         self._leaves = [
             _separable(substitute(nodes[part.node], instance.bindings), part.sign) for part in parts
         ]
-        numbers = {leaf_key(leaf): index for index, leaf in enumerate(instance.program.leaves)}
+        leaf_indices = {leaf_key(leaf): index for index, leaf in enumerate(instance.program.leaves)}
         self.shades: tuple[Shade, ...] = tuple(
-            Shade(part, leaf=-1 if leaf is None else numbers[leaf_key(nodes[part.node])])
+            Shade(part, leaf=-1 if leaf is None else leaf_indices[leaf_key(nodes[part.node])])
             for part, leaf in zip(parts, self._leaves, strict=True)
         )
 
@@ -122,28 +122,32 @@ class ShadeTracker:
 
     def _extend_shade(self, shade: Shade, leaf: Quantified | None, trace: Trace, block: SeriesBlock) -> Shade:
         part = shade.requirement
-        now = part.sign * block.series[part.node, 1]
-        determined = now[~np.isnan(now)]
-        least = min(shade.least, float(determined.min(initial=math.inf)))
-        is_known = shade.is_known and len(determined) == len(now)
-        fails = np.flatnonzero(now < 0.0)
+        numbers_now = part.sign * block.series[part.node, 1]
+        known_numbers = numbers_now[~np.isnan(numbers_now)]
+        least = min(shade.least, float(known_numbers.min(initial=math.inf)))
+        is_known = shade.is_known and len(known_numbers) == len(numbers_now)
+        failing_samples = np.flatnonzero(numbers_now < 0.0)
         bound: dict[str, Floats] = {}
-        bodies, worst = tuple[Formula, ...](), np.full(len(now), -1, np.int64)
-        if leaf is not None and len(fails):
-            failing = trace.take(np.searchsorted(trace.times_ns, block.times_ns[fails]))
-            tuples, bodies, of_fails = _numbers_of(leaf, part.sign, TraceScene(failing, self._regions))
+        bodies, worst_bodies = tuple[Formula, ...](), np.full(len(numbers_now), -1, np.int64)
+        if leaf is not None and len(failing_samples):
+            failing_trace = trace.take(np.searchsorted(trace.times_ns, block.times_ns[failing_samples]))
+            bindings, bodies, failing_numbers = _numbers_of(
+                leaf, part.sign, TraceScene(failing_trace, self._regions)
+            )
             if bodies:
                 # exactly equal, because the quantifier's number is the least of these numbers
-                is_least = of_fails == now[fails]
-                worst[fails] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
-            for names, binding_numbers in zip(tuples, of_fails, strict=True):
-                for name in names:
-                    numbers = bound.setdefault(name, np.full(len(now), np.nan))
-                    numbers[fails] = np.fmin(numbers[fails], binding_numbers)
+                is_least = failing_numbers == numbers_now[failing_samples]
+                worst_bodies[failing_samples] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
+            for object_names, binding_numbers in zip(bindings, failing_numbers, strict=True):
+                for name in object_names:
+                    object_numbers = bound.setdefault(name, np.full(len(numbers_now), np.nan))
+                    object_numbers[failing_samples] = np.fmin(
+                        object_numbers[failing_samples], binding_numbers
+                    )
         least_bound = dict(shade.least_bound)
-        for name, numbers in bound.items():
-            least_bound[name] = float(np.fmin.reduce(numbers, initial=least_bound.get(name, math.inf)))
-        return Shade(part, bound, least, is_known, least_bound, shade.leaf, bodies, worst)
+        for name, object_numbers in bound.items():
+            least_bound[name] = float(np.fmin.reduce(object_numbers, initial=least_bound.get(name, math.inf)))
+        return Shade(part, bound, least, is_known, least_bound, shade.leaf, bodies, worst_bodies)
 
 
 def _separable(leaf: Formula, sign: float) -> Quantified | None:
@@ -160,24 +164,26 @@ def _numbers_of(
 
     All three are empty for more than `_MOST_BINDINGS` bindings.
     """
-    names, none = scene.candidates(leaf.group), np.empty((0, len(scene.trace)))
+    names, no_numbers = scene.candidates(leaf.group), np.empty((0, len(scene.trace)))
     if math.perm(len(names), len(leaf.variables)) > _MOST_BINDINGS:
-        return (), (), none
-    tuples = list(permutations(names, len(leaf.variables)))
-    return (tuples, *_numbers_of_bindings(leaf, sign, scene, tuples)) if tuples else ((), (), none)
+        return (), (), no_numbers
+    bindings = list(permutations(names, len(leaf.variables)))
+    return (
+        (bindings, *_numbers_of_bindings(leaf, sign, scene, bindings)) if bindings else ((), (), no_numbers)
+    )
 
 
 def _numbers_of_bindings(
-    leaf: Quantified, sign: float, scene: TraceScene, tuples: Sequence[tuple[str, ...]]
+    leaf: Quantified, sign: float, scene: TraceScene, bindings: Sequence[tuple[str, ...]]
 ) -> tuple[tuple[Formula, ...], Floats]:
     """Return a quantifier's body for each of at least one binding, and the numbers (B, T) of these."""
     bodies = tuple(
         substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, names), strict=True)))
-        for names in tuples
+        for names in bindings
     )
     values = leaf_values(scene, bodies, {})
-    low, high = low_and_high(len(values), wide=False)
-    return bodies, np.where(values[low] == values[high], sign * values[low], np.nan)
+    low_channel, high_channel = low_and_high(len(values), wide=False)
+    return bodies, np.where(values[low_channel] == values[high_channel], sign * values[low_channel], np.nan)
 
 
 class EvaluatedResult(NamedTuple):
@@ -265,11 +271,13 @@ def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, befo
         before_ns: (R,), the result for all earlier samples.
     """
     since_ns = before_ns.copy()
-    at = np.arange(len(block.times_ns))
-    for number in np.flatnonzero(since_ns == LATEST_NS).tolist():
-        certain = np.flatnonzero(~requirements[number].conjunct.is_open(block.series, at))
-        if len(certain):
-            since_ns[number] = block.times_ns[certain[0]]
+    samples = np.arange(len(block.times_ns))
+    for requirement_index in np.flatnonzero(since_ns == LATEST_NS).tolist():
+        violated_samples = np.flatnonzero(
+            ~requirements[requirement_index].conjunct.is_open(block.series, samples)
+        )
+        if len(violated_samples):
+            since_ns[requirement_index] = block.times_ns[violated_samples[0]]
     return since_ns
 
 
@@ -284,31 +292,35 @@ def worst_robustness(
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
     """
-    objects = np.full(presence.class_code.shape, np.nan)
-    places = np.full((len(presence.times_ns), len(regions)), np.nan)
+    object_robustness = np.full(presence.class_code.shape, np.nan)
+    region_robustness = np.full((len(presence.times_ns), len(regions)), np.nan)
     for result in results:
-        of = Requirement.outcome if result.is_final else Requirement.robustness
+        robustness_of = Requirement.outcome if result.is_final else Requirement.robustness
         shades = tuple(map(Shade, result.requirements)) if result.shades is None else result.shades
-        parts = result._replace(requirements=tuple(shade.requirement for shade in shades))
-        own_ns = result.block.times_ns
-        at = np.minimum(np.searchsorted(own_ns, presence.times_ns), max(len(own_ns) - 1, 0))
-        for shade, (requirement, whole) in zip(
-            shades, _robustness(parts, presence.times_ns, of), strict=False
+        shaded_result = result._replace(requirements=tuple(shade.requirement for shade in shades))
+        block_times_ns = result.block.times_ns
+        block_samples = np.minimum(
+            np.searchsorted(block_times_ns, presence.times_ns), max(len(block_times_ns) - 1, 0)
+        )
+        for shade, (requirement, part_numbers) in zip(
+            shades, _robustness(shaded_result, presence.times_ns, robustness_of), strict=False
         ):
-            now = shade.outcome(whole) if result.is_final else whole
+            numbers = shade.outcome(part_numbers) if result.is_final else part_numbers
             for column in _columns(requirement.objects, presence.names):
-                objects[:, column] = np.fmin(objects[:, column], now)
+                object_robustness[:, column] = np.fmin(object_robustness[:, column], numbers)
             for column in _columns(requirement.regions, regions):
-                places[:, column] = np.fmin(places[:, column], now)
+                region_robustness[:, column] = np.fmin(region_robustness[:, column], numbers)
             for group in requirement.groups:
-                bound = np.broadcast_to(now[:, None], objects.shape).copy()
+                member_numbers = np.broadcast_to(numbers[:, None], object_robustness.shape).copy()
                 for column, name in enumerate(presence.names):
                     if result.is_final:
-                        bound[:, column] = shade.outcome_of(name, now)
+                        member_numbers[:, column] = shade.outcome_of(name, numbers)
                     elif name in shade.bound:
-                        bound[:, column] = shade.now_of(name, now, at)
-                objects = np.where(_members(group, presence), np.fmin(objects, bound), objects)
-    return objects, places
+                        member_numbers[:, column] = shade.now_of(name, numbers, block_samples)
+                object_robustness = np.where(
+                    _members(group, presence), np.fmin(object_robustness, member_numbers), object_robustness
+                )
+    return object_robustness, region_robustness
 
 
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
@@ -326,9 +338,9 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
         samples: (S,) int64, indices of samples.
     """
     times_ns = trace.times_ns[samples]
-    which, requirement, robustness = _first(results, times_ns)
+    result_indices, requirement_indices, robustness = _first(results, times_ns)
     violations = Violations(
-        result=which,
+        result=result_indices,
         node=np.full(len(samples), -1, np.int64),
         leaf=np.full(len(samples), -1, np.int64),
         is_shown=np.zeros(len(samples), np.bool_),
@@ -341,19 +353,21 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
         atoms=[],
     )
     for index, result in enumerate(results):
-        places = np.flatnonzero(which == index)
-        if result.leaf_pairs is not None and len(places):
-            nodes = np.array([demand.node for demand in result.requirements], np.int64)
-            violations.node[places] = nodes[requirement[places]]
-            at = np.searchsorted(result.block.times_ns, times_ns[places])
-            violations.leaf[places], violations.holds[places] = _deciding(
-                result, result.leaf_pairs, requirement[places], at
+        positions = np.flatnonzero(result_indices == index)
+        if result.leaf_pairs is not None and len(positions):
+            requirement_nodes = np.array([requirement.node for requirement in result.requirements], np.int64)
+            violations.node[positions] = requirement_nodes[requirement_indices[positions]]
+            block_samples = np.searchsorted(result.block.times_ns, times_ns[positions])
+            violations.leaf[positions], violations.holds[positions] = _deciding(
+                result, result.leaf_pairs, requirement_indices[positions], block_samples
             )
-            _point_at_settling_leaf(result, times_ns, places, violations)
-            leaf = violations.leaf[places]
-            located = places[leaf >= 0]
-            violations.robustness[located] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
-            _locate(result, trace, samples, places, violations)
+            _point_at_settling_leaf(result, times_ns, positions, violations)
+            leaf_indices = violations.leaf[positions]
+            located_positions = positions[leaf_indices >= 0]
+            violations.robustness[located_positions] *= result.leaf_pairs.divisors[
+                leaf_indices[leaf_indices >= 0]
+            ]
+            _locate(result, trace, samples, positions, violations)
     return violations
 
 
@@ -366,51 +380,51 @@ def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray
     settled = result.settled
     if result.leaf_pairs is None or settled is None or settled.shown is None:
         return np.zeros(len(times_ns), np.bool_)
-    within = _requirement_of(result, settled.shown.node)
-    if within is None:
+    requirement = _requirement_of(result, settled.shown.node)
+    if requirement is None:
         return np.zeros(len(times_ns), np.bool_)
     is_after = times_ns >= settled.time_ns
-    return np.asarray(times_ns == settled.time_ns) if within.is_invariant else is_after
+    return np.asarray(times_ns == settled.time_ns) if requirement.is_invariant else is_after
 
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
     """Return the requirement that contains a node; requirements are in the order of their ids."""
-    within = [requirement for requirement in result.requirements if requirement.node <= node]
-    return within[-1] if within else None
+    candidates = [requirement for requirement in result.requirements if requirement.node <= node]
+    return candidates[-1] if candidates else None
 
 
 def _point_at_settling_leaf(
-    result: EvaluatedResult, times_ns: Integers, places: Integers, violations: Violations
+    result: EvaluatedResult, times_ns: Integers, positions: Integers, violations: Violations
 ) -> None:
     """Put the arrow at the leaf that settled the violation, in samples of `_shows_settling_leaf`."""
     if result.settled is None:
         return
-    violations.leaf[places[times_ns[places] == result.settled.time_ns]] = -1
+    violations.leaf[positions[times_ns[positions] == result.settled.time_ns]] = -1
     leaf = result.settled.shown
-    settled_places = places[_shows_settling_leaf(result, times_ns[places])]
-    if leaf is None or not len(settled_places):
+    settled_positions = positions[_shows_settling_leaf(result, times_ns[positions])]
+    if leaf is None or not len(settled_positions):
         return
-    violations.leaf[settled_places], violations.node[settled_places] = leaf.leaf, leaf.node
-    violations.robustness[settled_places] = -abs(leaf.number)
-    violations.holds[settled_places] = leaf.number > 0.0
-    violations.moment_ns[settled_places] = np.where(
-        times_ns[settled_places] == leaf.time_ns, -1, leaf.time_ns
+    violations.leaf[settled_positions], violations.node[settled_positions] = leaf.leaf, leaf.node
+    violations.robustness[settled_positions] = -abs(leaf.number)
+    violations.holds[settled_positions] = leaf.number > 0.0
+    violations.moment_ns[settled_positions] = np.where(
+        times_ns[settled_positions] == leaf.time_ns, -1, leaf.time_ns
     )
 
 
 def _robustness(
     result: EvaluatedResult,
     times_ns: Integers,
-    of: Callable[[Requirement, Floats, Integers], Floats] = Requirement.robustness,
+    robustness_of: Callable[[Requirement, Floats, Integers], Floats] = Requirement.robustness,
 ) -> Iterator[tuple[Requirement, Floats]]:
     """Yield each requirement with its robustness (S,) at some times; NaN at times without evaluation."""
-    own_ns = result.block.times_ns
-    if not len(own_ns):
+    block_times_ns = result.block.times_ns
+    if not len(block_times_ns):
         return
-    at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
-    is_evaluated = own_ns[at] == times_ns
+    block_samples = np.minimum(np.searchsorted(block_times_ns, times_ns), len(block_times_ns) - 1)
+    is_evaluated = block_times_ns[block_samples] == times_ns
     for requirement in result.requirements:
-        numbers = of(requirement, result.block.series, at)
+        numbers = robustness_of(requirement, result.block.series, block_samples)
         yield requirement, np.where(is_evaluated, numbers, np.nan)
 
 
@@ -419,99 +433,123 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
 
     A requirement with robustness -inf is skipped: no object can fulfil it, so the arrow would have no ends.
     """
-    which, place = np.full(len(times_ns), -1, np.int64), np.full(len(times_ns), -1, np.int64)
-    violated = np.full(len(times_ns), np.nan)
-    earliest = np.full(len(times_ns), LATEST_NS)
+    result_indices, requirement_indices = (
+        np.full(len(times_ns), -1, np.int64),
+        np.full(len(times_ns), -1, np.int64),
+    )
+    robustness = np.full(len(times_ns), np.nan)
+    earliest_ns = np.full(len(times_ns), LATEST_NS)
     for index, result in enumerate(results):
         if result.leaf_pairs is None:
             continue
         since_ns = (
             np.zeros(len(result.requirements), np.int64) if result.since_ns is None else result.since_ns
         )
-        is_over = np.zeros(len(times_ns), np.bool_)
+        is_settled = np.zeros(len(times_ns), np.bool_)
         if result.settled is not None:
-            is_over = times_ns >= result.settled.time_ns
-        for number, (requirement, now) in enumerate(_robustness(result, times_ns)):
+            is_settled = times_ns >= result.settled.time_ns
+        for requirement_index, (requirement, numbers) in enumerate(_robustness(result, times_ns)):
             if requirement.is_condition:
                 continue
-            is_first = (now < 0.0) & (now > -np.inf) & (since_ns[number] < earliest)
+            is_first = (numbers < 0.0) & (numbers > -np.inf) & (since_ns[requirement_index] < earliest_ns)
             if not requirement.is_invariant:
-                is_first &= ~is_over
-            which[is_first], place[is_first], violated[is_first] = index, number, now[is_first]
-            earliest[is_first] = since_ns[number]
+                is_first &= ~is_settled
+            result_indices[is_first], requirement_indices[is_first], robustness[is_first] = (
+                index,
+                requirement_index,
+                numbers[is_first],
+            )
+            earliest_ns[is_first] = since_ns[requirement_index]
         if result.settled is not None and result.settled.shown is not None:
             # a goal after its deadline may have settled the violation
-            is_first = _shows_settling_leaf(result, times_ns) & (result.settled.time_ns < earliest)
-            which[is_first], violated[is_first] = index, -abs(result.settled.shown.number)
-            earliest[is_first] = result.settled.time_ns
-    return which, place, violated
+            is_first = _shows_settling_leaf(result, times_ns) & (result.settled.time_ns < earliest_ns)
+            result_indices[is_first], robustness[is_first] = index, -abs(result.settled.shown.number)
+            earliest_ns[is_first] = result.settled.time_ns
+    return result_indices, requirement_indices, robustness
 
 
 def _deciding(
-    result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers
+    result: EvaluatedResult, pairs: LeafPairs, requirement_indices: Integers, block_samples: Integers
 ) -> tuple[Integers, NDArray[np.bool_]]:
     """Return (H,) deciding leaves of requirements (H,) in samples (H,), and whether each leaf is negated.
 
     A leaf is -1 if no leaf has the requirement's number. A negated leaf holds if its requirement fails.
     """
-    leaf, is_turned = np.full(len(at), -1, np.int64), np.zeros(len(at), np.bool_)
+    leaf_indices, is_negated = (
+        np.full(len(block_samples), -1, np.int64),
+        np.zeros(len(block_samples), np.bool_),
+    )
     leaves = result.block.leaves
-    low, high = low_and_high(len(leaves), wide=False)
-    for number in np.unique(requirement[requirement >= 0]).tolist():
-        samples = np.flatnonzero(requirement == number)
-        below, demand = pairs.below[number], result.requirements[number]
-        if not len(below.indices):
+    low_channel, high_channel = low_and_high(len(leaves), wide=False)
+    for requirement_index in np.unique(requirement_indices[requirement_indices >= 0]).tolist():
+        positions = np.flatnonzero(requirement_indices == requirement_index)
+        leaves_of_requirement, requirement = (
+            pairs.below[requirement_index],
+            result.requirements[requirement_index],
+        )
+        if not len(leaves_of_requirement.indices):
             continue  # a constant formula has no leaves
-        places = below.indices[:, None], at[samples][None, :]
-        lows, highs = leaves[low][places], leaves[high][places]
-        now = result.block.series[demand.node, 1, at[samples]]
-        is_hit = (lows == highs) & (lows * below.signs[:, None] == now)
-        first = is_hit.argmax(axis=0)
-        leaf[samples] = np.where(is_hit.any(axis=0), below.indices[first], -1)
-        is_turned[samples] = demand.sign * below.signs[first] < 0.0
-    return leaf, is_turned
+        leaves_and_samples = leaves_of_requirement.indices[:, None], block_samples[positions][None, :]
+        lows, highs = leaves[low_channel][leaves_and_samples], leaves[high_channel][leaves_and_samples]
+        requirement_numbers = result.block.series[requirement.node, 1, block_samples[positions]]
+        is_hit = (lows == highs) & (lows * leaves_of_requirement.signs[:, None] == requirement_numbers)
+        first_hits = is_hit.argmax(axis=0)
+        leaf_indices[positions] = np.where(is_hit.any(axis=0), leaves_of_requirement.indices[first_hits], -1)
+        is_negated[positions] = requirement.sign * leaves_of_requirement.signs[first_hits] < 0.0
+    return leaf_indices, is_negated
 
 
 def _locate(
-    result: EvaluatedResult, trace: Trace, samples: Integers, places: Integers, violations: Violations
+    result: EvaluatedResult, trace: Trace, samples: Integers, positions: Integers, violations: Violations
 ) -> None:
-    """Set the ends of arrows and the atoms of quantifiers at `places` (H,), whose leaves are set."""
+    """Set the ends of arrows and the atoms of quantifiers at `positions` (H,), whose leaves are set."""
     if result.leaf_pairs is None:
         return
-    is_past = violations.moment_ns[places] >= 0
-    _point_at_past(result, result.leaf_pairs, places[is_past], violations)
-    places = places[(violations.leaf[places] >= 0) & ~is_past]
-    if not len(places):
+    is_past = violations.moment_ns[positions] >= 0
+    _point_at_past(result, result.leaf_pairs, positions[is_past], violations)
+    positions = positions[(violations.leaf[positions] >= 0) & ~is_past]
+    if not len(positions):
         return
     # a trace of only these samples, which are often few, is faster to measure
-    leaf, scene = violations.leaf[places], TraceScene(trace.take(samples[places]), result.leaf_pairs.regions)
-    for index in np.unique(leaf).tolist():
-        with_leaf = np.flatnonzero(leaf == index)
-        pair = result.leaf_pairs.pairs[index]
+    leaf_indices, scene = (
+        violations.leaf[positions],
+        TraceScene(trace.take(samples[positions]), result.leaf_pairs.regions),
+    )
+    for leaf_index in np.unique(leaf_indices).tolist():
+        leaf_positions = np.flatnonzero(leaf_indices == leaf_index)
+        pair = result.leaf_pairs.pairs[leaf_index]
         if pair is not None:
-            _point_at(scene, pair, with_leaf, places[with_leaf], violations)
-        for body, members in _iter_deciding(result, result.leaf_pairs, index, scene, with_leaf):
-            of_body = pair_of(body)
-            deciding_places = with_leaf[members]
-            if of_body is not None and len(deciding_places):
-                violations.atom[places[deciding_places]] = len(violations.atoms)
-                violations.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), of_body))
-                _point_at(scene, of_body, deciding_places, places[deciding_places], violations)
+            _point_at(scene, pair, leaf_positions, positions[leaf_positions], violations)
+        for body, members in _iter_deciding(result, result.leaf_pairs, leaf_index, scene, leaf_positions):
+            body_pair = pair_of(body)
+            deciding_positions = leaf_positions[members]
+            if body_pair is not None and len(deciding_positions):
+                violations.atom[positions[deciding_positions]] = len(violations.atoms)
+                violations.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), body_pair))
+                _point_at(scene, body_pair, deciding_positions, positions[deciding_positions], violations)
 
 
 def _point_at_past(
-    result: EvaluatedResult, pairs: LeafPairs, places: Integers, violations: Violations
+    result: EvaluatedResult, pairs: LeafPairs, positions: Integers, violations: Violations
 ) -> None:
     """Set the arrow at the leaf that settled a violation in an earlier sample, with the ends at that time."""
     settled = result.settled
     pair = None if settled is None or settled.atom is None else pair_of(settled.atom)
-    if not len(places) or settled is None or settled.atom is None or settled.sample is None or pair is None:
+    if (
+        not len(positions)
+        or settled is None
+        or settled.atom is None
+        or settled.sample is None
+        or pair is None
+    ):
         return
-    violations.atom[places] = len(violations.atoms)
+    violations.atom[positions] = len(violations.atoms)
     violations.atoms.append(BoundAtom(pairs.text_of(settled.atom), pair))
-    _point_at(TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), places[:1], violations)
+    _point_at(
+        TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), positions[:1], violations
+    )
     for column in (violations.points, violations.top, violations.is_shown):
-        column[places] = column[places[0]]
+        column[positions] = column[positions[0]]
 
 
 def _iter_deciding(
@@ -525,12 +563,12 @@ def _iter_deciding(
         yield from _iter_worst(pairs.leaves[leaf], shades[0].requirement.sign, scene, samples)
         return
     # the shades are of the last block, but a final block has only its last sample
-    at = np.searchsorted(result.block.times_ns, scene.trace.times_ns[samples]) - (
+    block_samples = np.searchsorted(result.block.times_ns, scene.trace.times_ns[samples]) - (
         len(result.block.times_ns) if result.is_final else 0
     )
-    worst = shades[0].worst[at]
-    for which in np.unique(worst[worst >= 0]).tolist():
-        yield shades[0].bodies[which], np.flatnonzero(worst == which)
+    worst_bodies = shades[0].worst[block_samples]
+    for body_index in np.unique(worst_bodies[worst_bodies >= 0]).tolist():
+        yield shades[0].bodies[body_index], np.flatnonzero(worst_bodies == body_index)
 
 
 def _iter_worst(
@@ -543,41 +581,46 @@ def _iter_worst(
     if not isinstance(leaf, Quantified):
         return
     part_scene = TraceScene(scene.trace.take(samples), scene.regions)
-    tuples = permutations(part_scene.candidates(leaf.group), len(leaf.variables))
-    least, bodies = np.full(len(samples), np.inf), dict[int, Formula]()
-    worst = np.full(len(samples), -1, np.int64)
-    begin = 0
-    while some := list(islice(tuples, _MOST_BINDINGS)):
-        of_some, numbers = _numbers_of_bindings(leaf, sign, part_scene, some)
+    bindings = permutations(part_scene.candidates(leaf.group), len(leaf.variables))
+    least_numbers, bodies = np.full(len(samples), np.inf), dict[int, Formula]()
+    worst_indices = np.full(len(samples), -1, np.int64)
+    first_index = 0
+    while next_bindings := list(islice(bindings, _MOST_BINDINGS)):
+        next_bodies, numbers = _numbers_of_bindings(leaf, sign, part_scene, next_bindings)
         numbers = np.where(np.isnan(numbers), np.inf, numbers)
-        is_less = numbers.min(axis=0) < least
-        worst[is_less] = begin + numbers.argmin(axis=0)[is_less]
-        least = np.minimum(least, numbers.min(axis=0))
-        bodies |= {begin + place: of_some[place] for place in set((worst[is_less] - begin).tolist())}
-        begin += len(some)
-    for which in np.unique(worst[worst >= 0]).tolist():
-        yield bodies[which], np.flatnonzero(worst == which)
+        is_less = numbers.min(axis=0) < least_numbers
+        worst_indices[is_less] = first_index + numbers.argmin(axis=0)[is_less]
+        least_numbers = np.minimum(least_numbers, numbers.min(axis=0))
+        bodies |= {
+            first_index + index: next_bodies[index]
+            for index in set((worst_indices[is_less] - first_index).tolist())
+        }
+        first_index += len(next_bindings)
+    for binding_index in np.unique(worst_indices[worst_indices >= 0]).tolist():
+        yield bodies[binding_index], np.flatnonzero(worst_indices == binding_index)
 
 
 def _point_at(
-    scene: TraceScene, pair: Pair, samples: Integers, places: Integers, violations: Violations
+    scene: TraceScene, pair: Pair, samples: Integers, positions: Integers, violations: Violations
 ) -> None:
-    """Set the ends of the arrows at `places`, measured between the pair in some samples of a scene."""
+    """Set the ends of the arrows at `positions`, measured between the pair in some samples of a scene."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
-    first, second = (Operand(operand.rows[samples], operand.enlargement) for operand in operands)
-    numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
-    violations.points[places] = numbers[:, :4].reshape(-1, 2, 2)
-    violations.top[places] = numbers[:, 5]
-    violations.is_shown[places] = np.isfinite(numbers[:, :5]).all(axis=1)
+    first_operand, second_operand = (
+        Operand(operand.rows[samples], operand.enlargement) for operand in operands
+    )
+    contact_columns = contacts(scene.batch, first_operand, second_operand, is_protrusion=pair.is_protrusion)
+    violations.points[positions] = contact_columns[:, :4].reshape(-1, 2, 2)
+    violations.top[positions] = contact_columns[:, 5]
+    violations.is_shown[positions] = np.isfinite(contact_columns[:, :5]).all(axis=1)
 
 
-def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:
-    return [column for column, name in enumerate(names) if name in chosen]
+def _columns(selected_names: frozenset[str], names: Sequence[str]) -> list[int]:
+    return [column for column, name in enumerate(names) if name in selected_names]
 
 
 def _members(group: ClassMembers, presence: Presence) -> NDArray[np.bool_]:
     """Return (S, objects), whether each object belongs to an open group in each sample."""
-    fits = [group.class_name in (ANY_CLASS, (name or "").casefold()) for name in presence.classes]
-    included = np.array([name not in group.excluded for name in presence.names], np.bool_)
+    is_class_member = [group.class_name in (ANY_CLASS, (name or "").casefold()) for name in presence.classes]
+    is_included = np.array([name not in group.excluded for name in presence.names], np.bool_)
     # the class code -1 of absent objects indexes the last entry
-    return np.array([*fits, False], np.bool_)[presence.class_code] & included
+    return np.array([*is_class_member, False], np.bool_)[presence.class_code] & is_included

@@ -31,8 +31,8 @@ class SceneBounds(NamedTuple):
     @classmethod
     def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
         """Return the box of some samples joined with the box before; None without any footprint."""
-        low, high = _finite_boxes(trace.footprints.select(trace.rows[trace.rows >= 0]))
-        box = cls(*low.min(axis=0, initial=np.inf).tolist(), *high.max(axis=0, initial=-np.inf).tolist())
+        lows, highs = _finite_boxes(trace.footprints.select(trace.rows[trace.rows >= 0]))
+        box = cls(*lows.min(axis=0, initial=np.inf).tolist(), *highs.max(axis=0, initial=-np.inf).tolist())
         if not np.isfinite(box).all():
             return before
         return box if before is None else before.with_points(np.reshape(box, (2, 2)))
@@ -75,14 +75,14 @@ class SceneExtent(NamedTuple):
     def after(self, trace: Trace, regions: Floats | None = None) -> SceneExtent:
         """Return the extent after the next samples; see `grow`."""
         if not self.size:
-            first = self.grow(trace.slice(0, 1), regions)[0]
-            return first.after(trace, regions) if first.size else self.grow(trace, regions)[0]
+            first_extent = self.grow(trace.slice(0, 1), regions)[0]
+            return first_extent.after(trace, regions) if first_extent.size else self.grow(trace, regions)[0]
         bounds = SceneBounds.of(trace, self.bounds)
         if bounds is None or bounds == self.bounds:
             return self
         xmin, ymin, xmax, ymax = _with_regions(np.array(bounds), regions).tolist()
-        side = np.array([max(xmax - xmin, ymax - ymin)])
-        return SceneExtent(bounds, float(_in_steps(side, self.size)[0]))
+        sides = np.array([max(xmax - xmin, ymax - ymin)])
+        return SceneExtent(bounds, float(_in_steps(sides, self.size)[0]))
 
     def grow(self, trace: Trace, regions: Floats | None = None) -> tuple[SceneExtent, Floats, Floats]:
         """Return the extent after T samples, and the running extent at each sample.
@@ -97,19 +97,23 @@ class SceneExtent(NamedTuple):
         if self.size and self.bounds is not None and self.bounds.contains(trace.footprints):
             corners = np.reshape(_with_regions(np.array(self.bounds), regions), (1, 2, 2))
             return self, np.repeat(corners, len(trace), axis=0), np.full(len(trace), self.size)
-        low, high = _finite_boxes(trace.footprints)
-        before = np.array(self.bounds or (np.inf, np.inf, -np.inf, -np.inf))
+        box_lows, box_highs = _finite_boxes(trace.footprints)
+        earlier_corners = np.array(self.bounds or (np.inf, np.inf, -np.inf, -np.inf))
         # the row -1 of an absent object indexes the appended empty box
-        lows = np.append(low, [[np.inf, np.inf]], axis=0)[trace.rows].min(axis=1, initial=np.inf)
-        highs = np.append(high, [[-np.inf, -np.inf]], axis=0)[trace.rows].max(axis=1, initial=-np.inf)
-        lows = np.minimum(np.minimum.accumulate(lows), before[:2])
-        highs = np.maximum(np.maximum.accumulate(highs), before[2:])
-        if not len(trace) or not np.isfinite(lows[-1]).all():
-            corners = np.repeat(np.reshape(before, (1, 2, 2)), len(trace), axis=0)
+        running_lows = np.append(box_lows, [[np.inf, np.inf]], axis=0)[trace.rows].min(axis=1, initial=np.inf)
+        running_highs = np.append(box_highs, [[-np.inf, -np.inf]], axis=0)[trace.rows].max(
+            axis=1, initial=-np.inf
+        )
+        running_lows = np.minimum(np.minimum.accumulate(running_lows), earlier_corners[:2])
+        running_highs = np.maximum(np.maximum.accumulate(running_highs), earlier_corners[2:])
+        if not len(trace) or not np.isfinite(running_lows[-1]).all():
+            corners = np.repeat(np.reshape(earlier_corners, (1, 2, 2)), len(trace), axis=0)
             return self, corners, np.full(len(trace), self.size)
-        bounds = SceneBounds(*lows[-1].tolist(), *highs[-1].tolist())
-        corners = _with_regions(np.concatenate([lows, highs], axis=1), regions).reshape(-1, 2, 2)
-        is_empty = ~np.isfinite(lows).all(axis=1)
+        bounds = SceneBounds(*running_lows[-1].tolist(), *running_highs[-1].tolist())
+        corners = _with_regions(np.concatenate([running_lows, running_highs], axis=1), regions).reshape(
+            -1, 2, 2
+        )
+        is_empty = ~np.isfinite(running_lows).all(axis=1)
         sides = np.where(is_empty, 0.0, (corners[:, 1] - corners[:, 0]).max(axis=1))
         sizes = _in_steps(sides, self.size)
         return SceneExtent(bounds, float(sizes[-1])), corners, sizes
@@ -128,19 +132,19 @@ def _with_regions(corners: Floats, regions: Floats | None) -> Floats:
     """Return boxes (..., 4) enlarged to contain the corners of regions."""
     if regions is None or not len(regions):
         return corners
-    low = np.minimum(corners[..., :2], regions.min(axis=0))
-    high = np.maximum(corners[..., 2:], regions.max(axis=0))
-    return np.concatenate([low, high], axis=-1)
+    lows = np.minimum(corners[..., :2], regions.min(axis=0))
+    highs = np.maximum(corners[..., 2:], regions.max(axis=0))
+    return np.concatenate([lows, highs], axis=-1)
 
 
 def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
     """Return the low and high corners of the boxes of footprints, (R, 2) each; infinite for NaN corners."""
-    start = footprints.vertex_start[footprints.part_start]
-    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
-    low = boxes(footprints.vertices - radius, start)[0]
-    high = boxes(footprints.vertices + radius, start)[1]
-    is_finite = np.isfinite(low).all(axis=1, keepdims=True) & np.isfinite(high).all(axis=1, keepdims=True)
-    return np.where(is_finite, low, np.inf), np.where(is_finite, high, -np.inf)
+    vertex_starts = footprints.vertex_start[footprints.part_start]
+    radii = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    lows = boxes(footprints.vertices - radii, vertex_starts)[0]
+    highs = boxes(footprints.vertices + radii, vertex_starts)[1]
+    is_finite = np.isfinite(lows).all(axis=1, keepdims=True) & np.isfinite(highs).all(axis=1, keepdims=True)
+    return np.where(is_finite, lows, np.inf), np.where(is_finite, highs, -np.inf)
 
 
 def _in_steps(sides: Floats, size: float) -> Floats:
@@ -149,14 +153,14 @@ def _in_steps(sides: Floats, size: float) -> Floats:
     Args:
         size: size after the samples before; 0 before any.
     """
-    sizes, place = np.empty(len(sides)), 0
-    while place < len(sides):
-        end = max(int(np.searchsorted(sides, size, side="right")), place)
-        sizes[place:end] = size
+    sizes, position = np.empty(len(sides)), 0
+    while position < len(sides):
+        end = max(int(np.searchsorted(sides, size, side="right")), position)
+        sizes[position:end] = size
         if end < len(sides):
             # repeated products, unlike a power, give the same bits for every cut into blocks
             size = size or float(sides[end])
             while size < sides[end]:
                 size *= _STEP
-        place = end
+        position = end
     return sizes

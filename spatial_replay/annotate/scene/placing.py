@@ -69,12 +69,13 @@ def place_names(low: Floats, high: Floats, letters: Floats, around: Surroundings
         around: surroundings, whose last N blocked boxes receive the boxes of the names.
     """
     middles = np.empty(low.shape)
-    for number in range(len(low)):
-        half = half_sizes(letters[number], around.line)
-        box = low[number], high[number]
-        middles[number] = _place(half, box, box, around, _NAME_PLACES)
-        place = number - len(low)
-        around.blocked[0][place], around.blocked[1][place] = middles[number] - half, middles[number] + half
+    for name_index in range(len(low)):
+        half_size = half_sizes(letters[name_index], around.line)
+        box = low[name_index], high[name_index]
+        middles[name_index] = _place(half_size, box, box, around, _NAME_PLACES)
+        blocked_index = name_index - len(low)
+        around.blocked[0][blocked_index] = middles[name_index] - half_size
+        around.blocked[1][blocked_index] = middles[name_index] + half_size
     return middles
 
 
@@ -93,26 +94,35 @@ def free_names(
         around: the view; its boxes are ignored.
     """
     middles = middles.copy()
-    halves = np.stack([half_sizes(length * np.ones_like(around.line), around.line) for length in letters])
-    for number in np.flatnonzero(movable.any(axis=1)).tolist():
-        rest = np.flatnonzero(np.arange(len(middles)) != number)
-        low = np.concatenate([boxes[0][rest], (middles - halves)[rest]])
-        high = np.concatenate([boxes[1][rest], (middles + halves)[rest]])
-        named, half = (boxes[0][number], boxes[1][number]), halves[number]
-        is_background = ((low <= named[0]) & (named[1] <= high)).all(axis=1)
-        covers = _overlaps(middles[number] - half, middles[number] + half, (low, high)) & ~is_background
-        places = np.flatnonzero(covers.any(axis=0) & movable[number])
-        if not len(places):
-            continue
-        named, half = _part(named, places), half.take(places, axis=-1)
-        others = _part((np.where(is_background[:, None], np.nan, low), high), places)
-        nothing = np.empty((0, 2, len(places))), np.empty((0, 2, len(places)))
-        near = Surroundings(
-            nothing, others, _part(around.scene, places), around.margin[places], around.line[places]
+    name_half_sizes = np.stack(
+        [half_sizes(length * np.ones_like(around.line), around.line) for length in letters]
+    )
+    for name_index in np.flatnonzero(movable.any(axis=1)).tolist():
+        other_indices = np.flatnonzero(np.arange(len(middles)) != name_index)
+        lows = np.concatenate([boxes[0][other_indices], (middles - name_half_sizes)[other_indices]])
+        highs = np.concatenate([boxes[1][other_indices], (middles + name_half_sizes)[other_indices]])
+        object_box, half_size = (boxes[0][name_index], boxes[1][name_index]), name_half_sizes[name_index]
+        is_background = ((lows <= object_box[0]) & (object_box[1] <= highs)).all(axis=1)
+        covers = (
+            _overlaps(middles[name_index] - half_size, middles[name_index] + half_size, (lows, highs))
+            & ~is_background
         )
-        moved = _place(half, named, named, near, _NAME_PLACES)
-        is_free = ~_is_covered(moved - half, moved + half, others)
-        middles[number][:, places[is_free]] = moved[:, is_free]
+        scene_indices = np.flatnonzero(covers.any(axis=0) & movable[name_index])
+        if not len(scene_indices):
+            continue
+        object_box, half_size = _part(object_box, scene_indices), half_size.take(scene_indices, axis=-1)
+        other_boxes = _part((np.where(is_background[:, None], np.nan, lows), highs), scene_indices)
+        no_boxes = np.empty((0, 2, len(scene_indices))), np.empty((0, 2, len(scene_indices)))
+        surroundings = Surroundings(
+            no_boxes,
+            other_boxes,
+            _part(around.scene, scene_indices),
+            around.margin[scene_indices],
+            around.line[scene_indices],
+        )
+        moved_centres = _place(half_size, object_box, object_box, surroundings, _NAME_PLACES)
+        is_free = ~_is_covered(moved_centres - half_size, moved_centres + half_size, other_boxes)
+        middles[name_index][:, scene_indices[is_free]] = moved_centres[:, is_free]
     return middles
 
 
@@ -125,8 +135,8 @@ def place_labels(letters: Floats, arrow: Box, around: Surroundings) -> Floats:
         letters: (K,), lengths of the labels.
         arrow: box of the arrow.
     """
-    nearest = np.fmin.reduce(around.blocked[0], axis=0), np.fmax.reduce(around.blocked[1], axis=0)
-    return _place(half_sizes(letters, around.line), nearest, arrow, around, _LABEL_PLACES)
+    blocked_box = np.fmin.reduce(around.blocked[0], axis=0), np.fmax.reduce(around.blocked[1], axis=0)
+    return _place(half_sizes(letters, around.line), blocked_box, arrow, around, _LABEL_PLACES)
 
 
 def half_sizes(letters: Floats, line: Floats) -> Floats:
@@ -134,38 +144,39 @@ def half_sizes(letters: Floats, line: Floats) -> Floats:
     return np.stack([LETTER * letters * line / 2.0, line / 2.0])
 
 
-def _place(half: Floats, nearest: Box, arrow: Box, around: Surroundings, most: int) -> Floats:
+def _place(half_size: Floats, nearest: Box, arrow: Box, around: Surroundings, candidate_count: int) -> Floats:
     """Return the centres (2, K) of one text in each of K scenes, at the first position of the best rank.
 
     A text covers other objects only if all positions in the view do. It leaves the view only if all
     positions in the view cover a blocked box.
 
     Args:
-        half: half the sizes of the texts.
+        half_size: half the sizes of the texts.
         nearest: box next to which the text is placed.
         arrow: box for positions without room next to `nearest`.
-        most: number of candidate positions.
+        candidate_count: number of candidate positions.
     """
-    centres, ranks = np.empty(half.shape), np.full(half.shape[1], _NOWHERE)
-    left, of_left = np.arange(half.shape[1]), _Text(half, nearest, arrow, around)
-    for number in range(most):
-        places, is_possible = _candidate(number, of_left)
+    centres, best_ranks = np.empty(half_size.shape), np.full(half_size.shape[1], _NOWHERE)
+    open_scenes, open_text = np.arange(half_size.shape[1]), _Text(half_size, nearest, arrow, around)
+    for candidate_index in range(candidate_count):
+        candidate_centres, is_possible = _candidate(candidate_index, open_text)
         if not is_possible.any():
             continue
-        rank = np.where(is_possible, _ranks(places, of_left), _NOWHERE)
-        is_better = rank < ranks[left]
-        better = left[is_better]
-        centres[:, better], ranks[better] = places[:, is_better], rank[is_better]
-        waiting = np.flatnonzero(ranks[left] > 0)
-        if not len(waiting):
+        candidate_ranks = np.where(is_possible, _ranks(candidate_centres, open_text), _NOWHERE)
+        is_better = candidate_ranks < best_ranks[open_scenes]
+        better_scenes = open_scenes[is_better]
+        centres[:, better_scenes] = candidate_centres[:, is_better]
+        best_ranks[better_scenes] = candidate_ranks[is_better]
+        waiting_indices = np.flatnonzero(best_ranks[open_scenes] > 0)
+        if not len(waiting_indices):
             return centres
-        if len(waiting) < _FEW * len(left):
-            left, of_left = left[waiting], of_left.of_scenes(waiting)
-    nowhere = ranks == _NOWHERE
-    if nowhere.any():
-        top = np.fmax.reduce(around.blocked[1][:, 1, nowhere], axis=0)
-        above = top + half[1, nowhere] + _GAP * around.line[nowhere]
-        centres[:, nowhere] = (nearest[0][0] + nearest[1][0])[nowhere] / 2.0, above
+        if len(waiting_indices) < _FEW * len(open_scenes):
+            open_scenes, open_text = open_scenes[waiting_indices], open_text.of_scenes(waiting_indices)
+    is_nowhere = best_ranks == _NOWHERE
+    if is_nowhere.any():
+        top = np.fmax.reduce(around.blocked[1][:, 1, is_nowhere], axis=0)
+        above = top + half_size[1, is_nowhere] + _GAP * around.line[is_nowhere]
+        centres[:, is_nowhere] = (nearest[0][0] + nearest[1][0])[is_nowhere] / 2.0, above
     return centres
 
 
@@ -187,51 +198,51 @@ class _Text(NamedTuple):
         )
 
 
-def _part(box: Box, places: Integers) -> Box:
-    return box[0].take(places, axis=-1), box[1].take(places, axis=-1)
+def _part(box: Box, scene_indices: Integers) -> Box:
+    return box[0].take(scene_indices, axis=-1), box[1].take(scene_indices, axis=-1)
 
 
-def _ranks(places: Floats, text: _Text) -> Integers:
+def _ranks(centres: Floats, text: _Text) -> Integers:
     """Return (K,), the ranks of positions (2, K) of texts; see `_NOWHERE`."""
     half, around = text.half, text.around
-    begin, end = places - half, places + half
-    centre = (around.scene[0][1] + around.scene[1][1]) / 2.0
-    is_outside = np.abs(places[1] - centre) > around.margin - half[1]
-    ranks = _is_covered(begin, end, around.others) + 2 * is_outside
-    ranks[_is_covered(begin, end, around.blocked)] = _NOWHERE
+    lows, highs = centres - half, centres + half
+    view_centre = (around.scene[0][1] + around.scene[1][1]) / 2.0
+    is_outside = np.abs(centres[1] - view_centre) > around.margin - half[1]
+    ranks = _is_covered(lows, highs, around.others) + 2 * is_outside
+    ranks[_is_covered(lows, highs, around.blocked)] = _NOWHERE
     return np.asarray(ranks)
 
 
-def _is_covered(begin: Floats, end: Floats, boxes: Box) -> Booleans:
-    """Return (K,), whether texts with corners `begin` and `end` (2, K) cover any of the boxes (B, 2, K)."""
-    return np.asarray(_overlaps(begin, end, boxes).any(axis=0))
+def _is_covered(lows: Floats, highs: Floats, boxes: Box) -> Booleans:
+    """Return (K,), whether texts with corners `lows` and `highs` (2, K) cover any of the boxes (B, 2, K)."""
+    return np.asarray(_overlaps(lows, highs, boxes).any(axis=0))
 
 
-def _overlaps(begin: Floats, end: Floats, boxes: Box) -> Booleans:
-    """Return (B, K), whether the texts with corners `begin` and `end` (2, K) cover each box (B, 2, K)."""
-    low, high = boxes
-    covers = (begin[1] < high[:, 1]) & (low[:, 1] < end[1])
-    covers &= (begin[0] < high[:, 0]) & (low[:, 0] < end[0])
+def _overlaps(lows: Floats, highs: Floats, boxes: Box) -> Booleans:
+    """Return (B, K), whether the texts with corners `lows` and `highs` (2, K) cover each box (B, 2, K)."""
+    box_lows, box_highs = boxes
+    covers = (lows[1] < box_highs[:, 1]) & (box_lows[:, 1] < highs[1])
+    covers &= (lows[0] < box_highs[:, 0]) & (box_lows[:, 0] < highs[0])
     return np.asarray(covers)
 
 
-def _candidate(number: int, text: _Text) -> tuple[Floats, Booleans]:
+def _candidate(candidate_index: int, text: _Text) -> tuple[Floats, Booleans]:
     """Return a candidate position (2, K) for each text by its number, and (K,) whether it is possible."""
     half, nearest, arrow, around = text
-    gap, centre = _GAP * around.line, (around.scene[0][0] + around.scene[1][0]) / 2.0
+    gap, view_centre = _GAP * around.line, (around.scene[0][0] + around.scene[1][0]) / 2.0
     reach = np.maximum(around.margin - half[0], 0.0)
-    if number < 2 * len(_SIDES):
-        low, high = nearest if number < len(_SIDES) else arrow
-        side = _SIDES[number % len(_SIDES)]
-        places = (low + high) / 2.0 + side[:, None] * ((high - low) / 2.0 + half + gap)
+    if candidate_index < 2 * len(_SIDES):
+        low, high = nearest if candidate_index < len(_SIDES) else arrow
+        side = _SIDES[candidate_index % len(_SIDES)]
+        centres = (low + high) / 2.0 + side[:, None] * ((high - low) / 2.0 + half + gap)
         if side[0]:
-            return places, np.abs(places[0] - centre) <= reach
+            return centres, np.abs(centres[0] - view_centre) <= reach
     else:
-        far, is_below = divmod(number - 2 * len(_SIDES), 2)
-        low, high = nearest if far < len(_FAR) else around.scene
-        distance = half[1] + gap + (*_FAR, 0.0, *_FAR)[far] * around.line
-        places = np.stack(
+        distance_index, is_below = divmod(candidate_index - 2 * len(_SIDES), 2)
+        low, high = nearest if distance_index < len(_FAR) else around.scene
+        distance = half[1] + gap + (*_FAR, 0.0, *_FAR)[distance_index] * around.line
+        centres = np.stack(
             [(arrow[0] + arrow[1])[0] / 2.0, low[1] - distance if is_below else high[1] + distance]
         )
-    places[0] = np.clip(places[0], centre - reach, centre + reach)
-    return places, np.ones(len(reach), np.bool_)
+    centres[0] = np.clip(centres[0], view_centre - reach, view_centre + reach)
+    return centres, np.ones(len(reach), np.bool_)

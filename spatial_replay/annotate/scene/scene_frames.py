@@ -37,12 +37,12 @@ def failed_objects(
     results: Sequence[EvaluatedResult], names: Sequence[str], times_ns: Integers
 ) -> NDArray[np.bool_]:
     """Return (S, objects), whether an atom that settled a violation so far names the object."""
-    failed = np.zeros((len(times_ns), len(names)), np.bool_)
+    has_failed = np.zeros((len(times_ns), len(names)), np.bool_)
     for settled in [result.settled for result in results if result.settled is not None]:
         for name in settled.objects:
             if name in names:
-                failed[times_ns >= settled.time_ns, names.index(name)] = True
-    return failed
+                has_failed[times_ns >= settled.time_ns, names.index(name)] = True
+    return has_failed
 
 
 def labelled_objects(
@@ -63,8 +63,8 @@ def labelled_objects(
     urgency = np.where(robustness < 0.0, robustness, np.where(is_named, 0.0, np.inf))
     urgency[~is_present] = np.inf
     # sorting the order gives the rank of each object
-    rank = np.argsort(np.argsort(urgency, axis=1, kind="stable"), axis=1, kind="stable")
-    is_chosen = (urgency < np.inf) & (rank < _MOST_LABELS)
+    ranks = np.argsort(np.argsort(urgency, axis=1, kind="stable"), axis=1, kind="stable")
+    is_chosen = (urgency < np.inf) & (ranks < _MOST_LABELS)
     return np.asarray(np.where(is_crowded[:, None], is_chosen, True))
 
 
@@ -111,29 +111,29 @@ def arrow_texts(
         first_ns: zero of times in texts.
         unit: unit of lengths.
     """
-    messages = np.flatnonzero(found.is_shown)
-    robustness = np.where(found.holds, -found.robustness, found.robustness)[messages].tolist()
-    texts = [with_unit(number, unit).encode() for number in robustness]
-    lengths = np.fromiter(map(len, texts), np.int64, len(texts))
-    of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
-    columns = [column[messages] for column in of]
-    causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
-    for places in equal_places(combined_code([*columns, lengths], len(messages))):
-        cause[messages[places]] = len(causes)
-        result, leaf, holds, moment_ns, atom = (int(column[places[0]]) for column in columns)
+    arrow_messages = np.flatnonzero(found.is_shown)
+    robustness = np.where(found.holds, -found.robustness, found.robustness)[arrow_messages].tolist()
+    number_texts = [with_unit(number, unit).encode() for number in robustness]
+    text_lengths = np.fromiter(map(len, number_texts), np.int64, len(number_texts))
+    violation_columns = found.result, found.leaf, found.holds, found.moment_ns, found.atom
+    columns = [column[arrow_messages] for column in violation_columns]
+    causes, cause_indices = list[CauseText](), np.zeros(len(found.result), np.int64)
+    for arrow_indices in equal_places(combined_code([*columns, text_lengths], len(arrow_messages))):
+        cause_indices[arrow_messages[arrow_indices]] = len(causes)
+        result, leaf, holds, moment_ns, atom = (int(column[arrow_indices[0]]) for column in columns)
         pairs = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text, pair = ("", None) if pairs is None else (pairs.texts[leaf], pairs.pairs[leaf])
         if atom >= 0:
             text, pair = found.atoms[atom]
-        at = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        said = f"{cut(text, _LONGEST_CAUSE)}{at}: {'must not hold, holds by ' if holds else ''}"
+        time_text = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
+        cause_text = f"{cut(text, _LONGEST_CAUSE)}{time_text}: {'must not hold, holds by ' if holds else ''}"
         dashes = () if moment_ns < 0 else _outlines_then(results[result].settled)
         names = () if pair is None else pair.names
-        causes.append(CauseText(said, int(lengths[places[0]]), dashes, names))
-    numbers = [b""] * len(found.result)
-    for index, number in zip(messages.tolist(), texts, strict=True):
-        numbers[index] = number
-    return ArrowTexts(tuple(causes), cause, numbers)
+        causes.append(CauseText(cause_text, int(text_lengths[arrow_indices[0]]), dashes, names))
+    encoded_numbers = [b""] * len(found.result)
+    for index, number in zip(arrow_messages.tolist(), number_texts, strict=True):
+        encoded_numbers[index] = number
+    return ArrowTexts(tuple(causes), cause_indices, encoded_numbers)
 
 
 def _outlines_then(settled: SettledViolation | None) -> tuple[float, ...]:
@@ -162,7 +162,7 @@ _OPACITY: Final = 0.6
 
 
 _MAP_PLACES: Final = tuple(np.linspace(-1.0, 1.0, len(MAP)).tolist())
-_MAP_COLOURS: Final = tuple(zip(*(bytes.fromhex(each[1:]) for each in MAP), strict=True))
+_MAP_COLOURS: Final = tuple(zip(*(bytes.fromhex(colour[1:]) for colour in MAP), strict=True))
 """Positions of a map's colours from -1, the worst, to 1, the best, and their red, green and blue."""
 
 
@@ -173,11 +173,11 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
         scale: positive, in the unit of the robustness; a number, or an array that broadcasts with it.
     """
     values = np.asarray(robustness, np.float64)
-    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / scale, 1.0)
-    share = np.where(np.isnan(values), 0.0, share)
-    mixed = _FROM_GREY[(values >= 0.0).astype(np.intp)] * share[..., None] + NEUTRAL
+    shares = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / scale, 1.0)
+    shares = np.where(np.isnan(values), 0.0, shares)
+    mixed_colours = _FROM_GREY[(values >= 0.0).astype(np.intp)] * shares[..., None] + NEUTRAL
     # rounded to 8 bits: finer steps are invisible and compress badly
-    return np.asarray(np.round(mixed * 255.0) / 255.0)
+    return np.asarray(np.round(mixed_colours * 255.0) / 255.0)
 
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
@@ -190,8 +190,8 @@ def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
 def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
     """Return the colours (..., 4) of cells (...) on a map that is white at 0, transparent where NaN."""
     largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0)) or 1.0
-    places = np.clip(np.nan_to_num(robustness) / largest, -1.0, 1.0)
-    shares = [np.interp(places, _MAP_PLACES, column) for column in _MAP_COLOURS]
+    map_positions = np.clip(np.nan_to_num(robustness) / largest, -1.0, 1.0)
+    shares = [np.interp(map_positions, _MAP_PLACES, column) for column in _MAP_COLOURS]
     opacity = np.where(np.isnan(robustness), 0.0, 255.0 * _OPACITY)
     return np.asarray(np.round(np.stack([*shares, opacity], axis=-1)), np.uint8)
 
@@ -289,7 +289,7 @@ class Arrows(NamedTuple):
         node, leaf, atom = (
             int(column[index]) for column in (violations.node, violations.leaf, violations.atom)
         )
-        of = (
+        violation_fields = (
             self.result,
             node,
             robustness,
@@ -299,7 +299,9 @@ class Arrows(NamedTuple):
             violations.atoms[atom].text if atom >= 0 else "",
         )
         cause = self.texts.causes[self.texts.cause[index]]
-        return DrawnViolation(violations.points[index], label, *of, cause.dashes, entity_ids(cause.names))
+        return DrawnViolation(
+            violations.points[index], label, *violation_fields, cause.dashes, entity_ids(cause.names)
+        )
 
 
 class SceneFrame(NamedTuple):
@@ -357,25 +359,29 @@ class SceneFrames:
 
     def frame(self, index: int) -> SceneFrame:
         """Return the content of a chosen message."""
-        messages, arrows, of_objects, of_regions = self._details
-        place = int(np.searchsorted(messages, index))
+        messages, arrows, object_shades, region_shades = self._details
+        chosen_index = int(np.searchsorted(messages, index))
         entities = {
             REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour), shades.tobytes())
             for region, colour, shades in zip(
-                self._regions, self.region_colours[index], of_regions[place], strict=True
+                self._regions, self.region_colours[index], region_shades[chosen_index], strict=True
             )
         }
         content = self._content
         for column, name in enumerate(content.names):
-            last = int(content.missing[index, column])
-            if content.forms[index, column] < FIRST_FORM and last < 0:
+            outline_index = int(content.missing[index, column])
+            if content.forms[index, column] < FIRST_FORM and outline_index < 0:
                 continue
-            row = int(content.observations[index, column])
-            rings = content.last.rings[last] if last >= 0 else content.rings.rings_of(row)
+            observation = int(content.observations[index, column])
+            rings = (
+                content.last.rings[outline_index]
+                if outline_index >= 0
+                else content.rings.rings_of(observation)
+            )
             colour = _bytes(self.object_colours[index, column])
-            shade = of_objects[place, column].tobytes()
-            entities[OBJECT + name] = DrawnEntity(rings, colour, shade, last >= 0)
-        return SceneFrame(entities, arrows, place)
+            result_shades = object_shades[chosen_index, column].tobytes()
+            entities[OBJECT + name] = DrawnEntity(rings, colour, result_shades, outline_index >= 0)
+        return SceneFrame(entities, arrows, chosen_index)
 
 
 class SceneContent(NamedTuple):

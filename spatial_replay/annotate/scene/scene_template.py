@@ -98,25 +98,27 @@ class Form(NamedTuple):
 
 def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
     """Return the rings of footprints. A point without radius becomes a disc of `point_radius`."""
-    counts = np.diff(footprints.vertex_start)
-    is_round = (counts == 1) | (footprints.radius > 0.0)
-    lengths = np.where(is_round, ROUND, counts)
-    part_start = starts_from_counts(lengths)
-    form, forms = _forms(footprints, lengths)
+    vertex_counts = np.diff(footprints.vertex_start)
+    is_round = (vertex_counts == 1) | (footprints.radius > 0.0)
+    ring_lengths = np.where(is_round, ROUND, vertex_counts)
+    part_start = starts_from_counts(ring_lengths)
+    form_indices, forms = _forms(footprints, ring_lengths)
     if not is_round.any():
         corners = footprints.vertices[footprints.vertex_start[0] : footprints.vertex_start[-1]]
-        return Rings(part_start[footprints.part_start], corners, form, forms, False)
+        return Rings(part_start[footprints.part_start], corners, form_indices, forms, False)
     points = np.empty((part_start[-1], 2))
-    straight = ~is_round
-    points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
-        flat_index(footprints.vertex_start[:-1][straight], counts[straight])
+    is_straight = ~is_round
+    points[flat_index(part_start[:-1][is_straight], vertex_counts[is_straight])] = footprints.vertices[
+        flat_index(footprints.vertex_start[:-1][is_straight], vertex_counts[is_straight])
     ]
-    for count in np.unique(counts[is_round]).tolist():
-        parts = np.flatnonzero(is_round & (counts == count))
-        corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
-        radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
-        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded_rings(corners, radius)
-    return Rings(part_start[footprints.part_start], points, form, forms, True)
+    for vertex_count in np.unique(vertex_counts[is_round]).tolist():
+        part_indices = np.flatnonzero(is_round & (vertex_counts == vertex_count))
+        corners = footprints.vertices[
+            footprints.vertex_start[part_indices][:, None] + np.arange(vertex_count)
+        ]
+        radii = np.where(footprints.radius[part_indices] > 0.0, footprints.radius[part_indices], point_radius)
+        points[part_start[part_indices][:, None] + np.arange(ROUND)] = _rounded_rings(corners, radii)
+    return Rings(part_start[footprints.part_start], points, form_indices, forms, True)
 
 
 def outlines_of(footprint: Footprint) -> list[Floats]:
@@ -128,9 +130,12 @@ def extents(footprints: FootprintBatch) -> Floats:
     """Return (R,) the longer side of each footprint's bounding box."""
     if not len(footprints):
         return np.empty(0)
-    start = footprints.vertex_start[footprints.part_start]
-    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
-    sides = boxes(footprints.vertices + radius, start)[1] - boxes(footprints.vertices - radius, start)[0]
+    vertex_starts = footprints.vertex_start[footprints.part_start]
+    radii = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    sides = (
+        boxes(footprints.vertices + radii, vertex_starts)[1]
+        - boxes(footprints.vertices - radii, vertex_starts)[0]
+    )
     return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
 
 
@@ -159,8 +164,8 @@ def _rounded_rings(corners: Floats, radius: Floats) -> Floats:
         radius: (M,), radius of the rounding.
     """
     x, y = _DIRECTIONS[:, :1], _DIRECTIONS[:, 1:]
-    reach = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
-    outermost = np.take_along_axis(corners, reach.argmax(axis=2)[:, :, None], axis=1)
+    projections = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
+    outermost = np.take_along_axis(corners, projections.argmax(axis=2)[:, :, None], axis=1)
     return np.asarray(outermost + radius[:, None, None] * _DIRECTIONS)
 
 
@@ -169,16 +174,18 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
     part_counts = np.diff(footprints.part_start)
     has_height = ~np.isnan(footprints.bottom)
     columns = [part_counts, has_height]
-    for part in range(int(part_counts.max(initial=0))):
-        has_part = part_counts > part
-        at = np.where(has_part, footprints.part_start[:-1] + part, 0)
-        columns.append(np.where(has_part, lengths[at], 0))
-    form, forms = np.zeros(len(footprints), np.int64), list[Form]()
-    for places in equal_places(combined_code(columns, len(footprints))):
-        form[places], row = len(forms), int(places[0])
-        rings = lengths[footprints.part_start[row] : footprints.part_start[row + 1]]
-        forms.append(Form(tuple(rings.tolist()), bool(has_height[row])))
-    return form, tuple(forms)
+    for part_index in range(int(part_counts.max(initial=0))):
+        has_part = part_counts > part_index
+        part_indices = np.where(has_part, footprints.part_start[:-1] + part_index, 0)
+        columns.append(np.where(has_part, lengths[part_indices], 0))
+    form_indices, forms = np.zeros(len(footprints), np.int64), list[Form]()
+    for footprint_indices in equal_places(combined_code(columns, len(footprints))):
+        form_indices[footprint_indices], first_footprint = len(forms), int(footprint_indices[0])
+        ring_lengths = lengths[
+            footprints.part_start[first_footprint] : footprints.part_start[first_footprint + 1]
+        ]
+        forms.append(Form(tuple(ring_lengths.tolist()), bool(has_height[first_footprint])))
+    return form_indices, tuple(forms)
 
 
 FRAME: Final = "world"
@@ -314,10 +321,11 @@ def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, 
         sides.points.add(x=x, y=y)
     for x, y in ring.tolist():
         sides.points.add(x=x, y=y, z=height)
-    count = len(ring)
-    for low in range(count):
-        following = (low + 1) % count
-        sides.indices.extend((low, following, count + low, following, count + following, count + low))
+    corner_count = len(ring)
+    for corner in range(corner_count):
+        next_corner = (corner + 1) % corner_count
+        sides.indices.extend((corner, next_corner, corner_count + corner))
+        sides.indices.extend((next_corner, corner_count + next_corner, corner_count + corner))
     sides.color.r, sides.color.g, sides.color.b, sides.color.a = SLOT, SLOT, SLOT, opacity
 
 
@@ -462,15 +470,17 @@ class EncodedRegions(NamedTuple):
 def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedRegions:
     """Encode regions, with or without names. Larger regions are lower and do not hide smaller ones."""
     sizes = [region.size for region in regions]
-    message, order = SceneUpdate(), list[int]()
-    for number, (region, size) in enumerate(zip(regions, sizes, strict=True)):
-        smaller = sum(other_size < size for other_size in sizes)
-        depth = _LABEL_LIFT * smaller / len(regions) * min(sizes)
+    message, number_indices = SceneUpdate(), list[int]()
+    for region_index, (region, size) in enumerate(zip(regions, sizes, strict=True)):
+        smaller_count = sum(other_size < size for other_size in sizes)
+        depth = _LABEL_LIFT * smaller_count / len(regions) * min(sizes)
         entity = _add_entity(message, REGION + region.name)
         _add_region(entity, region, depth, named=named)
-        at = len(_STAMP_WORDS) + 3 * number
-        order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
-    return EncodedRegions(len(regions), _encode(message), order)
+        first_colour = len(_STAMP_WORDS) + 3 * region_index
+        number_indices += [first_colour, first_colour + 1, first_colour + 2] * (
+            len(entity.lines) + len(entity.triangles)
+        )
+    return EncodedRegions(len(regions), _encode(message), number_indices)
 
 
 def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> SceneTemplate:
@@ -484,47 +494,53 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
     """
-    gone, last = SceneUpdate(), SceneUpdate()
+    deletions, last_entities = SceneUpdate(), SceneUpdate()
     for name in layout.deleted:
-        gone.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+        deletions.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     if layout.witness == "deleted":
-        gone.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
-    places, end = _places(layout, regions.number)
-    label, order = list[int](), [*regions.order]
-    for figure, object_places in zip(layout.objects, places, strict=True):
-        order += _order_of_object(figure, object_places)
+        deletions.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+    places_by_object, end = _places(layout, regions.number)
+    label_words, number_indices = list[int](), [*regions.order]
+    for figure, object_places in zip(layout.objects, places_by_object, strict=True):
+        number_indices += _order_of_object(figure, object_places)
     for name, length in layout.missing:
-        entity = _add_entity(last, OBJECT + name)
+        entity = _add_entity(last_entities, OBJECT + name)
         _add_dashes(entity, np.full((length - 1, 2), SLOT), lift)
-        order += range(end, end + 2 * (length - 1))
+        number_indices += range(end, end + 2 * (length - 1))
         if not isinstance(layout.witness, CauseText):
             _add_label(entity, missing_words(name), (SLOT, SLOT), 2.5 * lift)
-            order += range(end + 2 * (length - 1), end + 2 * length)
+            number_indices += range(end + 2 * (length - 1), end + 2 * length)
         end += 2 * length
     if isinstance(layout.witness, CauseText):
-        number = "#" * layout.witness.length
-        entity = _add_entity(last, WITNESS)
+        number_text = "#" * layout.witness.length
+        entity = _add_entity(last_entities, WITNESS)
         if layout.witness.dashes:
             _add_dashes(entity, np.reshape(layout.witness.dashes, (-1, 2)), lift)
-        point_at(entity, layout.witness.text + number, lift, layout.names)
-        label = layout.witness.words
-        begin = end + _ARROW_NUMBERS
-        middle = begin + 2 * len(layout.names)
-        order += range(end, begin)
-        for x in range(begin, middle, 2):
-            order += [x, x + 1, middle + 2]
-        order += range(middle, middle + 3 + len(label))
-    objects = [_encoded_object(figure, lift) for figure in layout.objects]
+        point_at(entity, layout.witness.text + number_text, lift, layout.names)
+        label_words = layout.witness.words
+        names_begin = end + _ARROW_NUMBERS
+        label_begin = names_begin + 2 * len(layout.names)
+        number_indices += range(end, names_begin)
+        for name_begin in range(names_begin, label_begin, 2):
+            number_indices += [name_begin, name_begin + 1, label_begin + 2]
+        number_indices += range(label_begin, label_begin + 3 + len(label_words))
+    encoded_objects = [_encoded_object(figure, lift) for figure in layout.objects]
     # parsers join the lists of concatenated messages:
     # https://protobuf.dev/programming-guides/encoding/#last-one-wins
-    encoded = b"".join([_encode(gone), regions.entities, *objects, _encode(last)])
+    encoded = b"".join([_encode(deletions), regions.entities, *encoded_objects, _encode(last_entities)])
     # the arrow's label is the last field, so its slots are at the end
-    slots = [*_offsets(encoded, SLOT_BYTES), *(len(encoded) - 8 - label[-1] + at for at in label)]
-    stamps = _offsets(encoded, _STAMP_BYTES)
+    slot_offsets = [
+        *_offsets(encoded, SLOT_BYTES),
+        *(len(encoded) - 8 - label_words[-1] + offset for offset in label_words),
+    ]
+    stamp_offsets = _offsets(encoded, _STAMP_BYTES)
     payload = np.frombuffer(encoded.replace(SLOT_BYTES, bytes(8)), np.uint8)
-    words = [*slots, *(begin + at for begin in stamps for at in _STAMP_WORDS)]
-    template = WireTemplate(payload, np.array(words, np.int64), np.empty(0, np.int64))
-    return SceneTemplate(template, np.array(order + [0, 1] * len(stamps), np.int64))
+    word_offsets = [
+        *slot_offsets,
+        *(stamp_offset + offset for stamp_offset in stamp_offsets for offset in _STAMP_WORDS),
+    ]
+    template = WireTemplate(payload, np.array(word_offsets, np.int64), np.empty(0, np.int64))
+    return SceneTemplate(template, np.array(number_indices + [0, 1] * len(stamp_offsets), np.int64))
 
 
 def _encode(message: SceneUpdate) -> bytes:
@@ -559,35 +575,35 @@ def _places(layout: SceneLayout, region_count: int) -> tuple[list[_Places], int]
     ], end
 
 
-def _order_of_object(drawn: DrawnObject, begin: _Places) -> list[int]:
+def _order_of_object(figure: DrawnObject, places: _Places) -> list[int]:
     """Return the index of the number for each word of an object, in the order of its primitives."""
-    rings, form = _corners(drawn.form.rings, begin.points), drawn.form
-    colour = list(range(begin.colour, begin.colour + 3))
-    top, bottom, height, label = range(begin.heights, begin.heights + 4)
-    upper = [top] if form.has_height else []
-    flat = [[at for corner in ring for at in corner] for ring in rings]
-    order = []
-    for points in flat:
-        order += [*upper, *points, *colour]
-    for points in flat:
+    rings, form = _corners(figure.form.rings, places.points), figure.form
+    colour_numbers = list(range(places.colour, places.colour + 3))
+    top, bottom, height, label = range(places.heights, places.heights + 4)
+    top_numbers = [top] if form.has_height else []
+    flat_points = [[number_index for corner in ring for number_index in corner] for ring in rings]
+    number_indices = []
+    for points in flat_points:
+        number_indices += [*top_numbers, *points, *colour_numbers]
+    for points in flat_points:
         if len(points) > 4:
-            order += [*upper, *points, *colour]
+            number_indices += [*top_numbers, *points, *colour_numbers]
     if form.has_height:
-        for ring, points in zip(rings, flat, strict=True):
+        for ring, points in zip(rings, flat_points, strict=True):
             if len(ring) > 1:
-                raised = [at for x, y in ring for at in (x, y, height)]
-                order += [bottom, *points, *raised, *colour]
-    if drawn.label:
-        order += [begin.middle, begin.middle + 1, *([label] if form.has_height else [])]
-    return order
+                raised_points = [number_index for x, y in ring for number_index in (x, y, height)]
+                number_indices += [bottom, *points, *raised_points, *colour_numbers]
+    if figure.label:
+        number_indices += [places.middle, places.middle + 1, *([label] if form.has_height else [])]
+    return number_indices
 
 
-def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
+def _corners(ring_lengths: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
     """Return the indices of x and y of each point, by ring."""
-    ends = np.cumsum(rings).tolist()
+    ends = np.cumsum(ring_lengths).tolist()
     return [
-        [(begin + 2 * at, begin + 2 * at + 1) for at in range(end - length, end)]
-        for end, length in zip(ends, rings, strict=True)
+        [(begin + 2 * point, begin + 2 * point + 1) for point in range(end - length, end)]
+        for end, length in zip(ends, ring_lengths, strict=True)
     ]
 
 
@@ -615,15 +631,24 @@ def numbers_of_witness(
         labels: last bytes of S labels, of equal lengths (see `CauseText.ends`).
         words: starts of the slots in these bytes (see `CauseText.words`).
     """
-    begin, end = points[:, 0], points[:, 1]
-    length = np.hypot(*(end - begin).T)
-    half = 0.5 * np.arctan2(*(end - begin).T[::-1])
-    head = np.minimum(0.5 * length, ARROW_HEAD * scale)
-    arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
-    middle = [label_places, z + ARROW_HEAD * scale]
-    text = b"".join([label[at : at + 8] for label in labels for at in words])
-    label = np.frombuffer(text, "<f8")
-    return [column.reshape(len(points), -1) for column in (*arrow, names, *middle, label)]
+    begins, ends = points[:, 0], points[:, 1]
+    lengths = np.hypot(*(ends - begins).T)
+    half_angles = 0.5 * np.arctan2(*(ends - begins).T[::-1])
+    head_lengths = np.minimum(0.5 * lengths, ARROW_HEAD * scale)
+    arrow_columns = [
+        begins,
+        z,
+        np.sin(half_angles),
+        np.cos(half_angles),
+        lengths - head_lengths,
+        head_lengths,
+    ]
+    label_centres = [label_places, z + ARROW_HEAD * scale]
+    label_bytes = b"".join([label[start : start + 8] for label in labels for start in words])
+    label_numbers = np.frombuffer(label_bytes, "<f8")
+    return [
+        column.reshape(len(points), -1) for column in (*arrow_columns, names, *label_centres, label_numbers)
+    ]
 
 
 def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
@@ -641,30 +666,30 @@ def _add_region(entity: SceneEntity, region: Region, depth: float, *, named: boo
     """
     bottom, top = region.outline.height or (0.0, 0.0)
     sides = None if region.outline.height is None else (bottom, top - bottom)
-    everything = np.concatenate(region.rings)
-    (left, low), (right, high) = everything.min(axis=0).tolist(), everything.max(axis=0).tolist()
-    label = top + _LABEL_LIFT * max(right - left, high - low)
+    all_points = np.concatenate(region.rings)
+    (left, low), (right, high) = all_points.min(axis=0).tolist(), all_points.max(axis=0).tolist()
+    label_height = top + _LABEL_LIFT * max(right - left, high - low)
     draw(
         entity,
         region.name if named else "",
         border_of(region),
         list(region.rings),
         ((left + right) / 2.0, high),
-        Elevation(-depth if sides is None else bottom, sides, label),
+        Elevation(-depth if sides is None else bottom, sides, label_height),
         REGION_OPACITY,
     )
 
 
 @lru_cache(4096)
-def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
+def _encoded_object(figure: DrawnObject, lift: float) -> bytes:
     """Encode an object, cached because consecutive layouts share most objects."""
     message = SceneUpdate()
-    rings = [np.full((length, 2), SLOT) for length in drawn.form.rings]
-    elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
-    if drawn.form.has_height:
+    rings = [np.full((length, 2), SLOT) for length in figure.form.rings]
+    elevation = Elevation(lift * (1.0 + figure.level / LEVELS), None, 2.5 * lift)
+    if figure.form.has_height:
         elevation = Elevation(SLOT, (SLOT, SLOT), SLOT)
-    entity = _add_entity(message, OBJECT + drawn.name)
-    draw(entity, drawn.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
+    entity = _add_entity(message, OBJECT + figure.name)
+    draw(entity, figure.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
     return _encode(message)
 
 
@@ -681,23 +706,23 @@ _STAMP_WORDS: Final = (0, _STAMP - 8)
 _NS: Final = 1_000_000_000
 
 
-def _offsets(payload: bytes, wanted: bytes) -> list[int]:
+def _offsets(payload: bytes, pattern: bytes) -> list[int]:
     """Return the offsets of some bytes in a payload."""
-    return [hit.start() for hit in re.finditer(re.escape(wanted), payload)]
+    return [hit.start() for hit in re.finditer(re.escape(pattern), payload)]
 
 
 def encoded_stamps(times_ns: Integers) -> Words:
     """Encode nanoseconds (S,) as timestamps: (S, 2) overlapping words at the offsets `_STAMP_WORDS`."""
     seconds, nanos = map(_five_bytes, np.divmod(times_ns, _NS))
     # a timestamp is a tag, five bytes, a tag, five bytes; the words are its first and its last eight bytes
-    first = 0x08 | seconds << 8 | 0x10 << 48 | nanos << 56
-    last = seconds >> 24 | 0x10 << 16 | nanos << 24
-    return np.stack([first, last], axis=1).view(np.uint64)
+    first_words = 0x08 | seconds << 8 | 0x10 << 48 | nanos << 56
+    last_words = seconds >> 24 | 0x10 << 16 | nanos << 24
+    return np.stack([first_words, last_words], axis=1).view(np.uint64)
 
 
 def _five_bytes(numbers: Integers) -> Integers:
     """Encode numbers below 2^35 as varints of five bytes."""
     padded = np.full(len(numbers), 0x80808080)
-    for place in range(5):
-        padded |= (numbers >> 7 * place & 0x7F) << 8 * place
+    for byte_index in range(5):
+        padded |= (numbers >> 7 * byte_index & 0x7F) << 8 * byte_index
     return padded

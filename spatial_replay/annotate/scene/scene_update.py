@@ -86,42 +86,48 @@ class SceneNumbers:
             scale: size of objects in the scene.
         """
         self._stamps = encoded_stamps(times_ns)
-        self._regions = regions.reshape(len(times_ns), -1)
+        self._region_colours = regions.reshape(len(times_ns), -1)
         self._content, self._scale = content, scale
-        self._of_objects = [objects, content.middles]
+        self._object_columns = [objects, content.middles]
         if any(form.has_height for form in content.rings.forms):
             top, bottom = content.footprints.top, content.footprints.bottom
-            self._of_objects.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
+            self._object_columns.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
 
     def of_messages(self, layout: SceneLayout, samples: Integers) -> Words:
         """Return (K, N), the numbers that fill a layout's template in K messages, each number once."""
-        columns = [self._stamps[samples], self._regions[samples]]
-        content, count = self._content, len(layout.objects)
-        if count:
+        columns = [self._stamps[samples], self._region_colours[samples]]
+        content, object_count = self._content, len(layout.objects)
+        if object_count:
             # the drawn objects of a message are consecutive rows
-            first = content.observations[samples, content.names.index(layout.objects[0].name)]
-            corners = sum(sum(figure.form.rings) for figure in layout.objects)
-            columns.append(_runs(content.rings.points, content.rings.start[first], corners))
-            of_objects = self._of_objects[: 3 if layout.has_heights else 2]
-            columns += [_runs(rows, first, count) for rows in of_objects]
+            first_rows = content.observations[samples, content.names.index(layout.objects[0].name)]
+            corner_count = sum(sum(figure.form.rings) for figure in layout.objects)
+            columns.append(_runs(content.rings.points, content.rings.start[first_rows], corner_count))
+            object_columns = self._object_columns[: 3 if layout.has_heights else 2]
+            columns += [_runs(column, first_rows, object_count) for column in object_columns]
         for name, length in layout.missing:
-            rows = content.missing[samples, content.names.index(name)]
+            outlines = content.missing[samples, content.names.index(name)]
             columns.append(
-                np.array([content.last.rows[row] for row in rows.tolist()]).reshape(-1, 2 * length)
+                np.array([content.last.rows[outline] for outline in outlines.tolist()]).reshape(
+                    -1, 2 * length
+                )
             )
         if isinstance(layout.witness, CauseText):
             violations, witness = content.violations, layout.witness
-            labels = witness.ends([content.numbers[index] for index in samples.tolist()])
-            z = np.fmax(violations.top[samples], 0.0) + 3.0 * LIFT * self._scale
-            spots = content.spots[samples, : len(layout.names)]
-            at = violations.points[samples], z, spots, content.label[samples]
-            columns += numbers_of_witness(*at, self._scale, labels, witness.words)
+            columns += numbers_of_witness(
+                violations.points[samples],
+                np.fmax(violations.top[samples], 0.0) + 3.0 * LIFT * self._scale,
+                content.spots[samples, : len(layout.names)],
+                content.label[samples],
+                self._scale,
+                witness.ends([content.numbers[index] for index in samples.tolist()]),
+                witness.words,
+            )
         return words_of(columns)
 
 
-def _runs(rows: Floats, first: Integers, count: int) -> Floats:
+def _runs(rows: Floats, first_rows: Integers, count: int) -> Floats:
     """Return runs of `count` consecutive rows (R, k), one run from each start (K,), as (K, count * k)."""
-    return np.asarray(rows[first[:, None] + np.arange(count)].reshape(len(first), -1))
+    return np.asarray(rows[first_rows[:, None] + np.arange(count)].reshape(len(first_rows), -1))
 
 
 PERIOD_NS: Final = 20_000_000
@@ -225,42 +231,48 @@ class SceneEncoder:
         state = state or SceneState()
         if state.zero_ns is None and len(trace):
             state = replace(state, zero_ns=int(trace.times_ns[0]))
-        sample_places = samples_to_write(trace.times_ns, state.written_ns)
-        times_ns = trace.times_ns[sample_places]
-        if not len(sample_places):
+        written_samples = samples_to_write(trace.times_ns, state.written_ns)
+        times_ns = trace.times_ns[written_samples]
+        if not len(written_samples):
             return SceneMessages(times_ns, [], self.pass_over(trace, state), None)
-        state, scales, first = self.with_scale(state, trace, trace.rows[sample_places])
+        state, scales, first_shown = self.with_scale(state, trace, trace.rows[written_samples])
         extent, corners, sizes = state.extent.grow(trace, self._corners)
-        view = _View(corners[sample_places], _LINE * sizes[sample_places])
+        view = _View(corners[written_samples], _LINE * sizes[written_samples])
         state = replace(state, extent=extent)
         names = tuple(sorted({*trace.names, *state.shown, *state.last}))
-        missing, state = self._missing(names, trace, state, sample_places, view.line)
-        missing[0][:first] = -1
+        missing, state = self._missing(names, trace, state, written_samples, view.line)
+        missing[0][:first_shown] = -1
         scale = state.scale or _UNSCALED
-        violations = first_violations(results, trace, sample_places)
-        rows = _rows_of(names, trace, trace.rows[sample_places])
+        violations = first_violations(results, trace, written_samples)
+        rows = _rows_of(names, trace, trace.rows[written_samples])
         presence = Presence(times_ns, names, _class_codes(trace, rows), trace.classes)
-        objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
-        objects[missing[0] >= 0] = np.nan
-        has_label = labelled_objects(self.named, names, rows >= 0, objects)
-        labels = has_label, failed_objects(results, names, times_ns)
+        object_robustness, region_robustness = worst_robustness(
+            results, presence, [region.name for region in self._drawn]
+        )
+        object_robustness[missing[0] >= 0] = np.nan
+        has_label = labelled_objects(self.named, names, rows >= 0, object_robustness)
+        label_flags = has_label, failed_objects(results, names, times_ns)
         arrows = arrow_texts(results, violations, state.zero_ns or 0, self.unit)
         regions_by_name = {region.name: np.concatenate(region.rings) for region in self._drawn}
         content = _content(
-            trace, names, rows, state, violations, arrows, labels, missing, regions_by_name, view
+            trace, names, rows, state, violations, arrows, label_flags, missing, regions_by_name, view
         )
-        shades = colours(objects, scales), colours(regions, scales)
-        object_shades = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
-        columns = SceneNumbers(times_ns, shades[1], object_shades, content, scale)
+        entity_colours = colours(object_robustness, scales), colours(region_robustness, scales)
+        object_colours = (
+            entity_colours[0].reshape(-1, 3) if (rows >= 0).all() else entity_colours[0][rows >= 0]
+        )
+        numbers = SceneNumbers(times_ns, entity_colours[1], object_colours, content, scale)
         templates = dict(state.templates)
-        encoded = []
-        for layout, samples in _by_layout(content):
+        indices_and_payloads = []
+        for layout, message_indices in _by_layout(content):
             if layout not in templates:
-                of_regions = self._unnamed if isinstance(layout.witness, CauseText) else self._encoded
-                templates[layout] = make_template(layout, of_regions, LIFT * scale)
-            encoded.append((samples, templates[layout].encode(columns.of_messages(layout, samples))))
+                encoded_regions = self._unnamed if isinstance(layout.witness, CauseText) else self._encoded
+                templates[layout] = make_template(layout, encoded_regions, LIFT * scale)
+            indices_and_payloads.append(
+                (message_indices, templates[layout].encode(numbers.of_messages(layout, message_indices)))
+            )
         is_shown = (content.forms[-1] >= FIRST_FORM) | (content.missing[-1] >= 0)
-        after = replace(
+        new_state = replace(
             state,
             written_ns=int(times_ns[-1]),
             shown=tuple(
@@ -269,12 +281,20 @@ class SceneEncoder:
             is_pointing=bool(content.violations.is_shown[-1]),
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
-        find_arrows = partial(_arrows_of, results, trace, sample_places, state.zero_ns or 0, self.unit)
+        find_arrows = partial(_arrows_of, results, trace, written_samples, state.zero_ns or 0, self.unit)
         find_shades = partial(_shades_of, results, presence, [region.name for region in self._drawn], scales)
         frames = SceneFrames(
-            times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
+            times_ns,
+            object_robustness,
+            region_robustness,
+            *entity_colours,
+            scale,
+            content,
+            self._drawn,
+            find_arrows,
+            find_shades,
         )
-        return SceneMessages(times_ns, join_in_order(encoded), after, frames)
+        return SceneMessages(times_ns, join_in_order(indices_and_payloads), new_state, frames)
 
     def pass_over(self, trace: Trace, state: SceneState) -> SceneState:
         """Return the state after more samples, without encoding messages."""
@@ -282,35 +302,51 @@ class SceneEncoder:
         return self._missing(trace.names, trace, state, np.empty(0, np.int64), np.empty(0))[1]
 
     def _missing(
-        self, names: tuple[str, ...], trace: Trace, state: SceneState, written: Integers, lines: Floats
+        self,
+        names: tuple[str, ...],
+        trace: Trace,
+        state: SceneState,
+        written_samples: Integers,
+        line_heights: Floats,
     ) -> tuple[tuple[Integers, Dashes], SceneState]:
         """Return the last outlines of missing objects in S messages, and the state after the samples.
 
         The array (S, names) has the index of each missing object's outline, -1 for other objects.
         """
-        last, outline_numbers = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
-        outlines, rows_of = list[tuple[Floats, ...]](), list[Floats]()
-        line_heights, line = np.unique(lines, return_inverse=True)
-        for name in sorted(self.named & {*trace.names, *last}):
+        last_footprints = dict(state.last)
+        outline_numbers = np.full((len(written_samples), len(names)), -1, np.int64)
+        outlines, outline_rows = list[tuple[Floats, ...]](), list[Floats]()
+        distinct_heights, height_indices = np.unique(line_heights, return_inverse=True)
+        for name in sorted(self.named & {*trace.names, *last_footprints}):
             column = trace.names.index(name) if name in trace.names else None
-            rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
-            seen = np.maximum.accumulate(np.where(rows >= 0, np.arange(len(rows)), -1))
-            last_seen = np.where(rows[written] < 0, seen[written], len(rows))
-            keys = last_seen * len(line_heights) + line
-            for key in np.unique(keys).tolist():
-                at, height = divmod(key, len(line_heights))
-                if at < len(rows) and (at >= 0 or name in last):
-                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[at]))
-                    outline_numbers[keys == key, names.index(name)] = len(outlines)
+            footprint_rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
+            seen_samples = np.maximum.accumulate(
+                np.where(footprint_rows >= 0, np.arange(len(footprint_rows)), -1)
+            )
+            last_seen_samples = np.where(
+                footprint_rows[written_samples] < 0, seen_samples[written_samples], len(footprint_rows)
+            )
+            outline_keys = last_seen_samples * len(distinct_heights) + height_indices
+            for key in np.unique(outline_keys).tolist():
+                sample, height_index = divmod(key, len(distinct_heights))
+                if sample < len(footprint_rows) and (sample >= 0 or name in last_footprints):
+                    batch, row = (
+                        last_footprints[name]
+                        if sample < 0
+                        else (trace.footprints, int(footprint_rows[sample]))
+                    )
+                    outline_numbers[outline_keys == key, names.index(name)] = len(outlines)
                     rings = rings_of(batch.select(np.array([row])), _POINT * (state.scale or _UNSCALED))
                     outlines.append(rings.rings_of(0))
-                    places = np.concatenate(outlines[-1])
-                    middle = (places[:, 0].min() + places[:, 0].max()) / 2.0
-                    under = [[middle, places[:, 1].min() - 0.75 * line_heights[height]]]
-                    rows_of.append(np.concatenate([dashes_of(outlines[-1]), under]))
-            if len(seen) and seen[-1] >= 0:
-                last[name] = trace.footprints, int(rows[seen[-1]])
-        return (outline_numbers, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
+                    corners = np.concatenate(outlines[-1])
+                    middle_x = (corners[:, 0].min() + corners[:, 0].max()) / 2.0
+                    name_position = [[middle_x, corners[:, 1].min() - 0.75 * distinct_heights[height_index]]]
+                    outline_rows.append(np.concatenate([dashes_of(outlines[-1]), name_position]))
+            if len(seen_samples) and seen_samples[-1] >= 0:
+                last_footprints[name] = trace.footprints, int(footprint_rows[seen_samples[-1]])
+        return (outline_numbers, Dashes(outline_rows, outlines)), replace(
+            state, last=MappingProxyType(last_footprints)
+        )
 
     def with_scale(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale, the scale (S, 1) of each message, and the first scaled message.
@@ -323,11 +359,11 @@ class SceneEncoder:
         is_shown = (rows >= 0).any(axis=1)
         if not is_shown.any():
             return state, scales, len(rows)
-        first = int(is_shown.argmax())
-        footprints = trace.footprints.select(rows[first][rows[first] >= 0])
+        first_shown = int(is_shown.argmax())
+        footprints = trace.footprints.select(rows[first_shown][rows[first_shown] >= 0])
         scale = float(np.median(extents(footprints))) or _UNSCALED
-        scales[first:] = scale
-        return replace(state, scale=scale), scales, first
+        scales[first_shown:] = scale
+        return replace(state, scale=scale), scales, first_shown
 
 
 class _View(NamedTuple):
@@ -340,16 +376,16 @@ class _View(NamedTuple):
 def _arrows_of(
     results: Sequence[EvaluatedResult],
     trace: Trace,
-    written: Integers,
+    written_samples: Integers,
     first_ns: int,
     unit: str,
-    chosen: Integers,
+    message_indices: Integers,
 ) -> list[Arrows]:
     """Return the arrows of each result in some messages, found for each result alone."""
     arrows = []
-    for number, result in enumerate(results):
-        violations = first_violations([result], trace, written[chosen])
-        arrows.append(Arrows(number, violations, arrow_texts([result], violations, first_ns, unit)))
+    for result_index, result in enumerate(results):
+        violations = first_violations([result], trace, written_samples[message_indices])
+        arrows.append(Arrows(result_index, violations, arrow_texts([result], violations, first_ns, unit)))
     return arrows
 
 
@@ -358,22 +394,24 @@ def _shades_of(
     presence: Presence,
     regions: Sequence[str],
     scales: Floats,
-    chosen: Integers,
+    message_indices: Integers,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return (K, objects, R) and (K, regions, R), shades in K messages by each of R results alone.
 
     R is 0 for a single result, whose shades equal the colours, and for more shades than `_MOST_SHADES`.
     """
-    entities = len(presence.names) + len(regions)
-    shaded = results if 1 < len(results) <= _MOST_SHADES // max(entities, 1) else ()
-    part = presence._replace(times_ns=presence.times_ns[chosen], class_code=presence.class_code[chosen])
-    of_objects = np.empty((len(chosen), len(presence.names), len(shaded)), np.uint8)
-    of_regions = np.empty((len(chosen), len(regions), len(shaded)), np.uint8)
-    for number, result in enumerate(shaded):
-        objects, places = worst_robustness([result], part, regions)
-        of_objects[:, :, number] = shade_codes(objects, scales[chosen])
-        of_regions[:, :, number] = shade_codes(places, scales[chosen])
-    return of_objects, of_regions
+    entity_count = len(presence.names) + len(regions)
+    shaded_results = results if 1 < len(results) <= _MOST_SHADES // max(entity_count, 1) else ()
+    part_presence = presence._replace(
+        times_ns=presence.times_ns[message_indices], class_code=presence.class_code[message_indices]
+    )
+    object_shades = np.empty((len(message_indices), len(presence.names), len(shaded_results)), np.uint8)
+    region_shades = np.empty((len(message_indices), len(regions), len(shaded_results)), np.uint8)
+    for result_index, result in enumerate(shaded_results):
+        object_robustness, region_robustness = worst_robustness([result], part_presence, regions)
+        object_shades[:, :, result_index] = shade_codes(object_robustness, scales[message_indices])
+        region_shades[:, :, result_index] = shade_codes(region_robustness, scales[message_indices])
+    return object_shades, region_shades
 
 
 def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
@@ -384,22 +422,22 @@ def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
     """
     if not len(times_ns):
         return np.empty(0, np.int64)
-    earliest = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
-    if times_ns[0] >= earliest and (np.diff(times_ns) >= PERIOD_NS).all():
+    earliest_ns = int(times_ns[0]) if written_ns is None else written_ns + PERIOD_NS
+    if times_ns[0] >= earliest_ns and (np.diff(times_ns) >= PERIOD_NS).all():
         return np.arange(len(times_ns))
     indices = []
-    at = bisect_left(times_ns, earliest)
-    while at < len(times_ns):
-        indices.append(at)
-        at = bisect_left(times_ns, int(times_ns[at]) + PERIOD_NS, at + 1)
+    index = bisect_left(times_ns, earliest_ns)
+    while index < len(times_ns):
+        indices.append(index)
+        index = bisect_left(times_ns, int(times_ns[index]) + PERIOD_NS, index + 1)
     return np.array(indices, np.int64)
 
 
 def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:
     """Return (S, names), rows of the trace by `names`; below 0 where an object is absent."""
-    of_all = np.full((len(rows), len(names)), -1, np.int64)
-    of_all[:, list(map(set(trace.names).__contains__, names))] = rows
-    return of_all
+    rows_by_name = np.full((len(rows), len(names)), -1, np.int64)
+    rows_by_name[:, list(map(set(trace.names).__contains__, names))] = rows
+    return rows_by_name
 
 
 def _content(
@@ -424,17 +462,23 @@ def _content(
     forms = np.where(was_present & (missing[0] < 0), DELETED, ABSENT)
     forms[is_present] = FIRST_FORM + rings.form
     styles = np.full(rows.shape, -1, np.int64)
-    low, high = boxes(rings.points, rings.start)
-    sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
-    has_label, failed = (flags[is_present] for flags in label_flags)
-    styles[is_present] = 4 * _levels(sizes, last_state.scale or _UNSCALED) + 2 * failed + (has_label | failed)
+    lows, highs = boxes(rings.points, rings.start)
+    sizes = extents(footprints) if rings.has_round else np.maximum(*(highs - lows).T)
+    has_label, has_failed = (flags[is_present] for flags in label_flags)
+    styles[is_present] = (
+        4 * _levels(sizes, last_state.scale or _UNSCALED) + 2 * has_failed + (has_label | has_failed)
+    )
     was_pointing = np.append(last_state.is_pointing, violations.is_shown[:-1])
-    arrow = np.where(violations.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
+    arrow_codes = np.where(
+        violations.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT)
+    )
     name_lengths = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
     arrow_messages = np.flatnonzero(violations.is_shown)
-    boxes_of_objects = _boxes_of(observations, low, high)
+    boxes_of_objects = _boxes_of(observations, lows, highs)
     is_named = (label_flags[0] | label_flags[1]) & is_present & ~violations.is_shown[:, None]
-    object_name_centres = _name_places(low, high, name_lengths, np.repeat(view.line, is_present.sum(axis=1)))
+    object_name_centres = _name_places(
+        lows, highs, name_lengths, np.repeat(view.line, is_present.sum(axis=1))
+    )
     text_lengths = np.array([len(name) + 2 for name in names], np.float64)
     named_observations = np.where(is_named, observations, -1)
     object_name_centres = _free_places(
@@ -466,7 +510,7 @@ def _content(
         object_name_centres,
         violations,
         label_centres,
-        arrow,
+        arrow_codes,
         arrows.causes,
         arrows.numbers,
         name_centres,
@@ -490,7 +534,7 @@ class _DecidingBoxes(NamedTuple):
 
 def _deciding_boxes(
     names: Sequence[str],
-    found: Violations,
+    violations: Violations,
     arrows: ArrowTexts,
     boxes_of_objects: Box,
     missing: tuple[Integers, Dashes],
@@ -501,39 +545,41 @@ def _deciding_boxes(
     Args:
         boxes_of_objects: boxes in the messages with an arrow, in the order of `names`.
     """
-    messages = np.flatnonzero(found.is_shown)
-    ends = found.points[messages].transpose(1, 2, 0)
-    named = np.full((2, 2, 2, len(messages)), np.nan)
-    blocked = np.full((2, _BLOCKED, 2, len(messages)), np.nan)
-    letters = np.zeros((2, len(messages)))
-    lasts = [_box(np.concatenate(rings)) for rings in missing[1].rings]
+    messages = np.flatnonzero(violations.is_shown)
+    arrow_ends = violations.points[messages].transpose(1, 2, 0)
+    name_boxes = np.full((2, 2, 2, len(messages)), np.nan)
+    blocked_boxes = np.full((2, _BLOCKED, 2, len(messages)), np.nan)
+    name_lengths = np.zeros((2, len(messages)))
+    missing_boxes = [_box(np.concatenate(rings)) for rings in missing[1].rings]
     for cause in np.unique(arrows.cause[messages]).tolist():
         is_cause = arrows.cause[messages] == cause
-        places = slice(None) if is_cause.all() else np.flatnonzero(is_cause)
-        text = arrows.causes[cause]
-        if text.dashes:
-            blocked[:, _THEN_BOX][..., places] = _box(np.reshape(text.dashes, (-1, 2)))[..., None]
-        for side, name in enumerate(text.names):
-            letters[side, places] = len(name.name) + 2
+        arrow_indices = slice(None) if is_cause.all() else np.flatnonzero(is_cause)
+        cause_text = arrows.causes[cause]
+        if cause_text.dashes:
+            blocked_boxes[:, _THEN_BOX][..., arrow_indices] = _box(np.reshape(cause_text.dashes, (-1, 2)))[
+                ..., None
+            ]
+        for side, name in enumerate(cause_text.names):
+            name_lengths[side, arrow_indices] = len(name.name) + 2
             if isinstance(name, RegionName):
                 if name.name in regions:
-                    named[:, side][..., places] = _box(regions[name.name])[..., None]
+                    name_boxes[:, side][..., arrow_indices] = _box(regions[name.name])[..., None]
                 continue
             if name.name not in names:
                 continue
             column = names.index(name.name)
-            for corner, of_objects in zip(blocked, boxes_of_objects, strict=True):
-                corner[side][:, places] = of_objects[column][:, places]
-            last = missing[0][messages, column]
-            for place in np.flatnonzero(is_cause & (last >= 0)).tolist():
-                blocked[:, side][..., place] = lasts[last[place]]
-                letters[side, place] = len(missing_words(name.name))
-            named[:, side][..., places] = blocked[:, side][..., places]
-    blocked[0, _ARROW_BOX] = np.minimum(ends[0], ends[1])
-    blocked[1, _ARROW_BOX] = np.maximum(ends[0], ends[1])
+            for blocked_corners, object_corners in zip(blocked_boxes, boxes_of_objects, strict=True):
+                blocked_corners[side][:, arrow_indices] = object_corners[column][:, arrow_indices]
+            outline_indices = missing[0][messages, column]
+            for arrow_index in np.flatnonzero(is_cause & (outline_indices >= 0)).tolist():
+                blocked_boxes[:, side][..., arrow_index] = missing_boxes[outline_indices[arrow_index]]
+                name_lengths[side, arrow_index] = len(missing_words(name.name))
+            name_boxes[:, side][..., arrow_indices] = blocked_boxes[:, side][..., arrow_indices]
+    blocked_boxes[0, _ARROW_BOX] = np.minimum(arrow_ends[0], arrow_ends[1])
+    blocked_boxes[1, _ARROW_BOX] = np.maximum(arrow_ends[0], arrow_ends[1])
     # the name of an object without a box is at the end of the arrow
-    low, high = np.where(np.isnan(named), ends, named)
-    return _DecidingBoxes(low, high, letters, (blocked[0], blocked[1]))
+    low, high = np.where(np.isnan(name_boxes), arrow_ends, name_boxes)
+    return _DecidingBoxes(low, high, name_lengths, (blocked_boxes[0], blocked_boxes[1]))
 
 
 def _box(points: Floats) -> Floats:
@@ -543,68 +589,74 @@ def _box(points: Floats) -> Floats:
 
 def _boxes_of(observations: Integers, low: Floats, high: Floats) -> Box:
     """Return the boxes (N, 2, K) of the objects in K messages; NaN for absent objects."""
-    places = observations.T
+    observation_rows = observations.T
     if not len(low):
-        nowhere = np.full((len(places), 2, places.shape[1]), np.nan)
-        return nowhere, nowhere
-    columns = [np.where(places < 0, np.nan, column[places]) for column in (*low.T, *high.T)]
-    return np.stack(columns[:2], axis=1), np.stack(columns[2:], axis=1)
+        no_boxes = np.full((len(observation_rows), 2, observation_rows.shape[1]), np.nan)
+        return no_boxes, no_boxes
+    box_columns = [
+        np.where(observation_rows < 0, np.nan, column[observation_rows]) for column in (*low.T, *high.T)
+    ]
+    return np.stack(box_columns[:2], axis=1), np.stack(box_columns[2:], axis=1)
 
 
-def _places(deciding: _DecidingBoxes, letters: Floats, others: Box, view: _View) -> tuple[Floats, Floats]:
+def _places(
+    deciding: _DecidingBoxes, label_lengths: Floats, other_boxes: Box, view: _View
+) -> tuple[Floats, Floats]:
     """Return the centres of the names (K, 2, 2) and of the label (K, 2) of an arrow.
 
     Args:
-        letters: (K,), lengths of labels.
-        others: boxes of all objects.
+        label_lengths: (K,), lengths of labels, letters.
+        other_boxes: boxes of all objects.
         view: view of these messages.
     """
-    around = _surroundings(deciding.blocked, others, view)
-    spots = place_names(deciding.low, deciding.high, deciding.letters, around)
-    arrow = deciding.blocked[0][_ARROW_BOX], deciding.blocked[1][_ARROW_BOX]
-    return spots.transpose(2, 0, 1), place_labels(letters, arrow, around).T
+    around = _surroundings(deciding.blocked, other_boxes, view)
+    name_centres = place_names(deciding.low, deciding.high, deciding.letters, around)
+    arrow_box = deciding.blocked[0][_ARROW_BOX], deciding.blocked[1][_ARROW_BOX]
+    return name_centres.transpose(2, 0, 1), place_labels(label_lengths, arrow_box, around).T
 
 
-def _surroundings(blocked: Box, others: Box, view: _View) -> Surroundings:
-    low, high = view.corners.transpose(1, 2, 0)
-    return Surroundings(blocked, others, (low, high), VIEW / 2.0 * (high - low).max(axis=0), view.line)
+def _surroundings(blocked: Box, other_boxes: Box, view: _View) -> Surroundings:
+    lows, highs = view.corners.transpose(1, 2, 0)
+    return Surroundings(
+        blocked, other_boxes, (lows, highs), VIEW / 2.0 * (highs - lows).max(axis=0), view.line
+    )
 
 
 def _free_places(
-    middles: Floats,
-    letters: Floats,
+    centres: Floats,
+    name_lengths: Floats,
     observations: Integers,
-    movable: NDArray[np.bool_],
+    is_movable: NDArray[np.bool_],
     boxes_of_objects: Box,
     view: _View,
 ) -> Floats:
     """Return the centres of names (R, 2). A name that covers another object moves to a free side, if any.
 
     Args:
-        letters: (N,), lengths of names.
+        name_lengths: (N,), lengths of names, letters.
         observations: (S, N), rows of objects with names; -1 for other objects.
-        movable: (S, N), whether each name may move.
+        is_movable: (S, N), whether each name may move.
     """
-    if not movable.any():
-        return middles
+    if not is_movable.any():
+        return centres
     is_named = observations.T >= 0
-    usual = np.where(is_named, middles.T[:, observations.T], np.nan).swapaxes(0, 1)
-    nothing = np.empty((0, 2, len(observations))), np.empty((0, 2, len(observations)))
-    around = _surroundings(nothing, boxes_of_objects, view)
-    free = free_names(usual, letters, movable.T, boxes_of_objects, around)
-    moved = middles.copy()
-    moved[observations.T[is_named]] = free.swapaxes(0, 1)[:, is_named].T
-    return moved
+    usual_centres = np.where(is_named, centres.T[:, observations.T], np.nan).swapaxes(0, 1)
+    no_boxes = np.empty((0, 2, len(observations))), np.empty((0, 2, len(observations)))
+    around = _surroundings(no_boxes, boxes_of_objects, view)
+    free_centres = free_names(usual_centres, name_lengths, is_movable.T, boxes_of_objects, around)
+    moved_centres = centres.copy()
+    moved_centres[observations.T[is_named]] = free_centres.swapaxes(0, 1)[:, is_named].T
+    return moved_centres
 
 
-def _name_places(low: Floats, high: Floats, letters: Integers, line: Floats) -> Floats:
+def _name_places(low: Floats, high: Floats, name_lengths: Integers, line_heights: Floats) -> Floats:
     """Return (R, 2), the centres of names: in the middle of large objects, below small ones."""
     # half the sum of the corners, unlike a mean of points, does not depend on the order of summation
-    places = (low + high) / 2.0
+    centres = (low + high) / 2.0
     sides = high - low
-    is_small = (sides[:, 1] < 1.5 * line) | (sides[:, 0] < 0.5 * line * letters)
-    places[:, 1] = np.where(is_small, low[:, 1] - 0.75 * line, places[:, 1])
-    return places
+    is_small = (sides[:, 1] < 1.5 * line_heights) | (sides[:, 0] < 0.5 * line_heights * name_lengths)
+    centres[:, 1] = np.where(is_small, low[:, 1] - 0.75 * line_heights, centres[:, 1])
+    return centres
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:
@@ -623,17 +675,17 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with the indices of its messages."""
-    lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
-    keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow]
-    for samples in equal_places(combined_code(keys, len(content.arrow))):
-        yield _layout(content, int(samples[0])), samples
+    outline_lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
+    layout_keys = [*content.forms.T, *content.styles.T, *outline_lengths.T, content.arrow]
+    for message_indices in equal_places(combined_code(layout_keys, len(content.arrow))):
+        yield _layout(content, int(message_indices[0])), message_indices
 
 
 def _layout(content: SceneContent, message: int) -> SceneLayout:
-    arrow = int(content.arrow[message])
-    is_pointing = arrow >= FIRST_FORM
-    of_objects = content.forms[message].tolist(), content.styles[message].tolist()
-    entries: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
+    arrow_code = int(content.arrow[message])
+    is_pointing = arrow_code >= FIRST_FORM
+    forms_and_styles = content.forms[message].tolist(), content.styles[message].tolist()
+    entries: list[tuple[str, int, int]] = list(zip(content.names, *forms_and_styles, strict=True))
     figures = tuple(
         DrawnObject(
             name,
@@ -645,16 +697,17 @@ def _layout(content: SceneContent, message: int) -> SceneLayout:
         if form >= FIRST_FORM
     )
     deleted = tuple(name for name, form, _ in entries if form == DELETED)
-    last = zip(content.names, content.missing[message].tolist(), strict=True)
-    missing = tuple((name, len(content.last.rows[row])) for name, row in last if row >= 0)
+    missing_rows = zip(content.names, content.missing[message].tolist(), strict=True)
+    missing = tuple((name, len(content.last.rows[row])) for name, row in missing_rows if row >= 0)
     cause: CauseText | Literal["deleted"] | None = None
-    if arrow != ABSENT:
-        cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
-    words = {name: _label(name, style | 1) for name, _, style in entries if style >= 0}
-    words |= {name: missing_words(name) for name, _ in missing}
-    beside = cause.names if isinstance(cause, CauseText) else ()
+    if arrow_code != ABSENT:
+        cause = "deleted" if arrow_code == DELETED else content.causes[arrow_code - FIRST_FORM]
+    name_labels = {name: _label(name, style | 1) for name, _, style in entries if style >= 0}
+    name_labels |= {name: missing_words(name) for name, _ in missing}
+    cause_names = cause.names if isinstance(cause, CauseText) else ()
     names = [
-        base.name if isinstance(base, RegionName) else words.get(base.name, base.name) for base in beside
+        base.name if isinstance(base, RegionName) else name_labels.get(base.name, base.name)
+        for base in cause_names
     ]
     return SceneLayout(deleted, figures, missing, cause, tuple(names))
 
