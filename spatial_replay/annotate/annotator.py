@@ -64,7 +64,7 @@ _MOST_RECENT: Final = 20
 
 
 class _Result:
-    """The state of one result between blocks, from which its messages are encoded."""
+    """The state of one result between blocks, and the encoder of its messages."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class _Result:
         return self.reporter.extend(block)
 
     def violate(self, block: SeriesBlock) -> None:
-        """Update since when each requirement is permanently violated."""
+        """Update the start of each requirement's permanent violation."""
         self._violated_since_ns = violated_since(self.requirements, block, self._violated_since_ns)
 
     def robustness(self, block: SeriesBlock, *, final: bool = False) -> Payloads:
@@ -129,7 +129,7 @@ class Annotator:
     The messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        first_event_ns: time of the first event; None before it.
+        first_event_ns: time of the first event; None before any event.
     """
 
     def __init__(
@@ -192,11 +192,11 @@ class Annotator:
 
     @property
     def extent(self) -> SceneBounds | None:
-        """The bounds of the planner's map and of all footprints so far; None without both."""
+        """The bounds of the planner's map and of all footprints so far; None without map and footprints."""
         return self._scene.extent.bounds
 
     def add_map(self, plan: Mapping[str, str]) -> None:
-        """Add the area of a planner's map, from the metadata of its plan, to the extent."""
+        """Add the area of a planner's map to the extent; `plan` is the metadata of the plan."""
         self._scene = replace(self._scene, extent=self._scene.extent.with_area(map_area(plan)))
 
     @property
@@ -262,7 +262,7 @@ class Annotator:
         return self._events([encoded_occurrence(time_ns, what, sentence)])
 
     def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock], most_changes: int = 0) -> list[Messages]:
-        """Add the next samples, and return only their events and the standing at the last changes.
+        """Add the next samples, and return only their events and the standing at its last changes.
 
         Args:
             most_changes: limit of these changes; see `StandingEncoder.encode_changes`.
@@ -293,7 +293,7 @@ class Annotator:
     ) -> list[Messages]:
         """Return the messages after the last sample.
 
-        They are the final verdicts of pending nodes, warnings about untested parts, and the robustness,
+        The messages are final verdicts of pending nodes, warnings about untested parts, and the robustness,
         standing and scene of the finished log.
 
         Args:
@@ -354,7 +354,7 @@ class Annotator:
         return self._in_order(_ROBUSTNESS, blocks, encoded)
 
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
-        """Return the events, by time, then in the order of results and of their nodes."""
+        """Return the events, sorted by time, then by result and node."""
         self._newest_samples.extend(trace)
         results_with_blocks = zip(self._results, blocks, strict=True)
         events = [event for result, block in results_with_blocks for event in result.extend(trace, block)]
@@ -418,7 +418,7 @@ class Annotator:
 
 
 def _last_of(block: SeriesBlock) -> SeriesBlock:
-    """Return the last sample of a block, or an empty block for an empty one."""
+    """Return the last sample of a block. An empty block stays empty."""
     # copies, because views would keep the whole block in memory
     return SeriesBlock(
         block.times_ns[-1:].copy(), block.series[:, :, -1:].copy(), block.leaves[:, :, -1:].copy()

@@ -41,9 +41,9 @@ _NOW = 1
 """Index of `now` among the numbers of a node."""
 
 _MOST_TEMPLATES = 512
-"""Limit of cached steps, with their messages and words; a step has up to `MAX_STATES` states."""
+"""Limit of cached steps; a step has a message and words for up to `MAX_STATES` states."""
 
-# values of propositions in messages by FALSE, TRUE and UNKNOWN, which is the index -1
+# truth values in messages, indexed by FALSE, TRUE and UNKNOWN (-1)
 _TRUTHS = np.array(
     [AutomatonState_pb2.TRUTH_FALSE, AutomatonState_pb2.TRUTH_TRUE, AutomatonState_pb2.TRUTH_UNKNOWN],
     np.uint8,
@@ -56,8 +56,8 @@ class AutomatonRun:
     The messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        propositions: the node of each proposition: the proposition itself, or the atom of a rate that the
-            proposition tests.
+        propositions: id of each proposition's node or, for a proposition that tests a rate, of the rate's
+            atom.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class AutomatonRun:
             object: object of a template's instance, or None.
             formula: formula of the automaton.
             order: leaves in the order of `SeriesBlock.leaves`.
-            named: replaces a template's parameter by the object in a text.
+            named: function that replaces a template's parameter in a text by the object.
         """
         self._name, self._object, self._with_object_name = name, object, named
         self._automaton = automaton
@@ -93,7 +93,7 @@ class AutomatonRun:
         self._is_possible[automaton.initial] = True
         self._are_all_nodes = all(self._is_proposition_node)
         self._state: int | None = automaton.initial
-        # whether `_state` is newer than `_possible`, because `step` updates only `_state`
+        # whether `_state` is newer than `_is_possible`, because `step` updates only `_state`
         self._is_behind = False
         self._cached_template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         state_sets = (automaton.accepting, automaton.can_accept, automaton.can_reject)
@@ -139,7 +139,8 @@ class AutomatonRun:
 
         Args:
             numbers: (N, 4), numbers of the formula's nodes after the sample.
-            leaves: returns (C, A, 1), the leaves of the sample; called only for the slow way.
+            leaves: function that returns (C, A, 1), the leaves of the sample; called only for unknown
+                propositions.
         """
         current_numbers = [numbers.item(node, _NOW) for node in self.propositions]
         if self._state is None or not self._are_all_nodes or any(map(math.isnan, current_numbers)):
@@ -150,7 +151,7 @@ class AutomatonRun:
         return (self._state,)
 
     def words(self) -> tuple[list[str], Integers]:
-        """Return the distinct states of the last block in words, and (T,) the index of words per sample."""
+        """Return the distinct states of the last block in words, and (T,) the index of words by sample."""
         texts, text_indices = list[str](), np.empty(len(self._states_after), np.int64)
         for sample_indices in _alike(self._states_after, self._states_after):
             text_indices[sample_indices] = len(texts)
@@ -280,7 +281,7 @@ def _node_of(proposition: Formula, formula: Formula, node_ids: Mapping[int, int]
 _LONGEST_GUARD = 500
 _LONGEST_STEP = 120
 _MOST_NAMED = 5
-"""Limit of listed states if a run may be in one of several."""
+"""Limit of listed states if several states are possible."""
 _MOST_SEARCHED = 2_000
 """Limit of states of an automaton whose messages name the next step to acceptance."""
 
@@ -308,7 +309,7 @@ def _alike(
 
 _STORED = ".json"
 _MOST_LITERALS = 50_000
-"""Limit of literals in all guards of an automaton that is stored as DOT and HOA, too."""
+"""Limit of literals in the guards of an automaton that is also stored as DOT and HOA."""
 
 
 @dataclass(frozen=True)
@@ -318,7 +319,7 @@ class SpecAutomaton:
     Attributes:
         name: reported name of the spec.
         automaton: the automaton; None if the spec has none.
-        reason: reason why the spec has none.
+        reason: reason why the spec has no automaton.
     """
 
     name: str

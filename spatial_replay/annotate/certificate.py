@@ -1,7 +1,7 @@
 """Certificates: hashes of the inputs and the results of an evaluation.
 
-Hashes depend only on content, not on the cut into blocks, chunks or files. So a recording has the same
-sample hash in two containers.
+Hashes depend only on content, not on the cut into blocks, chunks or files. So copies of
+a recording in two containers have the same sample hash.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class SampleHash:
     def _add_reports(
         self, report_name: str, times_ns: Integers, reported_ns: Integers, is_known: Booleans
     ) -> None:
-        """Add the times of reports that differ from the time of their sample; many logs have none."""
+        """Add the report times that differ from the time of their sample; many logs have no such times."""
         earlier_samples = np.flatnonzero(is_known & (reported_ns != times_ns))
         if len(earlier_samples):
             hasher = self._reports.setdefault(report_name, hashlib.sha256())
@@ -118,7 +118,7 @@ class MessageHash:
     """
 
     def __init__(self) -> None:
-        # one hash per column: many messages are hashed at once, and the cut into blocks does not count
+        # one hash per column, so that many messages are hashed at once, for any cut into blocks
         self._topics: dict[str, tuple[hashlib._Hash, hashlib._Hash, hashlib._Hash]] = {}
 
     def add(self, messages: Messages) -> None:

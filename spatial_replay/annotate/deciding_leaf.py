@@ -1,7 +1,8 @@
 """The deciding leaf of a node, found by comparing numbers instead of evaluating the log again.
 
-Robustness consists of minima, maxima and negations. So the number of a node equals the number of a leaf in
-some sample, up to its sign. If that sample is the newest, `find_leaf` finds the leaf by comparison.
+Robustness consists of minima, maxima and negations. So the number of a node equals, up to the sign, the
+number of a leaf in some sample. If that sample is the newest sample, `find_leaf` finds the leaf by
+comparison.
 """
 
 from __future__ import annotations
@@ -73,11 +74,11 @@ class DecidingLeaf(NamedTuple):
     Attributes:
         leaf: index among the program's leaves.
         number: nominal number of the leaf in the sample, with the leaf's own sign.
-        end: end of the leaf's interval that `number` is.
+        end: whether `number` is the low or the high end of the leaf's interval.
         time_ns: time of the sample.
         node: id of the leaf in the formula's tree; -1 if the leaf was found by its number alone.
         bound: deciding end of the leaf's interval with uncertainty.
-        missed: the failed implication above the leaf that causes the violation, or None.
+        missed: the failed implication that causes the violation, or None.
         response: for a leaf of the condition, the leaf closest to fulfilling the response, or None.
     """
 
@@ -147,7 +148,7 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
 
 
 _RECENT: Final = 1024
-"""Length of the search for the deciding object of a quantifier before a change, samples."""
+"""Length of the search before a change for a quantifier's deciding objects, samples."""
 
 
 class NewestSamples:
@@ -173,13 +174,13 @@ class NewestSamples:
     ) -> tuple[Atom, float] | None:
         """Return the deciding atom of a quantifier, with the deciding objects and the atom's own number.
 
-        None if the sample is not recent, if the quantifier needs earlier samples, or if no atom has the
+        Return None if the sample is not recent, the quantifier needs earlier samples, or no atom has the
         number.
 
         Args:
             leaf: the quantifier, with the object in place of a template's parameter.
             found: number and sample of the quantifier.
-            now_ns: time of the change, before which the sample must be recent.
+            now_ns: time of the change; the sample must be recent at that time.
         """
         sample = self.sample(found.time_ns, now_ns)
         if sample is None or look_back([leaf]):
@@ -216,7 +217,7 @@ class SettledViolation(NamedTuple):
         time_ns: time of the sample since which the violation is certain.
         leaf: deciding leaf, perhaps of an earlier sample; None if no leaf decided.
         atom: formula of the leaf to point at; for a quantifier its deciding atom, with objects.
-        sample: sample of that leaf; None if it was not recent at `time_ns`.
+        sample: sample of the leaf to point at; None if that sample was not recent at `time_ns`.
     """
 
     time_ns: int
@@ -238,7 +239,7 @@ class SettledViolation(NamedTuple):
 
 
 class LeafHistory:
-    """The leaves of one result in the samples so far. The cut of samples into blocks does not count."""
+    """The leaves of one result in all samples so far, for any cut of samples into blocks."""
 
     def __init__(
         self, formula: Formula, order: Sequence[Atom | Quantified], bindings: Bindings | None = None
@@ -415,7 +416,7 @@ def leaf_pairs(
 def pair_of(leaf: Formula) -> Pair | None:
     """Return the first distance or enclosure in an atom, or else the distance of its first two terms.
 
-    None for other leaves, and for terms that look back in time.
+    Return None for other leaves, and for terms that look back in time.
     """
     if not isinstance(leaf, Atom):
         return None

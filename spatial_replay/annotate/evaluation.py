@@ -1,6 +1,6 @@
 """Evaluations of specifications over samples, with the messages of an annotated log.
 
-The encoders are imported with the first message, so that an evaluation without messages imports none.
+The encoders are imported with the first message, so that an evaluation without messages imports no encoder.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class AnnotatedEvaluation:
         self.check_arrow(arrow)
 
     def check_arrow(self, title: str) -> None:
-        """Check that a result has a title; "" is valid, too.
+        """Check that a result has the title, or that the title is "".
 
         Raises:
             UsageError: no result has the title.
@@ -160,7 +160,7 @@ class AnnotatedEvaluation:
         start: tuple[int, str] = (0, ""),
         planned: str = "",
     ) -> Attachment:
-        """Return the layout for viewers of the log. All messages must be encoded before.
+        """Return the layout for viewers of the log. Encode all messages before the call.
 
         Args:
             topics: topics of messages that are not derived from samples.

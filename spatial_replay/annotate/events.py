@@ -90,8 +90,8 @@ class NodeStates:
     """The states of some nodes, each with a candidate for the next one.
 
     Attributes:
-        integers: (K, 6) int64, per node. Three are of the state: its code, and its first and last time.
-            Three are of the candidate: its code, its count of samples in a row, and its first time.
+        integers: (K, 6) int64. Columns of the state: code, first time, last time. Columns of the candidate:
+            code, number of samples in a row, first time.
         worst: (K, 2), least number of the state and of the candidate.
     """
 
@@ -146,7 +146,8 @@ def track(
     """
     integers, worst = before.integers.copy(), before.worst.copy()
     worst_places = np.tile(np.array([OF_CURRENT, OF_CANDIDATE], np.int64), (len(nodes), 1))
-    # a change takes `LASTING` samples, the first may have begun before the block, and a verdict takes one
+    # a change takes `LASTING` samples, the first change may have begun earlier, and a verdict takes one
+    # sample
     capacity = len(nodes) * (len(times_ns) // LASTING + 2)
     change_rows, worst_numbers = np.empty((capacity, 10), np.int64), np.empty((capacity, 2))
     change_count = _track(
@@ -368,7 +369,8 @@ class EventReporter:
 
     Attributes:
         settled: the violation of the root that was certain before the end of the log; None without one.
-        over: the deciding atom or the missed response of the root's verdict; "" before it, or if not known.
+        over: the deciding atom or the missed response of the root's verdict; "" before the verdict, or if
+            unknown.
     """
 
     def __init__(
@@ -410,7 +412,7 @@ class EventReporter:
         self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
-        """Add the next samples, and return the changes that they confirm, by node, then by time."""
+        """Add the next samples, and return the changes that they confirm, sorted by node, then by time."""
         if self._states.are_final:
             self._history = None
         if not len(block.times_ns) or self._states.are_final:
@@ -447,7 +449,7 @@ class EventReporter:
         return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
     def untested_warnings(self, time_ns: int, result: SpecResult) -> list[EncodedEvent]:
-        """Return a warning for each part of the result that was not tested, or only partly.
+        """Return a warning for each part of the result that was not tested, or was tested only partly.
 
         Args:
             time_ns: time of the end of the log.
@@ -577,7 +579,6 @@ class EventReporter:
             self.over = f"missed {deciding_leaf.missed.response}"
 
     def _violation(self, deciding_leaf: DecidingLeaf | None, time_ns: int) -> SettledViolation:
-        """Return the violation of the root with the deciding atom and its sample."""
         if deciding_leaf is None:
             return SettledViolation(time_ns, deciding_leaf)
         atom, _ = self._leaf(deciding_leaf.shown, time_ns)
@@ -599,9 +600,9 @@ class EventReporter:
     def _settling_words(
         self, settling_leaf: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
     ) -> tuple[str, str]:
-        """Return the deciding leaf in words, and a longer text with its condition and the time since then.
+        """Return the deciding leaf in words, and a longer text with its condition and its time.
 
-        Both are "" for None.
+        Both texts are "" for None.
         """
         if settling_leaf is None:
             return "", ""

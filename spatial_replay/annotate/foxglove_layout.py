@@ -48,7 +48,7 @@ _MOST_STRIPS: Final = 8
 
 _MOST_PLOTS: Final = 3
 _MOST_INDICATORS: Final = 6
-"""Limits of plots by unit, and of lights in the only row."""
+"""Limits of plots, one for each unit, and of lights in their row."""
 
 _LEGEND_PIXELS: Final = 240
 """Width of a legend with the values at the cursor, pixels. It is next to the curves and hides none."""
@@ -119,8 +119,8 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     """Return a light for each of the first results, in the colour of its standing at the cursor.
 
     Args:
-        outcomes: outcomes over the finished log. Titles of violated results have their worst number and its
-            time.
+        outcomes: outcomes over the finished log. The title of a violated result has the worst number
+            and its time.
     """
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
@@ -195,7 +195,7 @@ def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Pa
     """Return a panel with a strip of the standing of each result, then of named specs.
 
     Args:
-        by_stamp: whether strips read the time in the header of messages. A live source needs that, because
+        by_stamp: whether strips use the stamps in message headers. A live source needs these stamps, because
             after a seek its earlier messages arrive at the new time.
     """
     result_strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
@@ -266,7 +266,7 @@ def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
 
 
 def _with_clock(at: Instant) -> str:
-    """Return a time, also as the clock time of a viewer's cursor if that differs."""
+    """Return a time, followed by the clock time of a viewer's cursor if the clock time differs."""
     return f"{at} ({clock_text(at.time_ns)})" if at.first_ns else str(at)
 
 
@@ -298,7 +298,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve], text_zero: TextZero 
         unit_text = unit_words(unit)
         curve_settings = [
             {
-                # viewers draw samples as dots of this colour darkened, which cover a dense curve
+                # viewers draw samples as dots in a darker shade, and these dots cover a dense curve
                 "color": lighter(CURVES[index % len(CURVES)]),
                 "enabled": True,
                 "label": cut(curve.label, _LONGEST_LABEL),
@@ -369,7 +369,7 @@ class TextZero(NamedTuple):
 
 
 _OPENING_NS: Final = 99_000_000
-"""Stretch that a viewer plays by itself when it opens a log, nanoseconds."""
+"""Time that a viewer plays by itself when it opens a log, nanoseconds."""
 
 
 class LayoutContents(NamedTuple):
@@ -407,7 +407,7 @@ class LayoutContents(NamedTuple):
 
     @property
     def first_tab(self) -> str:
-        """The title of the tab that is open at first: a tab that shows something at the start of the log."""
+        """The title of the initially open tab, which has content at the start of the log."""
         if self.planned and PLAN_DECISION in self.topics:
             return "decision"
         if not self.outcomes or any(outcome.standing == VIOLATED for outcome in self.outcomes):
@@ -506,9 +506,9 @@ _Details = list[tuple[str, Panel]]
 
 
 def _details(contents: LayoutContents) -> _Details:
-    """Return the panels in tabs. The first panel is the one that is open at first."""
+    """Return the panels in tabs. The first panel is open initially."""
     trees, planned_for, zero = contents.trees, contents.planned_for, contents.zero
-    # the seconds in both tables count from another zero than the axes
+    # the zero of the seconds in both tables differs from the zero of the axes
     zero_text = f"; 0 s = {clock_text(zero.zero_ns)}" if zero is not None and zero.zero_ns else ""
     tab_rows = list[tuple[str, str, str, str]]()
     if trees:
@@ -599,7 +599,7 @@ def _tab_title(plot: Panel) -> str:
 
 
 def _tabs(identifier: str, titles_and_panels: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
-    """Return the identifier of a panel with tabs (for one panel its own), and all panels."""
+    """Return the identifier of a panel with tabs, and all panels. A single panel has no tabs."""
     panels = [panel for _, panel in titles_and_panels]
     if len(panels) == 1:
         return panels[0].identifier, panels

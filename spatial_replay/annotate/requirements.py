@@ -132,7 +132,7 @@ class Requirement(NamedTuple):
         return self._numbers(series, at)[0]
 
     def robustness(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,), its robustness times its sign if it holds or is violated, otherwise NaN.
+        """Return (S,), its robustness times its sign where it holds or is violated; NaN elsewhere.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
@@ -158,7 +158,7 @@ class Requirement(NamedTuple):
     def outcome(self, series: Floats, at: Integers) -> Floats:
         """Return (S,), the robustness of its obligation over the finished log, times the obligation's sign.
 
-        NaN if it is not known, or if the obligation fails without violating its conjunct.
+        NaN if the robustness is not known, or if the obligation fails without violating the conjunct.
 
         Args:
             series: (N, 4, T): value, now, and lower and upper over the finished log.
@@ -307,8 +307,8 @@ def _needs_all(position: _Position) -> bool:
 def _needs_all_now(position: _Position, is_always: bool) -> bool:
     """Return whether operands of a node may be invariants of their obligation.
 
-    They may below an unbounded operator that needs every sample, above all obligations, and below Boolean
-    operators that need all operands.
+    Operands may be invariants in three positions: below an unbounded operator that needs every sample, above
+    all obligations, and below Boolean operators that need all operands.
     """
     is_outside = position.obligation is None and not isinstance(position.formula, Temporal)
     return is_always or is_outside or (isinstance(position.formula, Boolean) and _needs_all(position))

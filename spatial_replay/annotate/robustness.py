@@ -1,4 +1,4 @@
-"""Numbers of every node after every sample ↔ messages of /spatial/robustness."""
+"""Conversion between the numbers of nodes after each sample and messages of /spatial/robustness."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def encode_robustness(
 @lru_cache(64)
 def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], final: bool) -> WireTemplate:
     """Return the template of a result's messages; blocks share it."""
-    # each number that is set becomes a slot, whatever its value
+    # each number that is set here becomes a slot; its value does not matter
     message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(
@@ -110,8 +110,8 @@ def standing_codes(series: Floats, *, final: bool = False) -> Codes:
 def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
     """Decode messages into one series per specification and object, in order of first appearance.
 
-    Messages with other nodes than before, such as of another run, go into a series of their own. Final
-    messages, about the finished log, are left out.
+    Messages with different nodes, such as messages of another run, get a series of their own. Final messages,
+    which describe the finished log, are left out.
 
     Raises:
         LogError: a message of another type.
@@ -189,8 +189,8 @@ class Thinning:
         """Return the points of one curve.
 
         Args:
-            times_ns: (S,) int64, a stretch of the log's samples.
-            numbers: (S,).
+            times_ns: (S,) int64, times of consecutive samples of the log.
+            numbers: (S,), numbers of the curve in these samples.
         """
         all_numbers = np.full(len(self._times_ns), np.nan)
         first_index = int(np.searchsorted(self._times_ns, times_ns[0])) if len(times_ns) else 0
@@ -229,7 +229,7 @@ def encode_curves(
 
 
 def curved_nodes(formula: Formula) -> dict[int, Formula]:
-    """Return the nodes with curves, by id: the root, and each node with a name that is unique."""
+    """Return the nodes with curves, by id: the root, and each node with a unique name."""
     nodes = [(identifier, node) for identifier, _, node in iter_nodes(formula)]
     names = [node.name for _, node in nodes]
     return {

@@ -77,8 +77,8 @@ class ReportedTree(NamedTuple):
     def written_texts(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object instead of the parameter.
 
-        Two kinds of nodes have no text of their own in the file, and get canonical texts. They are in the
-        body of a `def`, below its call, or in a quantifier, for each of its objects.
+        Nodes in the body of a `def`, and nodes of a quantifier for each of its objects, have no text of their
+        own in the file. They get canonical texts.
 
         Args:
             source: text of the file.
@@ -124,7 +124,7 @@ def _is_call(node: Formula, written_text: str, defined_names: Collection[str]) -
 def reported_trees(
     files: Sequence[Specification], instances: Sequence[Sequence[Instance]]
 ) -> list[ReportedTree]:
-    """Return the trees of all results. If two files have a spec of one name, their stems become prefixes.
+    """Return the trees of all results. If several specs have one name, the stems of their files are prefixes.
 
     Args:
         instances: instances of each file, in the order of evaluation.
@@ -257,11 +257,10 @@ def _declared_unit(unit: Unit, units: Mapping[str, str]) -> str:
 
 
 def logged_specifications(files: Sequence[Specification], units: Mapping[str, str]) -> list[Specification]:
-    """Return the specifications as a log stores them, so that the log gives equal specifications.
+    """Return the specifications in the form that a log stores, whose texts parse to equal specifications.
 
-    Each file name gets a unique stem. Constants given from outside are written into the text. A text that
-    still parses to another specification, because it was parsed with another profile, is replaced by the
-    canonical text.
+    Each file name gets a unique stem. Constants given from outside are written into the text. If the text
+    still parses to another specification, for example with another profile, the canonical text replaces it.
 
     Args:
         units: units of the log, see `with_numbers`.

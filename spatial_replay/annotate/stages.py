@@ -28,7 +28,7 @@ UNKNOWN: Final = "unknown"
 """Name of the stage after samples for which several stages are possible."""
 
 _MOST_WAYS: Final = 1_000_000
-"""Limit of an automaton with stages: pairs of a decision and a following state."""
+"""Size limit of an automaton with stages, pairs of a decision and a following state."""
 
 _MOST_HELD: Final = 1024
 """Limit of cached sets of states with their stages."""
@@ -64,7 +64,7 @@ class StagesOfStates:
     progress: tuple[float, ...]
 
     def stage_of(self, states: Sequence[int]) -> tuple[int, float]:
-        """Return the index of the stage of a run in one of some states, and the progress that is certain."""
+        """Return the index of the stage and the certain progress of a run that is in one of `states`."""
         stage_numbers = {self.numbers[state] for state in states}
         stage_number = stage_numbers.pop() if len(stage_numbers) == 1 else len(self.stages) - 1
         return stage_number, min(self.progress[state] for state in states)
@@ -221,7 +221,7 @@ def stages_of_automaton(automaton: Automaton) -> StagesOfStates:
 
 
 def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
-    """Return the successors of each state, each with the fewest propositions that must become true for it.
+    """Return each state's successors, each with the fewest propositions that must become true for the move.
 
     Propositions are in the order of the text.
     """
@@ -269,9 +269,9 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
 def _ways(
     automaton: Automaton, moves: Sequence[Mapping[int, Sequence[int]]]
 ) -> tuple[dict[int, int], dict[int, tuple[int, ...]]]:
-    """Return, by state that can accept, the number of owed propositions, and these in their order.
+    """Return the number of owed propositions of each state that can accept, and these propositions in order.
 
-    It is Dijkstra's algorithm from the accepting states backwards.
+    Dijkstra's algorithm runs backwards from the accepting states.
     """
     sources: dict[int, list[int]] = {}
     for state, targets in enumerate(moves):

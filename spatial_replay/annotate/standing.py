@@ -38,7 +38,7 @@ _RANKS.flags.writeable = False
 def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     """Return (S,), the index of the worst of R results in each of S samples.
 
-    Among violated results, the one with the earliest certain violation is the worst. Robustness is not
+    Among violated results, the result with the earliest certain violation is the worst. Robustness is not
     compared, because units may differ.
 
     Args:
@@ -107,8 +107,8 @@ class StandingEncoder:
     Between blocks it stores the last numbers of each result. Messages do not depend on the cut into blocks.
 
     Attributes:
-        outcomes: outcome of each result after `end`; before it empty.
-        order: indices of results after `end`, the worst first; earlier violations come first.
+        outcomes: outcome of each result; empty before `end`.
+        order: indices of the results, the worst first, with earlier violations first; empty before `end`.
         zero_ns: zero of the seconds; None before it is known.
     """
 
@@ -351,7 +351,7 @@ class StandingEncoder:
 
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""
-        # each number that is set becomes a slot, whatever its value
+        # each number that is set here becomes a slot; its value does not matter
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
         for entry_index, (title, unit, *_) in enumerate(self._entries):
@@ -370,7 +370,7 @@ class StandingEncoder:
 
 
 def _finite(numbers: Floats) -> Floats:
-    """Return numbers with NaN instead of infinite ones, which curves and tables cannot show."""
+    """Replace infinite numbers by NaN, because curves and tables cannot show infinity."""
     return np.where(np.isinf(numbers), np.nan, numbers)
 
 

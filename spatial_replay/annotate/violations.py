@@ -28,19 +28,18 @@ from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
-"""Limit of bindings with numbers of their own; beyond it, all members get the number of the worst."""
+"""Limit of bindings with numbers of their own. Beyond it, all members get the worst member's number."""
 
 _NO_NUMBERS: Final[Mapping[str, Floats]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
 class Shade:
-    """A part of a requirement that objects are coloured by, with numbers times the part's sign.
+    """A part of a requirement that colours objects. Its numbers are multiplied by the part's sign.
 
     Attributes:
         requirement: the part.
-        bound: number (T,) of each object that the part's quantifier binds, in the samples of a block; NaN
-            where the part holds.
+        bound: numbers (T,) in a block, by object that the part's quantifier binds; NaN where the part holds.
         least: least number of the part so far.
         is_known: whether the part was known in all samples.
         least_bound: least number of each bound object so far.
@@ -77,7 +76,7 @@ class Shade:
         """
         if not self.requirement.is_invariant or not self.least_bound:
             return part
-        # only failing samples have numbers: without one the object never failed, and held by at least 0
+        # only failing samples have numbers: an object without a number never failed, and held by at least 0
         number = self.least_bound.get(name, 0.0)
         return np.where(part < 0.0, number, part)
 
@@ -95,7 +94,7 @@ class Shade:
 
 
 class ShadeTracker:
-    """Follows the parts of one result's requirements. The cut of samples into blocks does not count."""
+    """Follows the parts of one result's requirements, for any cut of samples into blocks."""
 
     def __init__(
         self, instance: Instance, parts: Sequence[Requirement], regions: Mapping[str, Outline]
@@ -176,7 +175,7 @@ def _numbers_of(
 def _numbers_of_bindings(
     leaf: Quantified, sign: float, scene: TraceScene, bindings: Sequence[tuple[str, ...]]
 ) -> tuple[tuple[Formula, ...], Floats]:
-    """Return a quantifier's body for each of at least one binding, and the numbers (B, T) of these."""
+    """Return a quantifier's body for each of B bindings, and the bodies' numbers (B, T); B is at least 1."""
     bodies = tuple(
         substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, names), strict=True)))
         for names in bindings
@@ -197,7 +196,7 @@ class EvaluatedResult(NamedTuple):
             None for equal times.
         settled: the formula's violation that is certain before the end, or None.
         is_final: whether the block is the last sample with intervals over the finished log.
-        shades: parts of the requirements that objects are coloured by; None for the requirements themselves.
+        shades: parts of the requirements that colour objects; None if whole requirements colour objects.
     """
 
     requirements: tuple[Requirement, ...]
@@ -234,11 +233,11 @@ class Violations(NamedTuple):
         leaf: (S,) int64, index of the deciding leaf in the result's program; -1 for none.
         is_shown: (S,), whether the arrow has two ends.
         points: (S, 2, 2), ends of the arrow on the first and on the second object or region of the pair.
-        top: (S,), upper end of the higher one of both; NaN if neither has a height.
+        top: (S,), upper end of the pair's higher member; NaN if neither member has a height.
         robustness: (S,), at most 0, of the requirement or of the settling atom. It is in the unit of the log:
             a division by `scale` is undone.
         holds: (S,), whether the atom holds but must not.
-        moment_ns: (S,) int64, time of the sample of the number; -1 for the sample itself.
+        moment_ns: (S,) int64, time of the earlier sample that has the number; -1 for a number of this sample.
         atom: (S,) int64, index in `atoms` of the atom that decides a quantifier; else -1.
         atoms: atoms of quantifiers with their bound objects.
     """
@@ -326,7 +325,7 @@ def worst_robustness(
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
     """Return the violation with the arrow in some samples of a trace.
 
-    Among the violations in a sample, it is the one that was certain first.
+    Among the violations in a sample, the violation that was certain first has the arrow.
 
     The arrow is at the deciding atom of the requirement, between the two points that attain the signed
     distance of its terms, or along the protrusion of an enclosure. In the sample that settled the formula's
@@ -374,8 +373,8 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
     """Return (S,), whether the arrow of a result is at the leaf that settled its violation.
 
-    It is in the sample that settled the violation. If the atom is not an invariant, it is in all later
-    samples, too.
+    The arrow is at that leaf in the sample that settled the violation. If the requirement is not an
+    invariant, the arrow stays there in all later samples.
     """
     settled = result.settled
     if result.leaf_pairs is None or settled is None or settled.shown is None:

@@ -403,7 +403,6 @@ def _flat(places: Floats) -> Floats:
 
 
 def _refuse_edge_on(tags: TagsFile, seen_corners: Floats, known_corners: Floats) -> None:
-    """Check that tags are not seen edge-on."""
     tag_areas = [np.abs(_areas(corners.reshape(-1, 4, 2))) for corners in (seen_corners, known_corners)]
     longest_edges = np.linalg.norm(np.diff(seen_corners.reshape(-1, 4, 2), axis=1), axis=2).max(axis=1)
     if float(np.median(tag_areas[0] / longest_edges**2)) < _LEAST_SLANT:

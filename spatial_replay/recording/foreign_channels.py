@@ -115,7 +115,6 @@ def check_topic(topic: object) -> None:
 def _schema(
     topic: str, encoding: str, schema: object, schema_name: str | None, schema_encoding: str | None
 ) -> Schema:
-    """Return the schema of a definition that is no protobuf class."""
     schema_encodings = (ENCODINGS[encoding], *_OTHER_SCHEMAS.get(encoding, ()))
     if schema_encoding is not None and schema_encoding not in schema_encodings:
         raise UsageError(
@@ -137,7 +136,6 @@ def _schema(
 
 
 def _text(topic: str, encoding: str, schema: object) -> bytes:
-    """Return the bytes of a definition that is no protobuf class."""
     if isinstance(schema, Mapping) and ENCODINGS[encoding] == "jsonschema":
         return _json(topic, schema)
     if isinstance(schema, str) and encoding not in ("protobuf", "flatbuffer"):

@@ -30,7 +30,7 @@ class SceneBounds(NamedTuple):
 
     @classmethod
     def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
-        """Return the box of some samples joined with the box before; None without any footprint."""
+        """Return the box of some samples joined with an earlier box; None without any footprint."""
         lows, highs = _finite_boxes(trace.footprints.select(trace.rows[trace.rows >= 0]))
         box = cls(*lows.min(axis=0, initial=np.inf).tolist(), *highs.max(axis=0, initial=-np.inf).tolist())
         if not np.isfinite(box).all():
@@ -43,7 +43,7 @@ class SceneBounds(NamedTuple):
         return SceneBounds(*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
 
     def contains(self, footprints: FootprintBatch) -> bool:
-        """Return whether all footprints surely lie inside. Footprints with corners at NaN do not."""
+        """Return whether all footprints are certainly inside. A footprint with NaN corners is not."""
         radius = footprints.radius.max(initial=0.0)
         columns = zip(footprints.vertices.T, self[:2], self[2:], strict=True)
         return all(
@@ -148,10 +148,10 @@ def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
 
 
 def _in_steps(sides: Floats, size: float) -> Floats:
-    """Return nondecreasing lengths (T,), each rounded up to a power of `_STEP` times the first positive one.
+    """Round nondecreasing lengths (T,) up to the first positive length times a power of `_STEP`.
 
     Args:
-        size: size after the samples before; 0 before any.
+        size: size after the earlier samples; 0 without a size so far.
     """
     sizes, position = np.empty(len(sides)), 0
     while position < len(sides):

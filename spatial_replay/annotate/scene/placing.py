@@ -26,7 +26,7 @@ _NOWHERE: Final = 4
 """Rank of a position on a blocked box. Rank 2 is outside the view, 1 is on another object, 0 is free."""
 
 _FEW: Final = 0.7
-"""Share of scenes without a free position, below which the remaining scenes are copied to skip the others."""
+"""Fraction of scenes without a free position. Below it, these scenes are copied, to skip all other scenes."""
 
 Box = tuple[Floats, Floats]
 """Low and high corners (..., 2, K) of boxes in K scenes; NaN for no box."""

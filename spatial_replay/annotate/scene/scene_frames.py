@@ -50,8 +50,8 @@ def labelled_objects(
 ) -> NDArray[np.bool_]:
     """Return (S, objects), whether each object has a label.
 
-    In a crowded sample, at most `_MOST_LABELS` objects have labels: those that violate a specification, the
-    worst first, and then those that a specification names.
+    In a crowded sample, at most `_MOST_LABELS` objects have labels: first the objects that violate a
+    specification, from the worst on, and then the objects that a specification names.
 
     Args:
         named: objects that specifications name.
@@ -219,8 +219,8 @@ class DrawnEntity(NamedTuple):
         rings: outlines, (n, 2) each.
         colour: red, green and blue, 0 to 255.
         shades: index into `SHADES` for each result, the entity's colour by that result alone. Empty for a
-            single result, and for very many.
-        is_last: whether the object is missing, and the outlines are its last ones.
+            single result, and for very many results.
+        is_last: whether the object is missing, so that `rings` are its last outlines.
     """
 
     rings: tuple[Floats, ...]
@@ -310,7 +310,7 @@ class SceneFrame(NamedTuple):
     Attributes:
         entities: entities by id.
         arrows: arrows of each result in the chosen messages.
-        place: index of this message among the chosen ones.
+        place: index of this message among the chosen messages.
     """
 
     entities: Mapping[str, DrawnEntity]
@@ -391,8 +391,8 @@ class SceneContent(NamedTuple):
         names: objects in these messages, in the message before, or with a last outline.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
-        styles: (S, names), -1 where an object is absent. The last bit is its label, the second last bit its
-            violation of a result, and the other bits are its level.
+        styles: (S, names), -1 where an object is absent. Bit 0: it has a label. Bit 1: it violated a result.
+            Higher bits: its level.
         missing: (S, names), index in `last` of a missing object's outline; else -1.
         last: last outlines of missing objects.
         observations: (S, names), rows of `rings`, `footprints` and `middles`.

@@ -338,14 +338,14 @@ def lying_at(z: float) -> Pose:
 
 OBJECT_OPACITY: Final = 0.55
 REGION_OPACITY: Final = 0.3
-"""Opacity of faces: objects are more opaque than the regions that they lie in."""
+"""Opacity of faces: objects are more opaque than the regions around them."""
 
 OBJECT: Final = "object/"
 REGION: Final = "region/"
 WITNESS: Final = "witness"
 
 LEVELS: Final = 8
-"""Highest level of flat objects; small ones have higher levels than large ones."""
+"""Highest level of flat objects; smaller objects have higher levels."""
 
 _LABEL_LIFT: Final = 0.01
 """Height of a region's name above the region, fraction of the region's size."""
@@ -357,7 +357,7 @@ class CauseText(NamedTuple):
     Attributes:
         text: text before the number.
         length: length of the number with its unit, bytes.
-        dashes: dashed outlines at an earlier sample that the arrow is about: x and y of the dashes' ends.
+        dashes: dashed outlines at the earlier sample of the arrow: x and y of the dashes' ends.
         names: objects and regions of the deciding atom.
     """
 
@@ -367,13 +367,13 @@ class CauseText(NamedTuple):
     names: tuple[TrackedName | RegionName, ...] = ()
 
     def ends(self, numbers: Sequence[bytes]) -> list[bytes]:
-        """Return the last bytes of labels, with the number: at least 8, because slots have 8 bytes."""
+        """Return the last bytes of labels with their numbers: at least 8 bytes, the size of a slot."""
         text = self.text.encode().rjust(8)
         return [(text + number)[-max(8, self.length) :] for number in numbers]
 
     @property
     def words(self) -> list[int]:
-        """The starts of the slots of 8 bytes that fill such an end; the last two slots may overlap."""
+        """The starts of the 8-byte slots in the last bytes of a label; the last two slots may overlap."""
         last = max(8, self.length) - 8
         return [*range(0, last, 8), last]
 
@@ -548,7 +548,7 @@ def _encode(message: SceneUpdate) -> bytes:
 
 
 def border_of(region: Region) -> list[Floats]:
-    """Return the rings (n, 2) that outline a region: the ring of a disc, or the border as it is written."""
+    """Return the rings (n, 2) that outline a region: the ring of a disc, or the specified border."""
     return list(region.rings) if region.outline.is_disc else [np.array(region.outline.vertices, np.float64)]
 
 
@@ -707,7 +707,6 @@ _NS: Final = 1_000_000_000
 
 
 def _offsets(payload: bytes, pattern: bytes) -> list[int]:
-    """Return the offsets of some bytes in a payload."""
     return [hit.start() for hit in re.finditer(re.escape(pattern), payload)]
 
 

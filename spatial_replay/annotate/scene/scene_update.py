@@ -141,7 +141,7 @@ _UNSCALED: Final = 1.0
 
 _MOST_TEMPLATES: Final = 256
 _MOST_SHADES: Final = 4_096
-"""Limit of shades in one message, which has one per result and object or region."""
+"""Limit of shades in one message; each result has one shade per object or region."""
 _LINE: Final = 0.05
 """Estimated line height, fraction of the scene's longer side."""
 
@@ -518,7 +518,8 @@ def _content(
 
 
 _ARROW_BOX, _THEN_BOX, _BLOCKED = 2, 3, 6
-"""Indices of the boxes of the arrow and of earlier outlines among the blocked boxes, and count of these.
+"""Indices of the boxes of the arrow and of earlier outlines among the blocked boxes, and number
+of blocked boxes.
 
 The boxes of the objects come first, and the boxes of names last."""
 
