@@ -242,7 +242,7 @@ class Step(Displayed):
             sample = candidate.map.made_of.now.about.sample
             tracked = sample.objects[candidate.name]
             start, yaw = centre_of(tracked.footprint), tracked.yaw
-            avoided = [] if candidate.target is None else [(candidate.target.x, candidate.target.y)]
+            avoided_places = [] if candidate.target is None else [(candidate.target.x, candidate.target.y)]
             targets += [
                 Target(
                     candidate.name,
@@ -253,7 +253,7 @@ class Step(Displayed):
                     (start, (x, y)),
                     robustness,
                 )
-                for x, y, turn, robustness in candidate.map.best_poses(count, avoided)
+                for x, y, turn, robustness in candidate.map.best_poses(count, avoided_places)
             ]
         return tuple(sorted(targets, key=lambda target: -target.robustness)[:count])
 
@@ -312,8 +312,8 @@ def sentence_of(step: Step) -> str:
     """Return the reason of a step, with the time and cause of a loss of acceptance."""
     if step.lost is None:
         return step.reason
-    why = f", when this held: {step.lost.text}" if step.lost.text else ""
-    return f"{step.reason}; that was lost at {time_text(step.lost.time_ns)}{why}"
+    cause_text = f", when this held: {step.lost.text}" if step.lost.text else ""
+    return f"{step.reason}; that was lost at {time_text(step.lost.time_ns)}{cause_text}"
 
 
 class Executor(Protocol):

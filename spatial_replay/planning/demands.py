@@ -74,13 +74,13 @@ def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
     """Return the rules for the way, with all bans of a single literal in one or two rules."""
     required = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
     avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
-    others = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
-    more = [f"{len(others) - _MOST_RULES} more rules"] if len(others) > _MOST_RULES else []
+    other_rules = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
+    more_text = [f"{len(other_rules) - _MOST_RULES} more rules"] if len(other_rules) > _MOST_RULES else []
     return (
         *([f"keep {_listing(required, 'and')}"] if required else []),
         *([f"avoid {_listing(avoided, 'and')}"] if avoided else []),
-        *others[:_MOST_RULES],
-        *more,
+        *other_rules[:_MOST_RULES],
+        *more_text,
     )
 
 
@@ -125,10 +125,10 @@ def _literals_of(guard: str) -> dict[str, bool]:
 
 def _operands_of_and(text: str) -> list[str]:
     operands, start = [], 0
-    for place, depth in enumerate(_depths(text)):
-        if depth == 0 and text.startswith(" and ", place):
-            operands.append(text[start:place])
-            start = place + len(" and ")
+    for index, depth in enumerate(_depths(text)):
+        if depth == 0 and text.startswith(" and ", index):
+            operands.append(text[start:index])
+            start = index + len(" and ")
     return [*operands, text[start:]]
 
 
@@ -172,11 +172,13 @@ def _part_of_table(cube: Mapping[str, bool], names: Sequence[str]) -> tuple[int 
 
 def _listing(texts: Sequence[str], conjunction: str) -> str:
     """Return formulas between backquotes; a conjunction joins the last two."""
-    *first, last = [f"`{_shorten(text)}`" for text in texts] or ["anything"]
-    return f"{', '.join(first)} {conjunction} {last}" if first else last
+    *leading, last = [f"`{_shorten(text)}`" for text in texts] or ["anything"]
+    return f"{', '.join(leading)} {conjunction} {last}" if leading else last
 
 
 def _shorten(text: str) -> str:
     """Return a formula; a long one is shortened to the first operand of its "and"."""
-    first, *others = _operands_of_and(text)
-    return f"{first} and {len(others)} more" if others and len(text) > _LONGEST else text
+    first_operand, *other_operands = _operands_of_and(text)
+    return (
+        f"{first_operand} and {len(other_operands)} more" if other_operands and len(text) > _LONGEST else text
+    )

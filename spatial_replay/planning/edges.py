@@ -81,32 +81,37 @@ def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bo
         case Boolean(operator="not"):
             return alternatives(formula.operands[0], not wanted)
         case Boolean():
-            parts = [alternatives(operand, wanted) for operand in formula.operands]
+            options_by_operand = [alternatives(operand, wanted) for operand in formula.operands]
             if (formula.operator == "and") == wanted:
-                return _conjoin(parts)
-            return [conjunction for part in parts for conjunction in part][:MOST_ALTERNATIVES]
+                return _conjoin(options_by_operand)
+            return [conjunction for options in options_by_operand for conjunction in options][
+                :MOST_ALTERNATIVES
+            ]
         case _:
             return [((formula, wanted),)]
 
 
 def demands_of(cube: Cube, formulas: Sequence[Formula], least: float) -> list[tuple[Demand, ...]]:
     """Return alternatives that imply a cube of propositions, as conjunctions of demands."""
-    parts = [alternatives(formulas[number], value) for number, value in cube]
-    return [tuple(Demand(*literal, least) for literal in conjunction) for conjunction in _conjoin(parts)]
+    options_by_literal = [alternatives(formulas[number], value) for number, value in cube]
+    return [
+        tuple(Demand(*literal, least) for literal in conjunction)
+        for conjunction in _conjoin(options_by_literal)
+    ]
 
 
 def _conjoin(
-    parts: Sequence[list[tuple[tuple[Formula, bool], ...]]],
+    options_by_operand: Sequence[list[tuple[tuple[Formula, bool], ...]]],
 ) -> list[tuple[tuple[Formula, bool], ...]]:
-    combined: list[tuple[tuple[Formula, bool], ...]] = [()]
-    for part in parts:
+    conjunctions: list[tuple[tuple[Formula, bool], ...]] = [()]
+    for options in options_by_operand:
         # cut at each step, because the number of products grows exponentially
-        combined = [(*left, *right) for left, right in product(combined, part)][:MOST_ALTERNATIVES]
+        conjunctions = [(*left, *right) for left, right in product(conjunctions, options)][:MOST_ALTERNATIVES]
     # without duplicate literals, and without contradictions
-    unique = (dict.fromkeys(conjunction) for conjunction in combined)
+    unique_literals = (dict.fromkeys(conjunction) for conjunction in conjunctions)
     return [
         tuple(literals)
-        for literals in unique
+        for literals in unique_literals
         if not any((formula, not value) in literals for formula, value in literals)
     ]
 
@@ -134,13 +139,13 @@ class Budget:
     """
 
     def __init__(self, maps: float) -> None:
-        self.left, self._maps = maps, maps
+        self.left, self._initial_maps = maps, maps
         self.arrangements = self.parking_places = 0
 
     @property
     def search(self) -> Search:
         """The search effort until now."""
-        return Search(self._maps - self.left, self.arrangements, self.parking_places)
+        return Search(self._initial_maps - self.left, self.arrangements, self.parking_places)
 
     def spend(self, maps: float = 1.0) -> bool:
         """Subtract maps from the budget; return False if it is exceeded."""
@@ -150,8 +155,8 @@ class Budget:
 
 def move_objects(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
-    placed = {name: moved_object(sample.objects[name], *pose) for name, pose in poses.items()}
-    return with_objects(sample, placed, later_ns)
+    moved_objects = {name: moved_object(sample.objects[name], *pose) for name, pose in poses.items()}
+    return with_objects(sample, moved_objects, later_ns)
 
 
 def with_objects(sample: Sample, objects: Mapping[str, TrackedObject], later_ns: int = 0) -> Sample:
@@ -214,9 +219,9 @@ def unknown_reasons(
     for leaf in _leaves_of(formulas):
         if not isinstance(leaf, Atom):
             continue
-        names = [base.name for term in leaf.terms if isinstance(base := base_of(term), TrackedName)]
+        object_names = [base.name for term in leaf.terms if isinstance(base := base_of(term), TrackedName)]
         for reason in unknowns_of(scene, leaf):
-            missing = next((name for name in names if reason == f"{name} is not in the sample"), None)
+            missing = next((name for name in object_names if reason == f"{name} is not in the sample"), None)
             if missing is not None and missing in seen:
                 reason = f"{missing} has not been seen since {time_text(seen[missing])}"
             hint = nearest_hint(missing, sample.objects) if missing and missing not in seen else ""
@@ -226,17 +231,19 @@ def unknown_reasons(
 
 def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
     """Return the open groups without enough members in a proposition; none if any part has members."""
-    empty: list[Group] = []
+    empty_groups: list[Group] = []
     for leaf in _leaves_of([formula]):
-        count = 1
+        least_members = 1
         groups = [base for term in iter_terms([leaf]) if isinstance(base := base_of(term), Group)]
         if isinstance(leaf, Quantified) and isinstance(leaf.group, Group):
-            groups, count = [leaf.group], len(leaf.variables)
-        missing = [group for group in groups if group.is_open and _members_of(group, sample) < count]
-        if not missing:
+            groups, least_members = [leaf.group], len(leaf.variables)
+        missing_groups = [
+            group for group in groups if group.is_open and _members_of(group, sample) < least_members
+        ]
+        if not missing_groups:
             return []
-        empty += missing
-    return empty
+        empty_groups += missing_groups
+    return empty_groups
 
 
 def absence_text(groups: Iterable[Group], sample: Sample) -> str:
@@ -260,9 +267,9 @@ def _leaves_of(formulas: Iterable[Formula]) -> Iterator[Formula]:
 def _members_of(group: Group, sample: Sample) -> int:
     classes = {name: tracked.class_name for name, tracked in sample.objects.items()} | dict(sample.unknown)
     excluded = {name.name for name in group.excluded}
-    own_class = (group.class_name or ANY_CLASS).casefold()
+    group_class = (group.class_name or ANY_CLASS).casefold()
     return sum(
-        name not in excluded and own_class in (ANY_CLASS, (class_name or "").casefold())
+        name not in excluded and group_class in (ANY_CLASS, (class_name or "").casefold())
         for name, class_name in classes.items()
     )
 
@@ -283,12 +290,15 @@ def refuse_template(specification: Specification, name: str) -> None:
 
 def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
     """Return, for each proposition, the names of the innermost specs in a formula that contain it."""
-    parts = {
+    formulas_by_spec = {
         spec.name: list(iter_formulas(spec))[1:] for spec in list(iter_formulas(formula))[1:] if spec.name
     }
-    innermost = {name: inner for name, inner in parts.items() if not any(part.name for part in inner)}
+    innermost_specs = {
+        name: nested for name, nested in formulas_by_spec.items() if not any(part.name for part in nested)
+    }
     return [
-        [name for name, inner in innermost.items() if proposition in inner] for proposition in propositions
+        [name for name, nested in innermost_specs.items() if proposition in nested]
+        for proposition in propositions
     ]
 
 
@@ -315,13 +325,13 @@ class IdleTransitions(NamedTuple):
 
 def idle_transitions(automaton: Automaton, state: int, symbol: Symbol) -> IdleTransitions:
     """Return the transitions from a state that time alone takes."""
-    visited = {state: None}
-    after = automaton.step_set({state}, symbol)
-    while len(after) == 1 and not after <= visited.keys():
-        (state,) = after
-        visited[state] = None
-        after = automaton.step_set({state}, symbol)
-    return IdleTransitions(tuple(visited))
+    visited_states = {state: None}
+    next_states = automaton.step_set({state}, symbol)
+    while len(next_states) == 1 and not next_states <= visited_states.keys():
+        (state,) = next_states
+        visited_states[state] = None
+        next_states = automaton.step_set({state}, symbol)
+    return IdleTransitions(tuple(visited_states))
 
 
 def consideration_of(
@@ -338,8 +348,8 @@ def consideration_of(
         (path[0].source, *(transition.target for transition in path)),
         (path[0].source, path[0].target),
     )
-    others = _other_edges(automaton, edge, pruned, symbol)
-    return Consideration(states, edge, guards_of(automaton, path[:1]), guards_of(automaton, others), ())
+    rivals = _other_edges(automaton, edge, pruned, symbol)
+    return Consideration(states, edge, guards_of(automaton, path[:1]), guards_of(automaton, rivals), ())
 
 
 def order_text(automaton: Automaton, path: Sequence[Transition], without: Collection[Edge]) -> str:
@@ -348,11 +358,11 @@ def order_text(automaton: Automaton, path: Sequence[Transition], without: Collec
     Args:
         without: pruned edges, and edges that time alone takes.
     """
-    first = path[0]
-    rival = next(automaton.paths(first.source, {*without, (first.source, first.target)}), ())
-    if len(rival) != len(path):
+    move = path[0]
+    rival_path = next(automaton.paths(move.source, {*without, (move.source, move.target)}), ())
+    if len(rival_path) != len(path):
         return ""
-    return f"{first.source} -> {rival[0].target} is as short; the state with the lower number comes first"
+    return f"{move.source} -> {rival_path[0].target} is as short; the state with the lower number comes first"
 
 
 def equivalent_edges(
@@ -367,12 +377,12 @@ def equivalent_edges(
     A deadline unrolls one edge into a copy for each remaining sample. If one copy is impossible now, the
     later copies are impossible too, and the planner skips them.
     """
-    constraints = set(consideration.constraints.cubes)
+    constraint_cubes = set(consideration.constraints.cubes)
     for edge in ((source, target) for source in idle.states[1:] for target in automaton.successors[source]):
         transition = automaton.transition(*edge)
         if transition is not None and transition.guard == consideration.progress.cubes:
-            others = _other_edges(automaton, edge, pruned, symbol)
-            if constraints <= {cube for rival in others for cube in rival.guard}:
+            other_transitions = _other_edges(automaton, edge, pruned, symbol)
+            if constraint_cubes <= {cube for rival in other_transitions for cube in rival.guard}:
                 yield edge
 
 
@@ -385,10 +395,10 @@ def _other_edges(
         NoAutomatonError: a guard is cut, so its missing cubes would not be avoided.
     """
     source = edge[0]
-    allowed = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
+    allowed_targets = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
     for target in automaton.successors[source]:
         transition = automaton.transition(source, target)
-        if transition is not None and target not in allowed and (source, target) not in pruned:
+        if transition is not None and target not in allowed_targets and (source, target) not in pruned:
             if transition.is_cut:
                 reason = f"the guard of {source} -> {target} takes more than {MAX_CUBES} cubes"
                 raise NoAutomatonError(
@@ -425,8 +435,12 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
     ]
     cube = min(cubes, key=len, default=())
     # a condition that has just become true explains more than a condition that held before
-    changed = [literal for literal in cube if before and before[literal[0]] is not symbol[literal[0]]]
-    return " and ".join(automaton.propositions[number].literal(value) for number, value in changed or cube)
+    changed_literals = [
+        literal for literal in cube if before and before[literal[0]] is not symbol[literal[0]]
+    ]
+    return " and ".join(
+        automaton.propositions[number].literal(value) for number, value in changed_literals or cube
+    )
 
 
 def moved_later(
@@ -452,30 +466,30 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason],
     Args:
         why: infeasible part of the task; if empty, the detail of a reason `LATER`.
     """
-    ahead, reachable = [state], {state}
-    while ahead:
-        after = set(automaton.successors[ahead.pop()]) - reachable
-        reachable |= after
-        ahead += after
-    edges: dict[str, list[str]] = {}
+    pending_states, reachable_states = [state], {state}
+    while pending_states:
+        new_states = set(automaton.successors[pending_states.pop()]) - reachable_states
+        reachable_states |= new_states
+        pending_states += new_states
+    edges_by_kind: dict[str, list[str]] = {}
     for (source, target), reason in sorted(pruned.items()):
-        if source in reachable:
+        if source in reachable_states:
             # the last failure of an edge explains more than its number of attempts
             kind = str(reason) if reason.kind.startswith(_TRIED) else reason.kind
-            edges.setdefault(kind, []).append(f"{source} -> {target}")
-    reasons = "; ".join(f"{_edges_text(texts)}: {kind}" for kind, texts in edges.items())
-    later = [
+            edges_by_kind.setdefault(kind, []).append(f"{source} -> {target}")
+    reasons = "; ".join(f"{_edges_text(texts)}: {kind}" for kind, texts in edges_by_kind.items())
+    later_details = [
         reason.detail
         for edge, reason in sorted(pruned.items())
-        if edge[0] in reachable and reason.kind == LATER
+        if edge[0] in reachable_states and reason.kind == LATER
     ]
-    what = f"; what cannot be done: {why or later[0]}" if why or later else ""
-    return f"no path left: every way from state {state} was given up ({reasons}){what}"
+    impossible_text = f"; what cannot be done: {why or later_details[0]}" if why or later_details else ""
+    return f"no path left: every way from state {state} was given up ({reasons}){impossible_text}"
 
 
 def _edges_text(edges: Sequence[str]) -> str:
-    more = f" and {len(edges) - _LISTED} more" if len(edges) > _LISTED else ""
-    return ", ".join(edges[:_LISTED]) + more
+    rest_text = f" and {len(edges) - _LISTED} more" if len(edges) > _LISTED else ""
+    return ", ".join(edges[:_LISTED]) + rest_text
 
 
 # ------------------------------------------------------------------------------------------------ attempts
@@ -512,41 +526,48 @@ class Attempts:
     def __init__(self) -> None:
         self.motions = 0
         self.planned: tuple[Target, ...] = ()
-        self._failed: dict[Edge, Counter[str]] = {}
-        self._total: Counter[Edge] = Counter()
-        self._places: dict[str, tuple[tuple[float, float], ...]] = {}
-        self._left: dict[Edge, int] = {}
-        self._last: dict[Edge, str] = {}
-        self._motions: list[FailedMotion] = []
+        self._failure_counts: dict[Edge, Counter[str]] = {}
+        self._motion_counts: Counter[Edge] = Counter()
+        self._failed_places: dict[str, tuple[tuple[float, float], ...]] = {}
+        self._least_left: dict[Edge, int] = {}
+        self._last_failures: dict[Edge, str] = {}
+        self._failed_motions: list[FailedMotion] = []
         self._begin: tuple[Sample, Settings]
 
     @property
     def are_any(self) -> bool:
         """Whether any motion was tried."""
-        return bool(self._total)
+        return bool(self._motion_counts)
 
     def forgiven(self) -> Attempts:
         """Return these attempts with only refused motions as failures, so that other motions are repeated."""
         # a shallow copy: both share the counts of motions
         attempts = copy(self)
-        attempts._motions, attempts._places = [motion for motion in self._motions if motion.refused], {}
+        attempts._failed_motions, attempts._failed_places = (
+            [motion for motion in self._failed_motions if motion.refused],
+            {},
+        )
         return attempts
 
     def why_not_again(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return the reason why an edge is not tried again; None if it may be tried."""
-        if (failed := self.failures(edge)) >= most_failed:
-            return Reason(_count_text(failed), self._last.get(edge, ""))
+        if (failure_count := self.failures(edge)) >= most_failed:
+            return Reason(_count_text(failure_count), self._last_failures.get(edge, ""))
         # a successful motion resets the failures, so without this limit `G F …` could continue forever
-        return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
+        return (
+            Reason(f"tried {MOST_MOTIONS} times in all")
+            if self._motion_counts[edge] >= MOST_MOTIONS
+            else None
+        )
 
     def failures(self, edge: Edge) -> int:
         """Return the number of failed motions for an edge of the object with the most failures."""
-        return max(self._failed.get(edge, Counter()).values(), default=0)
+        return max(self._failure_counts.get(edge, Counter()).values(), default=0)
 
     def begin(self, edge: Edge, name: str, sample: Sample, settings: Settings) -> None:
         """Count a motion of an object for an edge; it counts as failed until it is concluded."""
-        self._failed.setdefault(edge, Counter())[name] += 1
-        self._total[edge] += 1
+        self._failure_counts.setdefault(edge, Counter())[name] += 1
+        self._motion_counts[edge] += 1
         self._begin = sample, settings
 
     def conclude(
@@ -567,45 +588,47 @@ class Attempts:
             is_stopped: whether the planner stopped the motion; the object then counts as moved.
         """
         before, settings = self._begin
-        refused = before is sample and not outcome.succeeded
-        self.motions += not refused
+        is_refused = before is sample and not outcome.succeeded
+        self.motions += not is_refused
         is_there = outcome.succeeded and _is_at(target, sample, settings)
         self.planned = aim.motions[1:] if is_there else ()
         if not outcome.succeeded:
-            said = (outcome.reason, "no sample came during the motion" if refused else "")
-            self._last[aim.edge] = "; ".join(filter(None, said))
-            stayed = not is_stopped and _stands(target.name, before, sample, settings)
-            self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
+            reasons = (outcome.reason, "no sample came during the motion" if is_refused else "")
+            self._last_failures[aim.edge] = "; ".join(filter(None, reasons))
+            has_stayed = not is_stopped and _stands(target.name, before, sample, settings)
+            self._failed_motions.append(FailedMotion(target, before, has_stayed, is_refused, outcome.at))
             # a motion that failed at its target may succeed at another place
-            if outcome.at in (None, "place") and not (settings.skill == "push" and stayed):
-                self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
+            if outcome.at in (None, "place") and not (settings.skill == "push" and has_stayed):
+                self._failed_places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
-            del self._failed[aim.edge]
+            del self._failure_counts[aim.edge]
         elif not is_there:
-            place = "({:.4g}, {:.4g})".format(*centre_of(sample.objects[target.name].footprint))
-            self._last[aim.edge] = f"moved, but then not at its target: {target.name} at {place}"
-        elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
+            place_text = "({:.4g}, {:.4g})".format(*centre_of(sample.objects[target.name].footprint))
+            self._last_failures[aim.edge] = (
+                f"moved, but then not at its target: {target.name} at {place_text}"
+            )
+        elif aim.is_joint and len(aim.motions) < self._least_left.get(aim.edge, MOST_MOTIONS):
             # one of several motions succeeded, and fewer motions are left than ever before
-            self._left[aim.edge] = len(aim.motions)
-            self._failed[aim.edge].clear()
+            self._least_left[aim.edge] = len(aim.motions)
+            self._failure_counts[aim.edge].clear()
         elif aim.is_joint:
             # a successful detour after a failure; `MOST_MOTIONS` still bounds all motions for the edge
-            del self._failed[aim.edge][target.name]
+            del self._failure_counts[aim.edge][target.name]
 
     def withdraw(self, edge: Edge, name: str) -> None:
         """Do not count the newest motion of an object for an edge as an attempt."""
-        self._failed[edge][name] -= 1
-        self._total[edge] -= 1
+        self._failure_counts[edge][name] -= 1
+        self._motion_counts[edge] -= 1
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
         """Return the places (x, y) where motions of an object failed, for any edge."""
-        return self._places.get(name, ())
+        return self._failed_places.get(name, ())
 
     def needs_room(self, name: str) -> bool:
         """Return whether an object could not be moved to a place, perhaps for lack of room at the place."""
         return any(
             motion.target.name == name and motion.stayed and motion.at in (None, "place")
-            for motion in self._motions
+            for motion in self._failed_motions
         )
 
     def failed_pick(self, name: str, sample: Sample, settings: Settings) -> bool:
@@ -623,7 +646,7 @@ class Attempts:
 
     def _here(self, name: str, sample: Sample, settings: Settings) -> Iterator[FailedMotion]:
         """Yield the failed motions of an object that began in the scene of a sample."""
-        for motion in self._motions:
+        for motion in self._failed_motions:
             if motion.target.name == name and _is_same_scene(motion, sample, settings):
                 yield motion
 
@@ -631,8 +654,8 @@ class Attempts:
 def _is_at(target: Target, sample: Sample, settings: Settings) -> bool:
     """Return whether an object is at its target; True for an object that is not in the sample."""
     tracked = sample.objects.get(target.name)
-    allowed = settings.workspace.grid.cell_size + (0.0 if tracked is None else tracked.uncertainty)
-    return tracked is None or math.dist(centre_of(tracked.footprint), (target.x, target.y)) <= allowed
+    tolerance = settings.workspace.grid.cell_size + (0.0 if tracked is None else tracked.uncertainty)
+    return tracked is None or math.dist(centre_of(tracked.footprint), (target.x, target.y)) <= tolerance
 
 
 def _count_text(count: int) -> str:
@@ -647,11 +670,12 @@ def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> 
     if settings.skill == "push":
         if not motion.stayed:
             return False
-        near = BESIDE * radius_of(tracked)
+        near_distance = BESIDE * radius_of(tracked)
         names = [
             neighbour
             for neighbour in names
-            if min(_away(tracked, scene.objects.get(neighbour)) for scene in (before, sample)) <= near
+            if min(_away(tracked, scene.objects.get(neighbour)) for scene in (before, sample))
+            <= near_distance
         ]
     return all(_stands(name, before, sample, settings) for name in names)
 
@@ -660,16 +684,16 @@ def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
     """Return the approximate distance between two objects; infinite if the other is missing."""
     if other is None:
         return math.inf
-    centres = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
-    return centres - radius_of(tracked) - radius_of(other)
+    centre_distance = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
+    return centre_distance - radius_of(tracked) - radius_of(other)
 
 
 def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
     """Return whether an object has not moved since an earlier sample; True if it is in neither sample."""
-    was, now = before.objects.get(name), sample.objects.get(name)
-    if was is None or now is None:
-        return was is now
-    moved = math.dist(centre_of(was.footprint), centre_of(now.footprint))
-    turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau)
-    allowed = settings.workspace.grid.cell_size + was.uncertainty + now.uncertainty
-    return moved <= allowed and abs(turned) <= _TURNED
+    earlier, newest = before.objects.get(name), sample.objects.get(name)
+    if earlier is None or newest is None:
+        return earlier is newest
+    moved_distance = math.dist(centre_of(earlier.footprint), centre_of(newest.footprint))
+    turn = math.remainder((newest.yaw or 0.0) - (earlier.yaw or 0.0), math.tau)
+    tolerance = settings.workspace.grid.cell_size + earlier.uncertainty + newest.uncertainty
+    return moved_distance <= tolerance and abs(turn) <= _TURNED

@@ -123,15 +123,15 @@ class _Field:
         turns: (A,), angles by which the object is turned, radians.
         clearance: (A, rows, columns), distance to immovable objects minus the required clearance; -inf out of
             reach.
-        standing: distance to each immovable object; "" is for the workspace's obstacles.
-        apart: distance to each other movable object minus the required clearance.
+        obstacle_distances: distance to each immovable object; "" is for the workspace's obstacles.
+        gaps: distance to each other movable object minus the required clearance.
         surplus: surplus of each demand on the object.
     """
 
     turns: Floats
     clearance: Floats
-    standing: Mapping[str, Floats]
-    apart: Mapping[str, Floats]
+    obstacle_distances: Mapping[str, Floats]
+    gaps: Mapping[str, Floats]
     surplus: Mapping[Demand, Floats]
 
 
@@ -149,12 +149,12 @@ class Arranger:
         self._sample, self._regions, self._settings, self._budget = sample, regions, settings, budget
         self._demands = tuple(dict.fromkeys(demands))
         self._grid = settings.workspace.grid
-        order = sorted(sample.objects) if settings.movable is None else settings.movable
-        self._movable = {name: sample.objects[name] for name in order if name in sample.objects}
-        self._about = {demand: self._names(demand) for demand in self._demands}
+        movable_names = sorted(sample.objects) if settings.movable is None else settings.movable
+        self._movable = {name: sample.objects[name] for name in movable_names if name in sample.objects}
+        self._names_by_demand = {demand: self._names(demand) for demand in self._demands}
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
-        self._visits = 0
+        self._visit_count = 0
         # allowed shortfall of a demand at a cell's centre, because another place in the cell may meet it
         self._slack = 0.0
         self._is_placed = settings.refine and settings.skill == "place"
@@ -163,9 +163,9 @@ class Arranger:
         return tuple(name for name in self._movable if concerns(demand.formula, name))
 
     @cached_property
-    def _unmet(self) -> tuple[Demand, ...]:
-        met = zip(self._demands, self._surplus_in(self._sample), strict=True)
-        return tuple(demand for demand, value in met if value < 0.0)
+    def _unmet_demands(self) -> tuple[Demand, ...]:
+        demand_surpluses = zip(self._demands, self._surplus_in(self._sample), strict=True)
+        return tuple(demand for demand, value in demand_surpluses if value < 0.0)
 
     def _surplus_in(self, sample: Sample) -> list[float]:
         """Return the surplus of each demand in a sample."""
@@ -174,47 +174,54 @@ class Arranger:
 
     def why_hopeless(self) -> str:
         """Return why no arrangement can meet the demands; "" if no single object proves that."""
-        for demand in self._unmet:
-            if not self._about[demand]:
+        for demand in self._unmet_demands:
+            if not self._names_by_demand[demand]:
                 return "no object that can be moved matters to it"
         for name in self._movable:
-            demands = [demand for demand in self._demands if self._about[demand] == (name,)]
+            demands = [demand for demand in self._demands if self._names_by_demand[demand] == (name,)]
             if (
                 demands
-                and any(demand in self._unmet for demand in demands)
+                and any(demand in self._unmet_demands for demand in demands)
                 and (field := self._field(name)) is not None
             ):
-                met = np.minimum.reduce([field.surplus[demand] for demand in demands])
-                least = -self._in_cell if self._is_placed else 0.0
-                if not ((field.clearance > least) & (met >= least)).any():
-                    if (met >= 0.0).any():
-                        stands = _standing_text(self._standing(field, met >= 0.0))
-                        return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
-                    missing = -float(met[field.clearance > 0.0].max(initial=-math.inf))
-                    nowhere = f"{name}: nowhere would all of it hold, {missing:.4g} is missing at best"
+                least_surplus = np.minimum.reduce([field.surplus[demand] for demand in demands])
+                tolerance = -self._corner_distance if self._is_placed else 0.0
+                if not ((field.clearance > tolerance) & (least_surplus >= tolerance)).any():
+                    if (least_surplus >= 0.0).any():
+                        standing_text = _standing_text(self._standing(field, least_surplus >= 0.0))
+                        return (
+                            f"{standing_text or 'the robot does not reach'} wherever {name} would have to be"
+                        )
+                    shortfall = -float(least_surplus[field.clearance > 0.0].max(initial=-math.inf))
+                    sentence = f"{name}: nowhere would all of it hold, {shortfall:.4g} is missing at best"
                     seams = seam_texts((demand.formula for demand in demands), self._regions)
-                    return "; ".join([nowhere, *seams])
+                    return "; ".join([sentence, *seams])
         return ""
 
     @property
-    def _in_cell(self) -> float:
+    def _corner_distance(self) -> float:
         """The distance from the centre of a cell to its corners."""
         return self._grid.cell_size / math.sqrt(2.0)
 
     def what_stands(self) -> str:
         """Return a sentence on immovable objects at places where movable ones could go; "" without any."""
-        names: dict[str, None] = {}
+        object_names: dict[str, None] = {}
         for name, field in self._fields.items():
             cells = self._meeting_cells(field, name, tuple(self._movable))
             if not cells.all():
-                names |= dict.fromkeys(self._standing(field, cells))
-        return f"{_standing_text(list(names))} there" if names else ""
+                object_names |= dict.fromkeys(self._standing(field, cells))
+        return f"{_standing_text(list(object_names))} there" if object_names else ""
 
     def _standing(self, field: _Field, cells: Booleans) -> list[str]:
         """Return the immovable objects that occupy some of `cells`, most cells first."""
         clearance = self._settings.workspace.clearance
-        counts = {name: int((cells & (away <= clearance)).sum()) for name, away in field.standing.items()}
-        return sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
+        cell_counts = {
+            name: int((cells & (distance <= clearance)).sum())
+            for name, distance in field.obstacle_distances.items()
+        }
+        return sorted(
+            (name for name in cell_counts if cell_counts[name]), key=lambda name: -cell_counts[name]
+        )
 
     def arrangements(self, most: int) -> Iterator[dict[str, Pose]]:
         """Yield arrangements, those of the smallest sets of objects first.
@@ -235,68 +242,71 @@ class Arranger:
         fits = not self._is_placed and next(self._between_cells(most), None) is not None
         return "smaller cells (cell_size) may help" if fits else ""
 
-    def _between_cells(self, most: int) -> Iterator[dict[str, Pose]]:
-        self._slack = self._in_cell
+    def _between_cells(self, max_moved: int) -> Iterator[dict[str, Pose]]:
+        self._slack = self._corner_distance
         try:
-            yield from self._over_cells(most)
+            yield from self._over_cells(max_moved)
         finally:
             self._slack = 0.0
 
-    def _over_cells(self, most: int) -> Iterator[dict[str, Pose]]:
+    def _over_cells(self, max_moved: int) -> Iterator[dict[str, Pose]]:
         # the number of a set comes before the set, so that equally good sets keep their order
-        queue = [(self._hubs_in(group), len(group), n, group) for n, group in enumerate(self._bases(most))]
+        queue = [
+            (self._hubs_in(group), len(group), number, group)
+            for number, group in enumerate(self._bases(max_moved))
+        ]
         heapq.heapify(queue)
-        seen = {group for *_, group in queue}
-        count = len(queue)
-        most_sets, most_effort = (_MOST_BETWEEN,) * 2 if self._slack else (_MOST_SETS, _MOST_SOLUTIONS)
-        for _ in range(most_sets):
+        queued_groups = {group for *_, group in queue}
+        group_count = len(queue)
+        max_groups, max_attempts = (_MOST_BETWEEN,) * 2 if self._slack else (_MOST_SETS, _MOST_SOLUTIONS)
+        for _ in range(max_groups):
             if not queue:
                 return
             *_, group = heapq.heappop(queue)
             domains = self._domains(group)
             if domains is not None and all(domain.any() for domain in domains.values()):
-                self._visits = 0
+                self._visit_count = 0
                 stencils = self._conflicts(group, domains)
-                effort = 0
+                attempt_count = 0
                 for cells in self._placements({}, domains, stencils):
                     poses: dict[str, Pose] | None = {name: self._pose(name, cells[name]) for name in cells}
                     if self._slack and poses:
                         poses = self._settle(poses)
                         # a failed attempt also counts, because it spends maps
-                        effort += 1
+                        attempt_count += 1
                     if poses is not None and self.meets(move_objects(self._sample, poses)):
                         yield poses
-                        effort += 1
+                        attempt_count += 1
                     elif not self._slack and not self._budget.spend(_MISS):
                         return
-                    if effort >= most_effort:
+                    if attempt_count >= max_attempts:
                         break
-            if len(group) < most and group:
+            if len(group) < max_moved and group:
                 for name in self._in_the_way(group):
                     # in the order of the settings, so that equal sets are equal tuples
                     wider = tuple(movable for movable in self._movable if movable in group or movable == name)
-                    if wider not in seen:
-                        seen.add(wider)
-                        count += 1
-                        heapq.heappush(queue, (self._hubs_in(wider), len(wider), count, wider))
+                    if wider not in queued_groups:
+                        queued_groups.add(wider)
+                        group_count += 1
+                        heapq.heappush(queue, (self._hubs_in(wider), len(wider), group_count, wider))
 
-    def _bases(self, most: int) -> list[tuple[str, ...]]:
+    def _bases(self, max_moved: int) -> list[tuple[str, ...]]:
         """Return the smallest sets of objects that have an object of every unmet demand."""
-        sets: dict[tuple[str, ...], None] = {(): None}
-        for demand in self._unmet:
-            wider: dict[tuple[str, ...], None] = {}
-            for group in sets:
-                if any(name in group for name in self._about[demand]):
-                    wider[group] = None
+        groups: dict[tuple[str, ...], None] = {(): None}
+        for demand in self._unmet_demands:
+            wider_groups: dict[tuple[str, ...], None] = {}
+            for group in groups:
+                if any(name in group for name in self._names_by_demand[demand]):
+                    wider_groups[group] = None
                     continue
-                for name in self._about[demand]:
-                    both = tuple(movable for movable in self._movable if movable in group or movable == name)
-                    if len(both) <= most:
-                        wider[both] = None
+                for name in self._names_by_demand[demand]:
+                    wider = tuple(movable for movable in self._movable if movable in group or movable == name)
+                    if len(wider) <= max_moved:
+                        wider_groups[wider] = None
             # sets without hubs first: moving only a hub seldom meets all its demands
-            least = sorted(wider, key=self._hubs_in)
-            sets = dict.fromkeys(least[:_MOST_SETS])
-        return list(sets)
+            best_groups = sorted(wider_groups, key=self._hubs_in)
+            groups = dict.fromkeys(best_groups[:_MOST_SETS])
+        return list(groups)
 
     def _hubs_in(self, group: Iterable[str]) -> int:
         """Return the number of hubs in a set: objects with unmet demands to several other objects."""
@@ -304,29 +314,33 @@ class Arranger:
 
     @cached_property
     def _hubs(self) -> frozenset[str]:
-        counts = Counter(name for demand in self._unmet for name in self._about[demand])
-        pairs = {frozenset(self._about[demand]) for demand in self._unmet}
+        demand_counts = Counter(
+            name for demand in self._unmet_demands for name in self._names_by_demand[demand]
+        )
+        object_pairs = {frozenset(self._names_by_demand[demand]) for demand in self._unmet_demands}
         # several demands on the same pair make neither object a hub
-        partners = Counter(name for pair in pairs for name in pair if len(pair) > 1)
-        return frozenset(name for name in counts if partners[name] > 1)
+        partner_counts = Counter(name for pair in object_pairs for name in pair if len(pair) > 1)
+        return frozenset(name for name in demand_counts if partner_counts[name] > 1)
 
-    def _in_the_way(self, chosen: tuple[str, ...]) -> list[str]:
+    def _in_the_way(self, group: tuple[str, ...]) -> list[str]:
         """Return up to four other objects that block the chosen ones, or take part in unmet demands."""
-        counts = dict.fromkeys((movable for movable in self._movable if movable not in chosen), 0)
-        for name in chosen:
+        blocked_counts = dict.fromkeys((movable for movable in self._movable if movable not in group), 0)
+        for name in group:
             if (field := self._field(name)) is None:
                 return []
             is_open = field.clearance > -self._slack
-            cells = is_open & self._meeting_cells(field, name, chosen)
+            cells = is_open & self._meeting_cells(field, name, group)
             if not cells.any():
                 # no cell is good even without all others, but moving the partner may meet a demand on both
                 cells = is_open
-            for neighbour, apart in field.apart.items():
-                if neighbour in counts:
-                    counts[neighbour] += int((cells & (apart <= 0.0)).sum())
-        tied = {name for demand in self._unmet for name in self._about[demand]}
-        useful = [movable for movable, count in counts.items() if count or movable in tied]
-        return sorted(useful, key=lambda movable: (movable not in tied, -counts[movable]))[:4]
+            for neighbour, gap in field.gaps.items():
+                if neighbour in blocked_counts:
+                    blocked_counts[neighbour] += int((cells & (gap <= 0.0)).sum())
+        unmet_names = {name for demand in self._unmet_demands for name in self._names_by_demand[demand]}
+        blockers = [movable for movable, count in blocked_counts.items() if count or movable in unmet_names]
+        return sorted(blockers, key=lambda movable: (movable not in unmet_names, -blocked_counts[movable]))[
+            :4
+        ]
 
     def _field(self, name: str) -> _Field | None:
         if name not in self._fields:
@@ -337,57 +351,57 @@ class Arranger:
 
     def _measure_field(self, name: str) -> _Field:
         workspace = self._settings.workspace
-        others = [
+        neighbours = [
             movable for movable in self._movable if movable != name and movable not in workspace.supports
         ]
-        about = [demand for demand in self._demands if name in self._about[demand]]
+        demands = [demand for demand in self._demands if name in self._names_by_demand[demand]]
         formulas = [
-            *(demand.formula for demand in about),
-            *(distance_between(name, neighbour) for neighbour in others),
+            *(demand.formula for demand in demands),
+            *(distance_between(name, neighbour) for neighbour in neighbours),
         ]
         # other movable objects are no obstacles in this map; `apart` has their distances
-        free = replace(workspace, supports=workspace.supports | set(others))
-        maps = proposition_maps(formulas, self._regions, self._sample, name, free)
-        met = dict(zip(about, map(surplus, maps.lower, maps.upper, about), strict=True))
-        measured = zip(others, maps.lower[len(about) :], strict=True)
-        apart = {neighbour: low - workspace.clearance for neighbour, low in measured}
-        reached = np.broadcast_to(workspace.within_reach(maps.grid), maps.clearance.shape)
-        clearance = np.where(reached, maps.clearance - workspace.clearance, -np.inf)
-        standing = dict(zip(maps.obstacles, maps.distances, strict=True))
-        return _Field(maps.turns, clearance, standing, apart, met)
+        free_workspace = replace(workspace, supports=workspace.supports | set(neighbours))
+        maps = proposition_maps(formulas, self._regions, self._sample, name, free_workspace)
+        surpluses = dict(zip(demands, map(surplus, maps.lower, maps.upper, demands), strict=True))
+        distances = zip(neighbours, maps.lower[len(demands) :], strict=True)
+        gaps = {neighbour: distance - workspace.clearance for neighbour, distance in distances}
+        is_reached = np.broadcast_to(workspace.within_reach(maps.grid), maps.clearance.shape)
+        clearance = np.where(is_reached, maps.clearance - workspace.clearance, -np.inf)
+        obstacle_distances = dict(zip(maps.obstacles, maps.distances, strict=True))
+        return _Field(maps.turns, clearance, obstacle_distances, gaps, surpluses)
 
-    def _meeting_cells(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
+    def _meeting_cells(self, field: _Field, name: str, group: tuple[str, ...]) -> Booleans:
         """Return the cells that meet all demands that concern no other chosen object."""
-        met = np.ones(field.clearance.shape, np.bool_)
-        for demand, values in field.surplus.items():
-            if all(movable == name or movable not in chosen for movable in self._about[demand]):
-                met &= values >= -self._slack
-        return met
+        is_met = np.ones(field.clearance.shape, np.bool_)
+        for demand, surpluses in field.surplus.items():
+            if all(movable == name or movable not in group for movable in self._names_by_demand[demand]):
+                is_met &= surpluses >= -self._slack
+        return is_met
 
-    def _domains(self, chosen: tuple[str, ...]) -> dict[str, Booleans] | None:
+    def _domains(self, group: tuple[str, ...]) -> dict[str, Booleans] | None:
         """Return the possible cells of each chosen object, without regard to the other chosen ones."""
         domains = {}
-        for name in chosen:
+        for name in group:
             if (field := self._field(name)) is None:
                 return None
-            domain = (field.clearance > -self._slack) & self._meeting_cells(field, name, chosen)
-            for neighbour, apart in field.apart.items():
-                if neighbour not in chosen:
-                    domain = domain & (apart > -self._slack)
+            domain = (field.clearance > -self._slack) & self._meeting_cells(field, name, group)
+            for neighbour, gap in field.gaps.items():
+                if neighbour not in group:
+                    domain = domain & (gap > -self._slack)
             domains[name] = domain
         return domains
 
     # ------------------------------------------------------------------------------------ two objects
 
     def _conflicts(
-        self, chosen: tuple[str, ...], domains: Mapping[str, Booleans]
+        self, group: tuple[str, ...], domains: Mapping[str, Booleans]
     ) -> dict[tuple[str, str], Booleans]:
         """Return the conflicts of each pair by the vector between its objects, (A, B, rows, columns)."""
         conflicts = {}
         # turns without possible cells are not measured
-        used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
-        for first, second in combinations(chosen, 2):
-            if (stencil := self._stencil(first, second, chosen, used)) is not None:
+        used_turns = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
+        for first, second in combinations(group, 2):
+            if (stencil := self._stencil(first, second, group, used_turns)) is not None:
                 # both objects may be off the centres of their cells, so twice the slack is allowed
                 conflicts[first, second] = is_conflict = stencil < -2.0 * self._slack
                 # seen from the second object, the vector has the opposite sign
@@ -395,56 +409,58 @@ class Arranger:
         return conflicts
 
     def _stencil(
-        self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
+        self, first: str, second: str, group: tuple[str, ...], used_turns: Mapping[str, Booleans]
     ) -> Floats | None:
         """Return the least surplus of the demands on two objects; -inf for turns that are not measured."""
         demands = [
             demand
             for demand in self._demands
-            if set(self._about[demand]) & set(chosen) == {first, second}
+            if set(self._names_by_demand[demand]) & set(group) == {first, second}
             and _is_of(demand.formula, (first, second))
         ]
         first_object, second_object = self._movable[first], self._movable[second]
-        size, grid = self._grid.cell_size, self._grid
+        cell_size, grid = self._grid.cell_size, self._grid
         supports = self._settings.workspace.supports
-        apart = first not in supports and second not in supports
-        reach = (
+        must_be_apart = first not in supports and second not in supports
+        reach_cells = (
             radius_of(first_object) + radius_of(second_object) + self._settings.workspace.clearance
-        ) / size + 1.0
+        ) / cell_size + 1.0
         # without demands only contact matters, so the stencil ends where the objects cannot touch
-        half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
-        turns, side = self._fields[first].turns, 2 * half + 1
-        cells = side * side * int(used[first].sum()) * int(used[second].sum())
-        if not (demands or apart) or cells > _WIDEST:
+        half_side = max(grid.shape) - 1 if demands else min(math.ceil(reach_cells), max(grid.shape) - 1)
+        turns, side = self._fields[first].turns, 2 * half_side + 1
+        cell_count = side * side * int(used_turns[first].sum()) * int(used_turns[second].sum())
+        if not (demands or must_be_apart) or cell_count > _WIDEST:
             return None
-        key = first, second, *demands, used[first].tobytes(), used[second].tobytes()
-        if key in self._stencils:
-            return self._stencils[key]
-        local = Grid(-(half + 0.5) * size, -(half + 0.5) * size, size, side, side)
+        stencil_key = first, second, *demands, used_turns[first].tobytes(), used_turns[second].tobytes()
+        if stencil_key in self._stencils:
+            return self._stencils[stencil_key]
+        local_grid = Grid(
+            -(half_side + 0.5) * cell_size, -(half_side + 0.5) * cell_size, cell_size, side, side
+        )
         formulas = [demand.formula for demand in demands]
-        workspace, measured = self._turned_in(local, used[second])
-        met = np.full((len(turns), len(used[second]), side, side), -np.inf)
-        for number in np.flatnonzero(used[first]).tolist():
-            turn = float(turns[number])
+        workspace, turn_indices = self._turned_in(local_grid, used_turns[second])
+        stencil = np.full((len(turns), len(used_turns[second]), side, side), -np.inf)
+        for turn_index in np.flatnonzero(used_turns[first]).tolist():
+            turn = float(turns[turn_index])
             objects = {first: moved_object(first_object, 0.0, 0.0, turn), second: second_object}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
             maps = proposition_maps(formulas, self._regions, sample, second, workspace)
             surpluses = list(map(surplus, maps.lower, maps.upper, demands))
-            if apart:
+            if must_be_apart:
                 surpluses.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
-            met[number, measured] = np.minimum.reduce(surpluses)
-        self._stencils[key] = met
-        return met
+            stencil[turn_index, turn_indices] = np.minimum.reduce(surpluses)
+        self._stencils[stencil_key] = stencil
+        return stencil
 
-    def _turned_in(self, grid: Grid, used: Booleans) -> tuple[Workspace, list[int]]:
+    def _turned_in(self, grid: Grid, used_turns: Booleans) -> tuple[Workspace, list[int]]:
         """Return a workspace without obstacles for the used turns, and the indices of these turns."""
-        yaws, keeps = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
-        if len(used) == 1:
-            return Workspace(grid, () if keeps else yaws), [0]
-        first = int(keeps)
-        numbers = [number for number in range(first, len(used)) if used[number]]
-        used_yaws = tuple(yaws[number - first] for number in numbers)
-        return Workspace(grid, used_yaws, keeps_yaw=keeps), [*range(first), *numbers]
+        yaws, keeps_yaw = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
+        if len(used_turns) == 1:
+            return Workspace(grid, () if keeps_yaw else yaws), [0]
+        first_yaw = int(keeps_yaw)
+        used_indices = [number for number in range(first_yaw, len(used_turns)) if used_turns[number]]
+        used_yaws = tuple(yaws[number - first_yaw] for number in used_indices)
+        return Workspace(grid, used_yaws, keeps_yaw=keeps_yaw), [*range(first_yaw), *used_indices]
 
     # ----------------------------------------------------------------------------------------- search
 
@@ -458,57 +474,63 @@ class Arranger:
             yield cells
             return
         name = min(domains, key=lambda movable: int(domains[movable].sum()))
-        others = {movable: domain for movable, domain in domains.items() if movable != name}
-        for cell in self._choices(name, domains[name], others, stencils):
-            if self._visits >= _MOST_VISITS:
+        other_domains = {movable: domain for movable, domain in domains.items() if movable != name}
+        for cell in self._choices(name, domains[name], other_domains, stencils):
+            if self._visit_count >= _MOST_VISITS:
                 return
-            self._visits += 1
-            left = {
+            self._visit_count += 1
+            remaining_domains = {
                 movable: domain & ~_conflicts(stencils.get((name, movable)), cell, domain.shape)
-                for movable, domain in others.items()
+                for movable, domain in other_domains.items()
             }
-            if all(domain.any() for domain in left.values()):
-                yield from self._placements({**cells, name: cell}, left, stencils)
+            if all(domain.any() for domain in remaining_domains.values()):
+                yield from self._placements({**cells, name: cell}, remaining_domains, stencils)
 
     def _choices(
         self,
         name: str,
         domain: Booleans,
-        others: Mapping[str, Booleans],
+        other_domains: Mapping[str, Booleans],
         stencils: Mapping[tuple[str, str], Booleans],
     ) -> Iterator[Cell]:
         """Yield some cells: the most robust cell, the cell that leaves most to the others, and corners."""
         score = self._score(name)
-        left = np.ones(domain.shape)
-        for movable, cells in others.items():
+        shares = np.ones(domain.shape)
+        for movable, cells in other_domains.items():
             if (stencil := stencils.get((name, movable))) is not None:
-                left = np.minimum(left, 1.0 - _count_losses(cells, stencil) / max(int(cells.sum()), 1))
-        ranked = [(domain & (left >= _ENOUGH), score), (domain & (left > 0.0), left), (domain, score)]
-        choices = [_best(among, values, score) for among, values in ranked if among.any()]
+                shares = np.minimum(shares, 1.0 - _count_losses(cells, stencil) / max(int(cells.sum()), 1))
+        rankings = [(domain & (shares >= _ENOUGH), score), (domain & (shares > 0.0), shares), (domain, score)]
+        choices = [
+            _best(allowed_cells, values, score) for allowed_cells, values in rankings if allowed_cells.any()
+        ]
         rows, columns = np.indices(domain.shape, np.float64)[1:]
-        among = domain & (left > 0.0)
-        if among.any():
-            choices += [_best(among, coordinate, left) for coordinate in (rows, -rows, columns, -columns)]
+        allowed_cells = domain & (shares > 0.0)
+        if allowed_cells.any():
+            choices += [
+                _best(allowed_cells, coordinate, shares) for coordinate in (rows, -rows, columns, -columns)
+            ]
         yield from dict.fromkeys(choices)
 
     def _score(self, name: str) -> Floats:
         """Return the score of each cell of an object, without regard to other chosen objects."""
         field, settings = self._fields[name], self._settings
-        gaps = np.minimum.reduce([field.clearance, *field.apart.values()])
-        room = gaps + settings.workspace.clearance
-        surpluses = [field.surplus[demand] for demand in field.surplus if self._about[demand] == (name,)]
-        if surpluses:
-            score: Floats = np.minimum.reduce(surpluses)
+        least_gap = np.minimum.reduce([field.clearance, *field.gaps.values()])
+        room = least_gap + settings.workspace.clearance
+        demand_surpluses = [
+            field.surplus[demand] for demand in field.surplus if self._names_by_demand[demand] == (name,)
+        ]
+        if demand_surpluses:
+            score: Floats = np.minimum.reduce(demand_surpluses)
             # cells with too little room, and turns of pushed objects, come after all others
             is_last = room < settings.room
             is_last[1:] |= settings.workspace.keeps_yaw
             # more than the range of all scores
-            behind = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
-            return score - np.where(is_last, behind, 0.0)
+            penalty = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
+            return score - np.where(is_last, penalty, 0.0)
         if settings.skill == "place":
             return np.asarray(np.minimum(room, 1e9))
-        away = distance_to([centre_of(self._movable[name].footprint)], self._grid)
-        return np.asarray(np.broadcast_to(-away, field.clearance.shape))
+        distance = distance_to([centre_of(self._movable[name].footprint)], self._grid)
+        return np.asarray(np.broadcast_to(-distance, field.clearance.shape))
 
     # ------------------------------------------------------------------------------------------ poses
 
@@ -522,50 +544,50 @@ class Arranger:
         Each step goes to the nearest places that meet the demands, which are linearized at this step and at
         previous steps.
         """
-        workspace, size = self._settings.workspace, self._grid.cell_size
+        workspace, cell_size = self._settings.workspace, self._grid.cell_size
         # obstacles become objects, so that distances to them are demands like all others
         obstacles = {
             f"obstacle {number}": TrackedObject(obstacle)
             for number, obstacle in enumerate(workspace.obstacles)
         }
         sample = with_objects(self._sample, obstacles)
-        others = [name for name in sample.objects if name not in workspace.supports]
+        obstacle_names = [name for name in sample.objects if name not in workspace.supports]
         pairs = {
             frozenset((name, neighbour))
             for name in poses
-            for neighbour in others
+            for neighbour in obstacle_names
             if name not in workspace.supports
         }
         # sorted, because the order of a set of texts differs between processes, and plans must be equal
-        apart = [
+        apart_demands = [
             Demand(distance_between(*sorted(pair)), True, workspace.clearance)
             for pair in sorted(pairs, key=sorted)
             if len(pair) == 2
         ]
-        demands = [*self._demands, *apart]
-        start = np.array([pose[:2] for pose in poses.values()])
-        for towards in _TOWARDS:
-            places, cuts, best, stalled = start, list[tuple[Floats, Floats]](), -math.inf, 0
+        demands = [*self._demands, *apart_demands]
+        start_places = np.array([pose[:2] for pose in poses.values()])
+        for margin_share in _TOWARDS:
+            places, cuts, best_surplus, stalls = start_places, list[tuple[Floats, Floats]](), -math.inf, 0
             for _ in range(_MOST_STEPS):
                 if not self._budget.spend(_STEP):
                     return None
-                met, slopes = self._slopes(sample, demands, poses, places)
-                stalled = stalled + 1 if met.min() <= best + 1e-3 * size else 0
-                best = max(best, float(met.min()))
-                if (met >= _STRICTLY).all() and self._grid.contains(places).all():
+                surpluses, slopes = self._slopes(sample, demands, poses, places)
+                stalls = stalls + 1 if surpluses.min() <= best_surplus + 1e-3 * cell_size else 0
+                best_surplus = max(best_surplus, float(surpluses.min()))
+                if (surpluses >= _STRICTLY).all() and self._grid.contains(places).all():
                     return {
                         name: (*place, poses[name][2])
                         for name, place in zip(poses, places.tolist(), strict=True)
                     }
-                if stalled > _MOST_STALLED:
+                if stalls > _MOST_STALLED:
                     break
                 # demands that are met by far do not limit the step
-                near = met < 2.0 * size
-                normals = slopes[near].reshape(-1, places.size)
-                least = normals @ places.ravel() - met[near] + towards * size
-                cuts = [*cuts, (normals, least)][-_OLDEST_CUTS:]
-                every = (np.concatenate(arrays) for arrays in zip(*cuts, strict=True))
-                places = nearest_meeting(places.ravel(), *every).reshape(-1, 2)
+                is_near = surpluses < 2.0 * cell_size
+                normals = slopes[is_near].reshape(-1, places.size)
+                least_values = normals @ places.ravel() - surpluses[is_near] + margin_share * cell_size
+                cuts = [*cuts, (normals, least_values)][-_OLDEST_CUTS:]
+                all_cuts = (np.concatenate(arrays) for arrays in zip(*cuts, strict=True))
+                places = nearest_meeting(places.ravel(), *all_cuts).reshape(-1, 2)
         return None
 
     def _slopes(
@@ -577,10 +599,10 @@ class Arranger:
         objects: dict[str, TrackedObject] = {}
         nudges: list[tuple[str, TrackedObject]] = []
         for name, place in zip(poses, places, strict=True):
-            objects[name], *nudged = moved_copies(
+            objects[name], *nudged_copies = moved_copies(
                 sample.objects[name], place + step * _NUDGES, poses[name][2]
             )
-            nudges += ((name, tracked) for tracked in nudged)
+            nudges += ((name, tracked) for tracked in nudged_copies)
         scene = with_objects(sample, objects)
         # each sample gets a later time, because the times of a trace must increase
         samples = [
@@ -592,11 +614,11 @@ class Arranger:
         ]
         trace = Trace.from_samples(samples)
         leaves = leaf_values(TraceScene(trace, self._regions), [demand.formula for demand in demands], {})
-        values = np.stack(
-            [leaves[0][n] if demand.wanted else -leaves[-1][n] for n, demand in enumerate(demands)]
+        surpluses = np.stack(
+            [leaves[0][row] if demand.wanted else -leaves[-1][row] for row, demand in enumerate(demands)]
         )
-        values -= np.array([[demand.least] for demand in demands])
-        return values[:, 0], ((values[:, 1:] - values[:, :1]) / step).reshape(-1, *places.shape)
+        surpluses -= np.array([[demand.least] for demand in demands])
+        return surpluses[:, 0], ((surpluses[:, 1:] - surpluses[:, :1]) / step).reshape(-1, *places.shape)
 
     def meets(self, sample: Sample) -> bool:
         """Return whether a sample meets all demands."""
@@ -605,17 +627,17 @@ class Arranger:
 
 def _standing_text(names: Sequence[str]) -> str:
     """Return the beginning of a sentence on immovable objects, with the first names; "" without names."""
-    said = [name or "an obstacle of the workspace" for name in names[:_MOST_NAMED]]
-    verb = "stand" if len(said) > 1 else "stands"
-    return f"{' and '.join(said)}, which cannot be moved, {verb}" if said else ""
+    phrases = [name or "an obstacle of the workspace" for name in names[:_MOST_NAMED]]
+    verb = "stand" if len(phrases) > 1 else "stands"
+    return f"{' and '.join(phrases)}, which cannot be moved, {verb}" if phrases else ""
 
 
-def _best(among: Booleans, values: Floats, then: Floats) -> Cell:
+def _best(is_allowed: Booleans, cell_values: Floats, tie_values: Floats) -> Cell:
     """Return the cell with the greatest value; among equal ones, the cell with the greatest `then`."""
-    best = np.where(among, values, -np.inf)
-    ties = best == best.max()
-    place = int(np.argmax(np.where(ties, then, -np.inf)))
-    turn, row, column = np.unravel_index(place, among.shape)
+    allowed_values = np.where(is_allowed, cell_values, -np.inf)
+    is_best = allowed_values == allowed_values.max()
+    best_index = int(np.argmax(np.where(is_best, tie_values, -np.inf)))
+    turn, row, column = np.unravel_index(best_index, is_allowed.shape)
     return int(turn), int(row), int(column)
 
 
@@ -624,14 +646,14 @@ def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> 
     conflicts = np.zeros(shape, np.bool_)
     if stencil is None:
         return conflicts
-    turn, *place = cell
-    half = stencil.shape[2] // 2
-    inside, of_stencil = [], []
-    for at, size in zip(place, shape[1:], strict=True):
-        low, high = max(at - half, 0), min(at + half + 1, size)
-        inside.append(slice(low, high))
-        of_stencil.append(slice(low - at + half, high - at + half))
-    conflicts[:, inside[0], inside[1]] = stencil[turn][:, of_stencil[0], of_stencil[1]]
+    turn, *centre = cell
+    half_side = stencil.shape[2] // 2
+    grid_slices, stencil_slices = [], []
+    for centre_index, size in zip(centre, shape[1:], strict=True):
+        low, high = max(centre_index - half_side, 0), min(centre_index + half_side + 1, size)
+        grid_slices.append(slice(low, high))
+        stencil_slices.append(slice(low - centre_index + half_side, high - centre_index + half_side))
+    conflicts[:, grid_slices[0], grid_slices[1]] = stencil[turn][:, stencil_slices[0], stencil_slices[1]]
     return conflicts
 
 
@@ -642,12 +664,14 @@ def _count_losses(cells: Booleans, stencil: Booleans) -> Floats:
     """
     half = stencil.shape[2] // 2
     rows, columns = cells.shape[1:]
-    padded = np.fft.rfft2(np.pad(cells.astype(np.float64), ((0, 0), (half, half), (half, half))))
-    shape = (rows + 2 * half, columns + 2 * half)
-    kernels = np.fft.rfft2(stencil.astype(np.float64), s=shape)
-    lost = np.fft.irfft2((padded[None] * kernels.conj()).sum(axis=1), s=shape)
+    cells_transform = np.fft.rfft2(np.pad(cells.astype(np.float64), ((0, 0), (half, half), (half, half))))
+    padded_shape = (rows + 2 * half, columns + 2 * half)
+    stencil_transform = np.fft.rfft2(stencil.astype(np.float64), s=padded_shape)
+    loss_counts = np.fft.irfft2(
+        (cells_transform[None] * stencil_transform.conj()).sum(axis=1), s=padded_shape
+    )
     # counts are whole numbers, so rounding removes the errors of the transforms
-    return np.rint(lost[:, :rows, :columns])
+    return np.rint(loss_counts[:, :rows, :columns])
 
 
 def _is_of(formula: Formula, names: Sequence[str]) -> bool:
@@ -687,16 +711,16 @@ class Lookahead:
 
     def __init__(self, expected: Expectations, sample: Sample) -> None:
         """Begin from the newest sample of a run."""
-        self._expected, self._first = expected, PredictedState(sample)
+        self._expected, self._start = expected, PredictedState(sample)
         self._automaton, self._formulas = expected.automaton, expected.formulas
         self._regions, self._settings = expected.regions, expected.settings
-        self.movables = expected.movables(self._first)
+        self.movables = expected.movables(self._start)
         """The movable objects of the newest sample."""
-        self._pruned: set[Edge] = set()
-        self._known: dict[tuple[int, Moved], tuple[Target, ...] | None] = {}
-        self._why: dict[str, None] = {}
-        self._unordered = ""
-        self._ruled_out: frozenset[Edge] = frozenset()
+        self._pruned_edges: set[Edge] = set()
+        self._solutions: dict[tuple[int, Moved], tuple[Target, ...] | None] = {}
+        self._causes: dict[str, None] = {}
+        self._unordered_names = ""
+        self._excluded_edges: frozenset[Edge] = frozenset()
 
     def decide(
         self,
@@ -718,22 +742,22 @@ class Lookahead:
         """
         if self._settings.motions == 1:
             return consideration
-        self._pruned = set(pruned)
-        self._why.clear()
-        for sequence in islice(self._joint(self._first, path, consideration), 4) if together else ():
-            if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
-                return self._with_first_motion(consideration, sequence, rest)
-        order = by_cost(consideration.candidates, self._settings)
-        for number, target in order.items():
-            if (rest := self._after(target, path[0])) is None:
+        self._pruned_edges = set(pruned)
+        self._causes.clear()
+        for sequence in islice(self._joint(self._start, path, consideration), 4) if together else ():
+            if (later_motions := self._ahead(sequence.scene, sequence.state)) is not None:
+                return self._with_first_motion(consideration, sequence, later_motions)
+        targets_by_index = by_cost(consideration.candidates, self._settings)
+        for candidate_index, target in targets_by_index.items():
+            if (later_motions := self._after(target, path[0])) is None:
                 continue
-            names = [target.name, *(motion.name for motion in rest)]
-            if together or len(set(names)) == len(names):
-                return choose_candidate(consideration, number, (target, *rest))
-        if not order:
+            moved_names = [target.name, *(motion.name for motion in later_motions)]
+            if together or len(set(moved_names)) == len(moved_names):
+                return choose_candidate(consideration, candidate_index, (target, *later_motions))
+        if not targets_by_index:
             return consideration
-        why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
-        reason = Reason(LATER, why if together else f"not by one motion: {why}")
+        causes = "; ".join(islice(self._causes, 3)) or "no sequence of motions was found"
+        reason = Reason(LATER, causes if together else f"not by one motion: {causes}")
         return replace(choose_candidate(consideration, None), pruned=reason)
 
     # ------------------------------------------------------------------------------------ one at a time
@@ -742,37 +766,37 @@ class Lookahead:
         """Return motions from a state to acceptance; None if none are found."""
         if state in self._automaton.accepting:
             return ()
-        key = state, scene.moved
-        if key not in self._known:
+        search_key = state, scene.moved
+        if search_key not in self._solutions:
             # None for now, so that a search that returns to this scene and state gives up
-            self._known[key] = None
-            self._known[key] = self._search(scene, state)
-        return self._known[key]
+            self._solutions[search_key] = None
+            self._solutions[search_key] = self._search(scene, state)
+        return self._solutions[search_key]
 
     def _search(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
         automaton, symbol = self._automaton, self._expected.symbol(scene)
         idle = idle_transitions(automaton, state, symbol)
-        pruned = self._pruned - idle.edges
-        looked_into: list[tuple[tuple[Transition, ...], Consideration]] = []
-        while len(looked_into) < _MOST_EDGES and self._expected.budget.left > 0:
-            pruned |= self._ruled_out
-            if (path := next(automaton.paths(state, pruned), None)) is None:
+        pruned_edges = self._pruned_edges - idle.edges
+        considered_paths: list[tuple[tuple[Transition, ...], Consideration]] = []
+        while len(considered_paths) < _MOST_EDGES and self._expected.budget.left > 0:
+            pruned_edges |= self._excluded_edges
+            if (path := next(automaton.paths(state, pruned_edges), None)) is None:
                 break
-            if ahead := idle.along(path):
-                return self._ahead(scene, ahead[-1])
-            consideration = consideration_of(automaton, path, pruned, symbol)
+            if idle_states := idle.along(path):
+                return self._ahead(scene, idle_states[-1])
+            consideration = consideration_of(automaton, path, pruned_edges, symbol)
             for sequence in self._ways(scene, path, consideration):
-                if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
-                    return (*sequence.motions, *rest)
-            looked_into.append((path, consideration))
-            pruned.add(consideration.edge)
-            pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
+                if (later_motions := self._ahead(sequence.scene, sequence.state)) is not None:
+                    return (*sequence.motions, *later_motions)
+            considered_paths.append((path, consideration))
+            pruned_edges.add(consideration.edge)
+            pruned_edges |= set(equivalent_edges(automaton, consideration, idle, pruned_edges, symbol))
         # only after single motions have failed, because finding hopeless edges costs maps
-        self._ruled_out = self._hopeless
-        for path, consideration in looked_into:
+        self._excluded_edges = self._hopeless
+        for path, consideration in considered_paths:
             for sequence in islice(self._joint(scene, path, consideration), 2):
-                if (rest := self._ahead(sequence.scene, sequence.state)) is not None:
-                    return (*sequence.motions, *rest)
+                if (later_motions := self._ahead(sequence.scene, sequence.state)) is not None:
+                    return (*sequence.motions, *later_motions)
         return None
 
     def _ways(
@@ -781,24 +805,24 @@ class Lookahead:
         """Yield single motions that take the first edge of a path, with the resulting scene and state."""
         movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
-        later = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
+        later_names = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
         for name in movables.names_for(consideration.progress):
             if not self._expected.budget.spend():
                 return
-            candidates.append(movables.candidate(name, consideration, later))
+            candidates.append(movables.candidate(name, consideration, later_names))
         for target in by_cost(candidates, self._settings).values():
-            after = scene.after(target.name, target.pose)
-            if self._expected.states_after(after, path[0].source) == {path[0].target}:
-                yield Ordered((target,), after, path[0].target)
+            next_scene = scene.after(target.name, target.pose)
+            if self._expected.states_after(next_scene, path[0].source) == {path[0].target}:
+                yield Ordered((target,), next_scene, path[0].target)
         if not any(candidate.target for candidate in candidates):
             causes = "; ".join(f"{candidate.name}: {candidate.rejected}" for candidate in candidates)
-            self._why[f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"] = (
-                None
-            )
+            self._causes[
+                f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"
+            ] = None
 
     def _after(self, target: Target, edge: Transition) -> tuple[Target, ...] | None:
         """Return the motions to acceptance after a first motion; () if the state after it is uncertain."""
-        scene = self._first.after(target.name, target.pose)
+        scene = self._start.after(target.name, target.pose)
         states = self._expected.states_after(scene, edge.source)
         return () if len(states) > 1 else self._ahead(scene, *states)
 
@@ -810,28 +834,32 @@ class Lookahead:
         """Yield motions of several objects that take a whole path, or its first edge."""
         if self._settings.motions < 2:
             return
-        numbers = count(1)
+        arrangement_numbers = count(1)
         # the whole path first, then only its first edge
-        for length in dict.fromkeys((len(path), 1)):
-            aims = path[:length]
-            if any((aim.source, aim.target) in self._ruled_out for aim in aims):
+        for aim_count in dict.fromkeys((len(path), 1)):
+            aims = path[:aim_count]
+            if any((aim.source, aim.target) in self._excluded_edges for aim in aims):
                 continue
-            if scene is self._first:
+            if scene is self._start:
                 yield from self._resume(aims, consideration)
             for demands in self._demands_of(scene, aims):
                 # a share of the maps is reserved for other edges
-                least = self._expected.budget.left * (1.0 - _JOINT_SHARE)
-                about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
-                if self._expected.budget.left <= 0 or about.why_hopeless():
+                reserved_maps = self._expected.budget.left * (1.0 - _JOINT_SHARE)
+                arranger = Arranger(
+                    scene.sample, self._regions, self._settings, demands, self._expected.budget
+                )
+                if self._expected.budget.left <= 0 or arranger.why_hopeless():
                     continue
                 arrangements: Iterable[dict[str, Pose]] = islice(
-                    about.arrangements(self._settings.motions), _MOST_ORDERED
+                    arranger.arrangements(self._settings.motions), _MOST_ORDERED
                 )
                 if self._expected.attempts.are_any:
                     # a motion may fail by chance, so places of failed motions are tried after all others
                     arrangements = sorted(arrangements, key=self._is_near_failure)
-                for number, poses in zip(numbers, arrangements, strict=False):
-                    for sequence in self._ordered_from(scene, aims, consideration, about, poses, least):
+                for number, poses in zip(arrangement_numbers, arrangements, strict=False):
+                    for sequence in self._ordered_from(
+                        scene, aims, consideration, arranger, poses, reserved_maps
+                    ):
                         yield sequence._replace(arrangement=number)
 
     def _resume(self, aims: Sequence[Transition], consideration: Consideration) -> Iterator[Ordered]:
@@ -840,7 +868,7 @@ class Lookahead:
         A new arrangement may need more motions than the old plan has left, and its motions may undo earlier
         motions.
         """
-        scene, states = self._first, frozenset({aims[0].source})
+        scene, states = self._start, frozenset({aims[0].source})
         places: dict[str, Pose] = {}
         for motion in self._expected.attempts.planned:
             scene = scene.after(motion.name, motion.pose)
@@ -848,24 +876,26 @@ class Lookahead:
             places[motion.name] = dict(scene.moved)[motion.name]
             if states == {aims[-1].target}:
                 robustness = self._expected.robustness(scene.sample, aims[0].guard)
-                never = consideration.constraints.cubes
-                order = MotionOrder(self._expected, self._first, aims, never, places, robustness, 0.0)
-                if (sequence := order.find()) is not None:
+                forbidden_cubes = consideration.constraints.cubes
+                motion_order = MotionOrder(
+                    self._expected, self._start, aims, forbidden_cubes, places, robustness, 0.0
+                )
+                if (sequence := motion_order.find()) is not None:
                     yield sequence
                 return
 
     def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
         """Yield conjunctions of demands that take all edges and avoid traps."""
-        never = self._expected.traps(aims[0].source)
+        trap_cubes = self._expected.traps(aims[0].source)
         safety_demands: list[Demand] = []
         # slightly more than the margin, so that rounding does not leave a constraint at it
-        least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
-        for cube in never:
+        least_margin = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
+        for cube in trap_cubes:
             if len(cube) == 1:
                 ((number, value),) = cube
-                ways = alternatives(self._formulas[number], not value)
-                if len(ways) == 1:
-                    safety_demands += (Demand(*literal, least) for literal in ways[0])
+                conjunctions = alternatives(self._formulas[number], not value)
+                if len(conjunctions) == 1:
+                    safety_demands += (Demand(*literal, least_margin) for literal in conjunctions[0])
         # at most eight combinations of cubes, because their number grows exponentially with the path
         for cubes in islice(product(*(aim.guard for aim in aims)), 8):
             literals = tuple(dict.fromkeys(literal for cube in cubes for literal in cube))
@@ -876,9 +906,9 @@ class Lookahead:
 
     def _is_near_failure(self, poses: Mapping[str, Pose]) -> bool:
         """Return whether an arrangement brings an object near a place where its motion failed."""
-        near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
+        near_distance = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
         return any(
-            math.dist(pose[:2], place) <= near
+            math.dist(pose[:2], place) <= near_distance
             for name, pose in poses.items()
             for place in self._expected.attempts.places_of(name)
         )
@@ -888,68 +918,76 @@ class Lookahead:
         scene: PredictedState,
         aims: Sequence[Transition],
         consideration: Consideration,
-        about: Arranger,
+        arranger: Arranger,
         poses: Mapping[str, Pose],
-        least: float,
+        reserved_maps: float,
     ) -> Iterator[Ordered]:
         """Yield the motions to an arrangement in a possible order, if one is found."""
         self._expected.budget.arrangements += 1
-        poses = self._without_staying(scene, about, poses)
+        poses = self._without_staying(scene, arranger, poses)
         robustness = self._expected.robustness(move_objects(scene.sample, poses), aims[0].guard)
-        never = consideration.constraints.cubes
-        order = MotionOrder(self._expected, scene, aims, never, poses, robustness, least)
-        if (sequence := order.find()) is not None:
+        forbidden_cubes = consideration.constraints.cubes
+        motion_order = MotionOrder(
+            self._expected, scene, aims, forbidden_cubes, poses, robustness, reserved_maps
+        )
+        if (sequence := motion_order.find()) is not None:
             yield sequence
-        elif scene is self._first and len(poses) > 1 and not self._unordered:
-            self._unordered = " and ".join(sorted(poses))
+        elif scene is self._start and len(poses) > 1 and not self._unordered_names:
+            self._unordered_names = " and ".join(sorted(poses))
 
     def _without_staying(
-        self, scene: PredictedState, about: Arranger, poses: Mapping[str, Pose]
+        self, scene: PredictedState, arranger: Arranger, poses: Mapping[str, Pose]
     ) -> Mapping[str, Pose]:
         """Return an arrangement without objects that barely move, if it meets the demands without them."""
         for name in list(poses):
             x, y, turn = poses[name]
-            others = {moved: pose for moved, pose in poses.items() if moved != name}
-            away = math.dist((x, y), centre_of(scene.sample.objects[name].footprint))
-            is_still = away <= self._settings.workspace.grid.cell_size and abs(turn) <= _STILL_TURN
-            if is_still and about.meets(move_objects(scene.sample, others)):
-                poses = others
+            other_poses = {moved_name: pose for moved_name, pose in poses.items() if moved_name != name}
+            distance = math.dist((x, y), centre_of(scene.sample.objects[name].footprint))
+            is_still = distance <= self._settings.workspace.grid.cell_size and abs(turn) <= _STILL_TURN
+            if is_still and arranger.meets(move_objects(scene.sample, other_poses)):
+                poses = other_poses
         return poses
 
     def _with_first_motion(
         self,
         consideration: Consideration,
         sequence: Ordered,
-        rest: tuple[Target, ...],
+        later_motions: tuple[Target, ...],
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
         motions = sequence.motions
-        first, sample = motions[0], self._first.sample
+        first_motion, sample = motions[0], self._start.sample
         # a parked object goes to its own place later, so the pose of its first motion is not final
-        poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first.name}
-        settings, now = self._settings, self.movables.maps_of(first.name)
-        then = proposition_maps(
+        poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first_motion.name}
+        settings, current_maps = self._settings, self.movables.maps_of(first_motion.name)
+        later_maps = proposition_maps(
             self._formulas,
             self._regions,
             move_objects(sample, poses),
-            first.name,
+            first_motion.name,
             settings.workspace,
-            now.grid,
+            current_maps.grid,
         )
         cubes = consideration.progress.cubes, consideration.constraints.cubes
-        gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
-        final_sample = move_objects(sample, {**poses, first.name: first.pose})
-        target = replace(
-            first, robustness=self._expected.robustness(final_sample, consideration.progress.cubes)
+        gradient = gradient_map(
+            current_maps, *cubes, settings.workspace, settings.constraint_margin, later_maps
         )
-        if all(motion.name != first.name for motion in motions[1:]):
-            target = self._refine(target, consideration, poses, (*motions[1:], *rest))
-        candidate = Candidate(first.name, gradient, target, is_chosen=True, rule=sequence.rule)
-        rivals = (rival for rival in consideration.candidates if rival.name != first.name)
-        others = tuple(replace(rival, is_chosen=False) for rival in rivals)
-        planned = (target, *motions[1:], *rest)
+        final_sample = move_objects(sample, {**poses, first_motion.name: first_motion.pose})
+        target = replace(
+            first_motion, robustness=self._expected.robustness(final_sample, consideration.progress.cubes)
+        )
+        if all(motion.name != first_motion.name for motion in motions[1:]):
+            target = self._refine(target, consideration, poses, (*motions[1:], *later_motions))
+        candidate = Candidate(first_motion.name, gradient, target, is_chosen=True, rule=sequence.rule)
+        rivals = (rival for rival in consideration.candidates if rival.name != first_motion.name)
+        other_candidates = tuple(replace(rival, is_chosen=False) for rival in rivals)
+        planned_motions = (target, *motions[1:], *later_motions)
         return replace(
-            consideration, candidates=(*others, candidate), pruned=None, motions=planned, is_joint=True
+            consideration,
+            candidates=(*other_candidates, candidate),
+            pruned=None,
+            motions=planned_motions,
+            is_joint=True,
         )
 
     def _refine(
@@ -957,28 +995,34 @@ class Lookahead:
         target: Target,
         consideration: Consideration,
         poses: Mapping[str, Pose],
-        rest: tuple[Target, ...],
+        later_motions: tuple[Target, ...],
     ) -> Target:
         """Return the first of several motions with a refined target, if the later states stay the same."""
-        start, *way, end = target.waypoints
-        way = way if self._settings.skill == "push" else []
-        straight = replace(target, waypoints=(start, *way, end))
-        better = self.movables.refine(straight, consideration, None, poses)
-        ways = self.movables.with_way(better, consideration.constraints.cubes)
-        if isinstance(ways, str) or self.movables.is_repeated(ways) or better.robustness <= target.robustness:
+        start, *corners, end = target.waypoints
+        corners = corners if self._settings.skill == "push" else []
+        direct_target = replace(target, waypoints=(start, *corners, end))
+        refined_target = self.movables.refine(direct_target, consideration, None, poses)
+        target_with_way = self.movables.with_way(refined_target, consideration.constraints.cubes)
+        if (
+            isinstance(target_with_way, str)
+            or self.movables.is_repeated(target_with_way)
+            or refined_target.robustness <= target.robustness
+        ):
             return target
         state = consideration.edge[0]
-        before, after = (self._states_along((first, *rest), state) for first in (target, ways))
-        return ways if before == after else target
+        old_states, new_states = (
+            self._states_along((motion, *later_motions), state) for motion in (target, target_with_way)
+        )
+        return target_with_way if old_states == new_states else target
 
     def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
         """Return the possible states after each motion, from the newest sample on."""
-        scene, states, visited = self._first, frozenset({state}), []
+        scene, states, states_by_motion = self._start, frozenset({state}), []
         for motion in motions:
             scene = scene.after(motion.name, motion.pose)
             states = self._automaton.step_set(states, self._expected.symbol(scene))
-            visited.append(states)
-        return visited
+            states_by_motion.append(states)
+        return states_by_motion
 
     # --------------------------------------------------------------------------------------- what is seen
 
@@ -1002,24 +1046,24 @@ class Lookahead:
         """The literals that no arrangement of the objects can fulfil."""
         if not self._automaton.is_listable:
             return ()
-        symbol = self._expected.symbol(self._first)
+        symbol = self._expected.symbol(self._start)
         literals = {
             literal
             for transition in self._automaton.transitions
             for cube in transition.guard
             for literal in cube
         }
-        hopeless: list[tuple[int, bool]] = []
+        hopeless_literals: list[tuple[int, bool]] = []
         budget = Budget(self._expected.budget.left * _HOPELESS_SHARE)
-        for number, value in sorted(literals):
+        for number, wanted in sorted(literals):
             # a literal that holds now is not hopeless; `is`, because None is unknown
-            if symbol[number] is (not value) and budget.left > 0:
-                why = self._why_hopeless(self._first.sample, number, value, budget)
-                if why:
-                    hopeless.append((number, value))
-                    self._why[f"{self._automaton.propositions[number].literal(value)}: {why}"] = None
+            if symbol[number] is (not wanted) and budget.left > 0:
+                cause = self._why_hopeless(self._start.sample, number, wanted, budget)
+                if cause:
+                    hopeless_literals.append((number, wanted))
+                    self._causes[f"{self._automaton.propositions[number].literal(wanted)}: {cause}"] = None
         self._expected.budget.spend(self._expected.budget.left * _HOPELESS_SHARE - budget.left)
-        return tuple(hopeless)
+        return tuple(hopeless_literals)
 
     def why_not(self, state: int) -> str:
         """Return the infeasible condition of every path to acceptance, and the objects in the way.
@@ -1028,41 +1072,45 @@ class Lookahead:
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
-                return self._why_never(self._first.sample, literal)
-        if not self._unordered:
+                return self._why_never(self._start.sample, literal)
+        if not self._unordered_names:
             return ""
-        return f"{self._unordered}: there are places for all, but no order of motions to them was found"
+        return f"{self._unordered_names}: there are places for all, but no order of motions to them was found"
 
     def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
         """Return the demands of a literal that no arrangement meets, and the objects in the way."""
         budget = Budget(_MOST_WHY_NOT)
-        every = demands_of((literal,), self._formulas, self._settings.margin)
-        demands = next(iter(every), ())
+        conjunctions = demands_of((literal,), self._formulas, self._settings.margin)
+        demands = next(iter(conjunctions), ())
         # demands that are not needed for the conflict are dropped, so that the reason names few demands
-        core = list(demands)
+        core_demands = list(demands)
         for demand in reversed(demands):
-            fewer = tuple(member for member in core if member != demand)
-            if fewer and budget.left > 0 and self._why_impossible(sample, fewer, budget):
-                core = list(fewer)
-        about = Arranger(sample, self._regions, self._settings, core, budget)
-        what = " and ".join(literal_text(demand.formula, demand.wanted) for demand in core)
-        if why := about.why_hopeless():
-            return f"{what}: {'; '.join(filter(None, (why, about.cell_hint(self._settings.motions))))}"
-        stands = about.what_stands()
-        said = "no places were found for all at once", stands, about.cell_hint(self._settings.motions)
-        return f"{what}: {'; '.join(filter(None, said))}"
+            fewer_demands = tuple(member for member in core_demands if member != demand)
+            if fewer_demands and budget.left > 0 and self._why_impossible(sample, fewer_demands, budget):
+                core_demands = list(fewer_demands)
+        arranger = Arranger(sample, self._regions, self._settings, core_demands, budget)
+        goals = " and ".join(literal_text(demand.formula, demand.wanted) for demand in core_demands)
+        if cause := arranger.why_hopeless():
+            return f"{goals}: {'; '.join(filter(None, (cause, arranger.cell_hint(self._settings.motions))))}"
+        standing_text = arranger.what_stands()
+        sentences = (
+            "no places were found for all at once",
+            standing_text,
+            arranger.cell_hint(self._settings.motions),
+        )
+        return f"{goals}: {'; '.join(filter(None, sentences))}"
 
     def _why_impossible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> str:
         """Return "" if an arrangement meets demands, or else why none does, or that none was found."""
-        about = Arranger(sample, self._regions, self._settings, demands, budget)
-        why = about.why_hopeless()
-        arrangement = None if why else next(about.arrangements(self._settings.motions), None)
-        return why or (_NOT_FOUND if arrangement is None else "")
+        arranger = Arranger(sample, self._regions, self._settings, demands, budget)
+        cause = arranger.why_hopeless()
+        arrangement = None if cause else next(arranger.arrangements(self._settings.motions), None)
+        return cause or (_NOT_FOUND if arrangement is None else "")
 
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
-        why = "it never holds"
+        cause = "it never holds"
         for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
-            why = self._why_impossible(sample, demands, budget)
-            if not why or (why == _NOT_FOUND and budget.left <= 0):
+            cause = self._why_impossible(sample, demands, budget)
+            if not cause or (cause == _NOT_FOUND and budget.left <= 0):
                 return ""
-        return why
+        return cause

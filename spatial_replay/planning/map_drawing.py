@@ -71,21 +71,21 @@ def map_frame(
         obstacles: obstacles of the workspace by name.
     """
     grid, values = gradient.grid, gradient.values[turn]
-    low = grid.xmin, grid.ymin
-    high = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
+    low_corner = grid.xmin, grid.ymin
+    high_corner = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
     entity, height = SceneEntity(id=_MAP, frame_id=FRAME), -_FRAME_DEPTH * grid.cell_size
-    _add_blocked_cells(entity, np.isnan(values), low, grid.cell_size, height)
-    contour = _contour(values, margin) * grid.cell_size + np.array(low)
+    _add_blocked_cells(entity, np.isnan(values), low_corner, grid.cell_size, height)
+    contour = _contour(values, margin) * grid.cell_size + np.array(low_corner)
     if len(contour):
         entity.lines.append(
             _line(contour.tolist(), height, _INK, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS)
         )
-    _add_axes(entity, low, high, height)
-    scale = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
-    if scale:
-        _add_scale(entity, low, high, height, scale, margin)
-    font_size = _FONT * max(high[0] - low[0], high[1] - low[1])
-    entities = (_obstacle(name, part, height, font_size) for name, part in obstacles.items())
+    _add_axes(entity, low_corner, high_corner, height)
+    greatest_value = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    if greatest_value:
+        _add_scale(entity, low_corner, high_corner, height, greatest_value, margin)
+    font_size = _FONT * max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
+    entities = (_obstacle(name, footprint, height, font_size) for name, footprint in obstacles.items())
     return MapFrame(entity, height, tuple(entities))
 
 
@@ -129,7 +129,7 @@ def map_drawing(
 
 
 def _add_blocked_cells(
-    entity: SceneEntity, blocked: Booleans, low: tuple[float, float], cell_size: float, height: float
+    entity: SceneEntity, blocked: Booleans, low_corner: tuple[float, float], cell_size: float, height: float
 ) -> None:
     """Add a grey area for the blocked cells, which the map leaves transparent; free cells at 0 are white."""
     changes = np.diff(np.pad(blocked, ((0, 0), (1, 1))).astype(np.int8), axis=1)
@@ -138,12 +138,12 @@ def _add_blocked_cells(
     area = entity.triangles.add()
     area.pose.position.z, area.pose.orientation.w = height, 1.0
     area.color.r, area.color.g, area.color.b, area.color.a = *NEUTRAL, _BLOCKED_OPACITY
-    for number, (row, start, end) in enumerate(
+    for run_index, (row, start, end) in enumerate(
         zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
     ):
-        for column, line in ((start, row), (end, row), (end, row + 1), (start, row + 1)):
-            area.points.add(x=low[0] + column * cell_size, y=low[1] + line * cell_size)
-        area.indices.extend(4 * number + corner for corner in (0, 1, 2, 0, 2, 3))
+        for column, row_line in ((start, row), (end, row), (end, row + 1), (start, row + 1)):
+            area.points.add(x=low_corner[0] + column * cell_size, y=low_corner[1] + row_line * cell_size)
+        area.indices.extend(4 * run_index + corner for corner in (0, 1, 2, 0, 2, 3))
 
 
 def _contour(values: Floats, margin: float) -> Floats:
@@ -153,63 +153,69 @@ def _contour(values: Floats, margin: float) -> Floats:
     return np.concatenate([across[:, ::-1], along])
 
 
-def _run_ends(before: Floats, after: Floats, margin: float) -> Floats:
+def _run_ends(first_rows: Floats, second_rows: Floats, margin: float) -> Floats:
     """Return row and ends (2 N, 2) of each run of columns where only one of two rows reaches the margin."""
-    parted: Booleans = np.isfinite(before) & np.isfinite(after) & ((before >= margin) != (after >= margin))
-    changes = np.diff(np.pad(parted, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    is_parted: Booleans = (
+        np.isfinite(first_rows)
+        & np.isfinite(second_rows)
+        & ((first_rows >= margin) != (second_rows >= margin))
+    )
+    changes = np.diff(np.pad(is_parted, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     return np.argwhere(changes).astype(np.float64)
 
 
 def _add_axes(
-    entity: SceneEntity, low: tuple[float, float], high: tuple[float, float], height: float
+    entity: SceneEntity, low_corner: tuple[float, float], high_corner: tuple[float, float], height: float
 ) -> None:
     """Add a frame with ticks and coordinates below and on the left."""
-    size = max(high[0] - low[0], high[1] - low[1])
-    corners = [low, (high[0], low[1]), high, (low[0], high[1])]
+    size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
+    corners = [low_corner, (high_corner[0], low_corner[1]), high_corner, (low_corner[0], high_corner[1])]
     entity.lines.append(_line(corners, height, NEUTRAL, LinePrimitive.LINE_LOOP, pixels=_THIN_PIXELS))
     ticks: list[tuple[float, float]] = []
-    for x in _round_numbers(low[0], high[0]):
-        ticks += [(x, low[1]), (x, low[1] - _TICK * size)]
-        _add_text(entity, number_text(x), (x, low[1] - (_TICK + _FONT) * size), height, _FONT * size)
-    for y in _round_numbers(low[1], high[1]):
-        ticks += [(low[0], y), (low[0] - _TICK * size, y)]
+    for x in _round_numbers(low_corner[0], high_corner[0]):
+        ticks += [(x, low_corner[1]), (x, low_corner[1] - _TICK * size)]
+        _add_text(entity, number_text(x), (x, low_corner[1] - (_TICK + _FONT) * size), height, _FONT * size)
+    for y in _round_numbers(low_corner[1], high_corner[1]):
+        ticks += [(low_corner[0], y), (low_corner[0] - _TICK * size, y)]
         text = number_text(y)
-        left = low[0] - (2.0 * _TICK + _half_width(text)) * size
+        left = low_corner[0] - (2.0 * _TICK + _half_width(text)) * size
         _add_text(entity, text, (left, y), height, _FONT * size)
     entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
 
 
 def _add_scale(
     entity: SceneEntity,
-    low: tuple[float, float],
-    high: tuple[float, float],
+    low_corner: tuple[float, float],
+    high_corner: tuple[float, float],
     height: float,
-    scale: float,
+    greatest_value: float,
     margin: float,
 ) -> None:
     """Add the colour bar on the right, with numbers at its ends, at 0 and at the margin."""
-    size = max(high[0] - low[0], high[1] - low[1])
-    left, right = high[0] + _GAP * size, high[0] + (_GAP + _BAR) * size
-    numbers = np.linspace(-scale, scale, _SHADES)
-    levels = np.linspace(low[1], high[1], _SHADES)
+    size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
+    left, right = high_corner[0] + _GAP * size, high_corner[0] + (_GAP + _BAR) * size
+    bar_values = np.linspace(-greatest_value, greatest_value, _SHADES)
+    bar_levels = np.linspace(low_corner[1], high_corner[1], _SHADES)
     bar = entity.triangles.add()
     bar.pose.position.z, bar.pose.orientation.w = height, 1.0
-    for level, colour in zip(levels.tolist(), (cell_colours(numbers) / 255.0).tolist(), strict=True):
+    for level, colour in zip(bar_levels.tolist(), (cell_colours(bar_values) / 255.0).tolist(), strict=True):
         for x in (left, right):
             bar.points.add(x=x, y=level)
             bar.colors.add(r=colour[0], g=colour[1], b=colour[2], a=colour[3])
-    for first in range(0, 2 * (_SHADES - 1), 2):
-        bar.indices.extend((first, first + 1, first + 2, first + 1, first + 3, first + 2))
+    for corner in range(0, 2 * (_SHADES - 1), 2):
+        bar.indices.extend((corner, corner + 1, corner + 2, corner + 1, corner + 3, corner + 2))
     ticks: list[tuple[float, float]] = []
     levels_of_texts: list[float] = []
-    for number in dict.fromkeys((0.0, scale, -scale, margin)):
-        level = (low[1] + high[1]) / 2.0 + number / scale * (high[1] - low[1]) / 2.0
-        if abs(number) > scale:
+    for tick_value in dict.fromkeys((0.0, greatest_value, -greatest_value, margin)):
+        level = (low_corner[1] + high_corner[1]) / 2.0 + tick_value / greatest_value * (
+            high_corner[1] - low_corner[1]
+        ) / 2.0
+        if abs(tick_value) > greatest_value:
             continue
         ticks += [(left, level), (right + _TICK * size, level)]
-        if all(abs(level - before) >= _FONT * size for before in levels_of_texts):
+        if all(abs(level - other_level) >= _FONT * size for other_level in levels_of_texts):
             levels_of_texts.append(level)
-            text = number_text(number)
+            text = number_text(tick_value)
             x = right + (2.0 * _TICK + _half_width(text)) * size
             _add_text(entity, text, (x, level), height, _FONT * size)
     entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
@@ -222,12 +228,14 @@ def _half_width(text: str) -> float:
 
 def _round_numbers(low: float, high: float) -> Iterator[float]:
     """Yield the multiples of a round number in an interval, at most `_MOST_TICKS`."""
-    least = (high - low) / (_MOST_TICKS - 1)
-    power = 10.0 ** math.floor(math.log10(least))
-    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))
+    least_step = (high - low) / (_MOST_TICKS - 1)
+    power = 10.0 ** math.floor(math.log10(least_step))
+    step = next(
+        factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least_step * (1 - 1e-9)
+    )
     # the tolerances keep ticks at the ends in spite of rounding
-    for place in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
-        yield place * step
+    for multiple in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
+        yield multiple * step
 
 
 def _add_text(

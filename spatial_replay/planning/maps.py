@@ -108,16 +108,16 @@ class GradientMap(Displayed):
             avoided: places (x, y) from which the poses are also at least two cells away.
         """
         # stable, so that equally robust cells keep their order
-        order = np.argsort(
+        cell_order = np.argsort(
             -np.where(self.blocked == FREE, self.robustness, -np.inf), axis=None, kind="stable"
         )
         places, poses = [*avoided], list[tuple[float, float, float, float]]()
-        for number in order[: int((self.blocked == FREE).sum())]:
-            turn, row, column = map(int, np.unravel_index(int(number), self.blocked.shape))
+        for cell_index in cell_order[: int((self.blocked == FREE).sum())]:
+            turn, row, column = map(int, np.unravel_index(int(cell_index), self.blocked.shape))
             place = self.grid.centre(row, column)
             if len(poses) == count:
                 break
-            if all(math.dist(place, before) >= 2.0 * self.grid.cell_size for before in places):
+            if all(math.dist(place, other_place) >= 2.0 * self.grid.cell_size for other_place in places):
                 places.append(place)
                 poses.append((*place, float(self.turns[turn]), float(self.robustness[turn, row, column])))
         return poses
@@ -148,8 +148,8 @@ def gradient_map(
         after: maps after motions of other objects, for the robustness; blocked cells follow from `maps`.
     """
     shape = maps.clearance.shape
-    then = maps if after is None else after
-    robustness = _greatest(then.lower, then.upper, progress, shape)
+    robustness_maps = maps if after is None else after
+    robustness = _greatest(robustness_maps.lower, robustness_maps.upper, progress, shape)
     danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
     # later assignments take precedence: a constrained cell is reported as such, even if it is also occupied
@@ -157,7 +157,7 @@ def gradient_map(
     blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
     blocked[danger >= -margin] = CONSTRAINED
-    parts = MapParts(maps, then, progress, constraints)
+    parts = MapParts(maps, robustness_maps, progress, constraints)
     return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns, parts)
 
 
@@ -211,8 +211,8 @@ class PropositionMaps:
 
     def room(self, others: Collection[str] | None) -> Floats:
         """Return the distance to the nearest of some objects, (A, rows, columns); None for all objects."""
-        mask = [others is None or name in others for name in self.obstacles]
-        return np.asarray(self.distances[mask].min(axis=0, initial=np.inf))
+        is_selected = [others is None or name in others for name in self.obstacles]
+        return np.asarray(self.distances[is_selected].min(axis=0, initial=np.inf))
 
     def nearest(self) -> NDArray[np.int64]:
         """Return the index in `obstacles` of what is nearest in each cell, (A, rows, columns).
@@ -262,48 +262,54 @@ def proposition_maps(
     if not isinstance(tracked, TrackedObject):
         present = ", ".join(sample.objects) or "none"
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
-    cells = workspace.grid if grid is None else grid
+    map_grid = workspace.grid if grid is None else grid
     turns = workspace.turns(tracked.yaw)
-    moves = np.array([concerns(proposition, name) for proposition in propositions], np.bool_)
-    concerned = [proposition for proposition, is_moving in zip(propositions, moves, strict=True) if is_moving]
-    others = [
-        proposition for proposition, is_moving in zip(propositions, moves, strict=True) if not is_moving
+    is_concerned = np.array([concerns(proposition, name) for proposition in propositions], np.bool_)
+    moving_propositions = [
+        proposition for proposition, is_moving in zip(propositions, is_concerned, strict=True) if is_moving
+    ]
+    fixed_propositions = [
+        proposition
+        for proposition, is_moving in zip(propositions, is_concerned, strict=True)
+        if not is_moving
     ]
     obstacles = [
         obstacle for obstacle in sorted(sample.objects) if obstacle not in (name, *workspace.supports)
     ]
-    formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
-    trace, centres = Trace.from_samples([sample]), cells.centres()
+    formulas = [*moving_propositions, *_obstacle_distances(propositions, name, obstacles)]
+    trace, centres = Trace.from_samples([sample]), map_grid.centres()
     shape = len(turns), len(centres)
-    to_obstacles: Floats = np.empty((len(obstacles) + 1, *shape))
+    obstacle_distances: Floats = np.empty((len(obstacles) + 1, *shape))
     pieces: list[tuple[slice, Floats]] = []
-    for places in _slices(len(centres), math.prod(shape) * len(formulas)):
-        posed = _trace_over_poses(trace, tracked, name, centres[places], turns)
-        static = _static_distance(posed, name, workspace.obstacles).reshape(len(turns), -1)
+    for cell_slice in _slices(len(centres), math.prod(shape) * len(formulas)):
+        posed_trace = _trace_over_poses(trace, tracked, name, centres[cell_slice], turns)
+        static_distances = _static_distance(posed_trace, name, workspace.obstacles).reshape(len(turns), -1)
         # the first two rows are bounds without uncertainty
-        values = leaf_values(TraceScene(posed, regions), formulas, {})[:2]
-        values = values.reshape(*values.shape[:2], *static.shape)
-        to_obstacles[:, :, places] = [*values[0, len(concerned) :], static]
-        pieces.append((places, values[:, : len(concerned)]))
+        leaf_bounds = leaf_values(TraceScene(posed_trace, regions), formulas, {})[:2]
+        leaf_bounds = leaf_bounds.reshape(*leaf_bounds.shape[:2], *static_distances.shape)
+        obstacle_distances[:, :, cell_slice] = [*leaf_bounds[0, len(moving_propositions) :], static_distances]
+        pieces.append((cell_slice, leaf_bounds[:, : len(moving_propositions)]))
     # propositions that do not depend on the object have the same value in every cell
-    fixed = leaf_values(TraceScene(trace, regions), others, {})[:2, :, :, None]
+    fixed_bounds = leaf_values(TraceScene(trace, regions), fixed_propositions, {})[:2, :, :, None]
     # if everything is known, as in most maps, one array has both bounds
-    ends = max(len(fixed), *(len(values) for _, values in pieces))
-    bounds: Floats = np.empty((ends, len(propositions), *shape))
-    bounds[:, ~moves] = fixed
-    for places, values in pieces:
-        bounds[:, moves, :, places] = values
-    bounds = bounds.reshape(ends, len(propositions), len(turns), *cells.shape)
-    to_obstacles = to_obstacles.reshape(-1, len(turns), *cells.shape)
-    about = MapSubject(tuple(propositions), regions, sample)
-    ways = to_obstacles.min(axis=0), to_obstacles, turns, (*obstacles, "")
-    return PropositionMaps(name, cells, bounds[0], bounds[-1], *ways, about, workspace.named_obstacles)
+    bound_count = max(len(fixed_bounds), *(len(leaf_bounds) for _, leaf_bounds in pieces))
+    bounds: Floats = np.empty((bound_count, len(propositions), *shape))
+    bounds[:, ~is_concerned] = fixed_bounds
+    for cell_slice, leaf_bounds in pieces:
+        bounds[:, is_concerned, :, cell_slice] = leaf_bounds
+    bounds = bounds.reshape(bound_count, len(propositions), len(turns), *map_grid.shape)
+    obstacle_distances = obstacle_distances.reshape(-1, len(turns), *map_grid.shape)
+    subject = MapSubject(tuple(propositions), regions, sample)
+    distance_fields = obstacle_distances.min(axis=0), obstacle_distances, turns, (*obstacles, "")
+    return PropositionMaps(
+        name, map_grid, bounds[0], bounds[-1], *distance_fields, subject, workspace.named_obstacles
+    )
 
 
-def _slices(count: int, values: int) -> Iterator[slice]:
+def _slices(cell_count: int, value_count: int) -> Iterator[slice]:
     """Yield slices of `count` places with a total of `values` values, each of at most `_AT_ONCE` values."""
-    size = max(1, count * _AT_ONCE // max(values, 1))
-    yield from (slice(first, first + size) for first in range(0, count, size))
+    slice_size = max(1, cell_count * _AT_ONCE // max(value_count, 1))
+    yield from (slice(first, first + slice_size) for first in range(0, cell_count, slice_size))
 
 
 def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:
@@ -312,13 +318,13 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
     The distance is at most 0 exactly if the object's centre is in the Minkowski sum of the obstacle and the
     mirrored object, the usual configuration-space obstacle.
     """
-    atoms_read = (
+    proposition_atoms = (
         part for proposition in propositions for part in iter_formulas(proposition) if isinstance(part, Atom)
     )
-    measured = {part for atom in atoms_read for part in iter_expressions(atom.expression)}
+    measured_expressions = {part for atom in proposition_atoms for part in iter_expressions(atom.expression)}
     pairs = ((distance_between(name, obstacle), distance_between(obstacle, name)) for obstacle in obstacles)
     # operands in the order in which a proposition measures them, so that the kernel measures them only once
-    return [swapped if swapped.expression in measured else atom for atom, swapped in pairs]
+    return [swapped if swapped.expression in measured_expressions else atom for atom, swapped in pairs]
 
 
 def distance_between(first: str, second: str) -> Atom:
@@ -331,8 +337,8 @@ def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) ->
     if not obstacles:
         return np.full(len(trace), np.inf)
     batch = FootprintBatch.concatenate([trace.footprints, FootprintBatch.from_footprints(obstacles)])
-    rows = np.tile(np.arange(len(trace.footprints), len(batch)), (len(trace), 1))
-    operands = Operand(trace.rows[:, [trace.names.index(name)]]), Operand(rows)
+    obstacle_rows = np.tile(np.arange(len(trace.footprints), len(batch)), (len(trace), 1))
+    operands = Operand(trace.rows[:, [trace.names.index(name)]]), Operand(obstacle_rows)
     return np.asarray(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0])
 
 
@@ -341,20 +347,20 @@ def _trace_over_poses(
 ) -> Trace:
     """Return a trace with a copy of the only sample for each turn and position of the object."""
     footprints = with_poses(trace.footprints, tracked, centres, turns)
-    count, column = len(footprints) - len(trace.footprints), trace.names.index(name)
-    object_rows = np.full(count, trace.rows[0, column])
-    rows = np.repeat(trace.rows, count, axis=0)
-    rows[:, column] = len(trace.footprints) + np.arange(count)
+    pose_count, column = len(footprints) - len(trace.footprints), trace.names.index(name)
+    object_rows = np.full(pose_count, trace.rows[0, column])
+    rows = np.repeat(trace.rows, pose_count, axis=0)
+    rows[:, column] = len(trace.footprints) + np.arange(pose_count)
     return Trace(
-        times_ns=np.arange(count, dtype=np.int64),
+        times_ns=np.arange(pose_count, dtype=np.int64),
         names=trace.names,
         rows=rows,
         footprints=footprints,
-        yaw=np.concatenate((trace.yaw, trace.yaw[object_rows] + np.repeat(turns, count // len(turns)))),
+        yaw=np.concatenate((trace.yaw, trace.yaw[object_rows] + np.repeat(turns, pose_count // len(turns)))),
         uncertainty=np.concatenate((trace.uncertainty, trace.uncertainty[object_rows])),
         class_code=np.concatenate((trace.class_code, trace.class_code[object_rows])),
         classes=trace.classes,
-        signals={signal: np.repeat(values, count) for signal, values in trace.signals.items()},
+        signals={signal: np.repeat(values, pose_count) for signal, values in trace.signals.items()},
     )
 
 
@@ -483,21 +489,22 @@ def map_layers(
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = parts.then.about.propositions
-    cubes = [[_Part.of(formulas[number], value) for number, value in cube] for cube in parts.progress]
-    leaves = tuple(dict.fromkeys(leaf for cube in cubes for part in cube for leaf in part.leaves()))
+    cube_parts = [[_Part.of(formulas[number], value) for number, value in cube] for cube in parts.progress]
+    leaves = tuple(dict.fromkeys(leaf for cube in cube_parts for part in cube for leaf in part.leaves()))
     lower, upper = _bounds_of(parts.then, [leaf.formula for leaf in leaves])
     layers = np.empty((len(leaves), *shape))
-    for place, leaf in enumerate(leaves):
-        layers[place] = lower[place] if leaf.wanted else -upper[place]
-    places = {leaf: place for place, leaf in enumerate(leaves)}
+    for layer_index, leaf in enumerate(leaves):
+        layers[layer_index] = lower[layer_index] if leaf.wanted else -upper[layer_index]
+    layer_indices = {leaf: layer_index for layer_index, leaf in enumerate(leaves)}
     limits = (
-        _limit_of([part.limit(layers, places) for part in cube], shape, is_every=True) for cube in cubes
+        _limit_of([part.limit(layers, layer_indices) for part in cube], shape, is_every=True)
+        for cube in cube_parts
     )
     _, limiting = _limit_of(limits, shape, is_every=False)
-    avoided = avoided_cells(gradient, settings, failed)
-    causes, blocked_by = _causes(gradient, avoided if tried is None else avoided | tried)
+    is_avoided = avoided_cells(gradient, settings, failed)
+    causes, blocked_by = _causes(gradient, is_avoided if tried is None else is_avoided | tried)
     texts = tuple(leaf.text for leaf in leaves)
-    required_leaves = [{leaf for part in cube for leaf in part.required_leaves()} for cube in cubes]
+    required_leaves = [{leaf for part in cube for leaf in part.required_leaves()} for cube in cube_parts]
     required = tuple(all(leaf in of_cube for of_cube in required_leaves) for leaf in leaves)
     return MapLayers(texts, required, layers, limiting, causes, blocked_by)
 
@@ -575,52 +582,61 @@ def literal_text(formula: Formula, wanted: bool) -> str:
 
 
 def _limit_of(parts: Iterable[_Limit], shape: tuple[int, ...], *, is_every: bool) -> _Limit:
-    value, limiting = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
+    limit, limiting = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
     for part_value, part_limiting in parts:
-        better = part_value < value if is_every else part_value > value
-        value, limiting = np.where(better, part_value, value), np.where(better, part_limiting, limiting)
-    return value, limiting
+        is_limiting = part_value < limit if is_every else part_value > limit
+        limit, limiting = (
+            np.where(is_limiting, part_value, limit),
+            np.where(is_limiting, part_limiting, limiting),
+        )
+    return limit, limiting
 
 
 def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floats, Floats]:
     """Return bounds (N, A, rows, columns) of the robustness of formulas in the cells of maps."""
-    about = maps.about
-    tracked = about.sample.objects[maps.name]
+    subject = maps.about
+    tracked = subject.sample.objects[maps.name]
     yaw = tracked.yaw or 0.0 if isinstance(tracked, TrackedObject) else 0.0
     # all objects are declared supports, so that the distances of obstacles are not measured again
-    everything = frozenset(about.sample.objects)
-    free = Workspace(maps.grid, yaws=tuple((maps.turns + yaw).tolist()), supports=everything)
-    part_maps = proposition_maps(formulas, about.regions, about.sample, maps.name, free)
+    all_names = frozenset(subject.sample.objects)
+    free_workspace = Workspace(maps.grid, yaws=tuple((maps.turns + yaw).tolist()), supports=all_names)
+    part_maps = proposition_maps(formulas, subject.regions, subject.sample, maps.name, free_workspace)
     return part_maps.lower, part_maps.upper
 
 
-def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
+def _causes(gradient: GradientMap, is_avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
     """Return the causes that block cells, and the index of each cell's cause."""
     maps, blocked = gradient.made_of.now, gradient.blocked
     # kind and number of a cause as one integer, so that np.unique counts causes
     codes = np.full(blocked.shape, -1, np.int64)
-    for reason, family in _KIND_OF.items():
-        codes[blocked == reason] = family * _NUMBERS
-    stands = blocked == OCCUPIED
-    codes[stands] += maps.nearest()[stands]
-    held = blocked == CONSTRAINED
+    for reason, kind_index in _KIND_OF.items():
+        codes[blocked == reason] = kind_index * _NUMBERS
+    is_occupied = blocked == OCCUPIED
+    codes[is_occupied] += maps.nearest()[is_occupied]
+    is_constrained = blocked == CONSTRAINED
     texts: tuple[str, ...] = ()
-    if held.any():
-        texts, which = most_dangerous(gradient.made_of, blocked.shape)
-        codes[held] += which[held]
-    codes[(blocked == FREE) & avoided] = _FAILED * _NUMBERS
+    if is_constrained.any():
+        texts, constraint_indices = most_dangerous(gradient.made_of, blocked.shape)
+        codes[is_constrained] += constraint_indices[is_constrained]
+    codes[(blocked == FREE) & is_avoided] = _FAILED * _NUMBERS
     unique_codes, counts = np.unique(codes[codes >= 0], return_counts=True)
-    order = np.argsort(-counts, kind="stable")
+    count_order = np.argsort(-counts, kind="stable")
     causes = []
     blocked_by = np.full(blocked.shape, -1, np.int64)
-    for place, (code, count) in enumerate(
-        zip(unique_codes[order].tolist(), counts[order].tolist(), strict=True)
+    for cause_index, (code, count) in enumerate(
+        zip(unique_codes[count_order].tolist(), counts[count_order].tolist(), strict=True)
     ):
-        kind, number = _KINDS[code // _NUMBERS], code % _NUMBERS
-        name = texts[number] if kind == "constraint" else maps.obstacles[number] if kind == "object" else ""
+        kind, cause_number = _KINDS[code // _NUMBERS], code % _NUMBERS
+        name = (
+            texts[cause_number]
+            if kind == "constraint"
+            else maps.obstacles[cause_number]
+            if kind == "object"
+            else ""
+        )
         if kind == "object" and not name:
             kind = "obstacle"
-        blocked_by[codes == code] = min(place, MOST_CAUSES - 1)
+        blocked_by[codes == code] = min(cause_index, MOST_CAUSES - 1)
         causes.append(BlockedBy(kind, name, count))
     return tuple(causes[:MOST_CAUSES]), blocked_by
 
@@ -640,14 +656,14 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
     guards = list(dict.fromkeys(guards))
     members = list(dict.fromkeys(part for guard in guards for part in guard))
     lower, upper = _bounds_of(parts.now, [member.formula for member in members])
-    places = {member: place for place, member in enumerate(members)}
-    which, danger = np.zeros(shape, np.int64), np.full(shape, -np.inf)
+    member_indices = {member: place for place, member in enumerate(members)}
+    most_robust, danger = np.zeros(shape, np.int64), np.full(shape, -np.inf)
     for number, guard in enumerate(guards):
-        cube = tuple((places[part], part.wanted) for part in guard)
+        cube = tuple((member_indices[part], part.wanted) for part in guard)
         robustness = cube_robustness(upper, lower, cube, shape)
-        which[robustness > danger] = number
+        most_robust[robustness > danger] = number
         np.maximum(danger, robustness, out=danger)
-    return tuple(" and ".join(part.brief for part in guard) for guard in guards), which
+    return tuple(" and ".join(part.brief for part in guard) for guard in guards), most_robust
 
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:
@@ -657,21 +673,21 @@ def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:
 
 def distance_to(places: Collection[tuple[float, float]], grid: Grid) -> Floats:
     """Return the distance from each cell to the nearest of some places, (rows, columns)."""
-    away = np.full(grid.shape, np.inf)
+    distances = np.full(grid.shape, np.inf)
     centres = grid.centres()
     for place in places:
-        np.minimum(away, np.hypot(*(centres - np.array(place)).T).reshape(grid.shape), out=away)
-    return away
+        np.minimum(distances, np.hypot(*(centres - np.array(place)).T).reshape(grid.shape), out=distances)
+    return distances
 
 
 def avoided_cells(
     gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]]
 ) -> Booleans:
     """Return whether a target avoids each cell after failed motions, (rows, columns)."""
-    avoided = near(failed, gradient.grid)
-    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    if holds.any() and not (holds & ~avoided).any():
+    is_avoided = near(failed, gradient.grid)
+    is_met = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    if is_met.any() and not (is_met & ~is_avoided).any():
         # a motion may fail by chance, so places are tried again, those far from the failures first
-        away = distance_to(failed, gradient.grid)
-        return np.asarray(away < away[holds.any(axis=0)].max() / 2.0)
-    return avoided
+        distances = distance_to(failed, gradient.grid)
+        return np.asarray(distances < distances[is_met.any(axis=0)].max() / 2.0)
+    return is_avoided

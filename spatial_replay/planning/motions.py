@@ -95,9 +95,11 @@ class Movables:
 
     def names_for(self, progress: Guards) -> list[str]:
         """Return the movable objects that a progress set depends on, in the order of the settings."""
-        about = {number for cube in progress.cubes for number, _ in cube}
+        proposition_numbers = {number for cube in progress.cubes for number, _ in cube}
         return [
-            name for name in self.names if any(concerns(self.propositions[number], name) for number in about)
+            name
+            for name in self.names
+            if any(concerns(self.propositions[number], name) for number in proposition_numbers)
         ]
 
     def candidate(
@@ -117,27 +119,27 @@ class Movables:
         tracked, settings = self.sample.objects[name], self.settings
         gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)
         # a failed motion may have lacked room, so its object keeps room from everything
-        keeps_all = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
-        room_from = None if keeps_all else later
-        failed = self.attempts.places_of(name)
+        keeps_all_room = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
+        room_from = None if keeps_all_room else later
+        failed_places = self.attempts.places_of(name)
         # another target does not help an object that cannot be picked up
         target: Target | str = "it could not be picked up where it lies"
         if not self.attempts.failed_pick(name, self.sample, settings):
             room = gradient.made_of.now.room(room_from)
-            target = find_target(gradient, tracked, settings, room, failed, self.failed_here(name))
+            target = find_target(gradient, tracked, settings, room, failed_places, self.failed_here(name))
         if isinstance(target, Target) and refine:
             target = self.refine(target, consideration, room_from)
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, Target) and self.is_repeated(target):
             target = "it was tried wherever it would hold, and nothing has changed since"
-        possible_target, why = (None, target) if isinstance(target, str) else (target, "")
+        possible_target, rejection = (None, target) if isinstance(target, str) else (target, "")
         return Candidate(
             name,
             gradient,
             possible_target,
-            why,
-            failed=failed,
+            rejection,
+            failed=failed_places,
             room_from=_tuple(room_from),
             failures=self.failed_here(name),
         )
@@ -173,9 +175,11 @@ class Movables:
             return target
         failures = () if settings.skill == "push" else self.failed_here(name)
         measure = self._measures(name, consideration, room_from, then)
-        better = refine_target(target, self.sample.objects[name], settings, measure, failures)
-        is_kept = settings.skill == "place" or self._is_pushed_to(better, consideration.constraints.cubes)
-        return better if is_kept else target
+        refined_target = refine_target(target, self.sample.objects[name], settings, measure, failures)
+        is_usable = settings.skill == "place" or self._is_pushed_to(
+            refined_target, consideration.constraints.cubes
+        )
+        return refined_target if is_usable else target
 
     def _measures(
         self,
@@ -187,19 +191,28 @@ class Movables:
         """Return the function that measures an object's maps for an edge, as `refine_target` needs it."""
         settings = self.settings
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
-        later = self.sample if then is None else move_objects(self.sample, then)
+        later_sample = self.sample if then is None else move_objects(self.sample, then)
 
         def measure(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
             workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
-            about = self.propositions, self.regions
-            now = proposition_maps(*about, self.sample, name, workspace, grid)
-            after = now if then is None else proposition_maps(*about, later, name, workspace, grid)
+            subject = self.propositions, self.regions
+            current_maps = proposition_maps(*subject, self.sample, name, workspace, grid)
+            later_maps = (
+                current_maps
+                if then is None
+                else proposition_maps(*subject, later_sample, name, workspace, grid)
+            )
             gradient = gradient_map(
-                now, progress, constraints, settings.workspace, settings.constraint_margin, after
+                current_maps,
+                progress,
+                constraints,
+                settings.workspace,
+                settings.constraint_margin,
+                later_maps,
             )
             # places that later motions of other objects occupy
-            gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
-            return gradient, np.minimum(now.room(room_from), after.room(room_from))
+            gradient.blocked[later_maps.clearance <= settings.workspace.clearance] = OCCUPIED
+            return gradient, np.minimum(current_maps.room(room_from), later_maps.room(room_from))
 
         return measure
 
@@ -207,14 +220,16 @@ class Movables:
         """Return whether the last leg of a path, and the turn at its end, are free."""
         # the progress set ((),) is always true, because only blocked cells matter
         gradient = self.gradient(target.name, ((),), constraints)
-        size = gradient.grid.cell_size
-        last = (gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], size / 2))
-        if any(gradient.blocked[0][cell] != FREE for cell in last):
+        cell_size = gradient.grid.cell_size
+        last_cells = (
+            gradient.grid.cell(*point) for point in points_along(target.waypoints[-2:], cell_size / 2)
+        )
+        if any(gradient.blocked[0][cell] != FREE for cell in last_cells):
             return False
         if not is_clear_leg(gradient, target.waypoints[-2:], self.settings):
             return False
-        spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
-        return bool(can_turn_in(spot, gradient, target.turn, self.settings).all())
+        target_grid = Grid(target.x - cell_size / 2, target.y - cell_size / 2, cell_size, 1, 1)
+        return bool(can_turn_in(target_grid, gradient, target.turn, self.settings).all())
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
         """Return the target of a carried object with a path that keeps the constraints, or why there is none.
@@ -224,37 +239,41 @@ class Movables:
         margin or, as a last resort, just false.
         """
         settings, name = self.settings, target.name
-        about = sorted({number for cube in constraints for number, _ in cube})
-        is_bound = any(concerns(self.propositions[number], name) for number in about)
+        proposition_numbers = sorted({number for cube in constraints for number, _ in cube})
+        is_bound = any(concerns(self.propositions[number], name) for number in proposition_numbers)
         if settings.skill == "push" or settings.lift is None or not is_bound:
             return target
-        danger, grid, parts = self._danger_on_the_way(target, constraints, about)
-        away = distance_to([settings.workspace.base], grid)
-        reached = (away >= settings.workspace.nearest) & (away <= settings.workspace.farthest)
+        danger, grid, parts = self._danger_on_the_way(target, constraints, proposition_numbers)
+        base_distance = distance_to([settings.workspace.base], grid)
+        is_reached = (base_distance >= settings.workspace.nearest) & (
+            base_distance <= settings.workspace.farthest
+        )
         (start, end), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
         goals[grid.cell(*end)] = True
         margin = settings.constraint_margin
         for distance in (margin + grid.cell_size / math.sqrt(2.0), margin, 0.0):
-            path = shortest_path(reached & (danger < -distance), grid.cell(*start), goals)
+            path = shortest_path(is_reached & (danger < -distance), grid.cell(*start), goals)
             if path is not None:
-                turns = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
+                corners = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
                 # a straight path gets a third waypoint, because two would leave the path to the robot
                 middle = ((start[0] + end[0]) / 2.0, (start[1] + end[1]) / 2.0)
-                return replace(target, waypoints=(start, *(turns or [middle]), end))
+                return replace(target, waypoints=(start, *(corners or [middle]), end))
         # the reason names the constraints that the shortest path crosses
-        path = shortest_path(reached, grid.cell(*start), goals)
+        path = shortest_path(is_reached, grid.cell(*start), goals)
         if path is None:
             return "the robot does not reach all of any way there"
         centres = [grid.centre(*cell) for cell in path.cells.tolist()]
-        crossed = [grid.cell(*point) for point in points_along(centres, grid.cell_size)]
-        texts, which = most_dangerous(parts, (1, *grid.shape))
-        numbers = dict.fromkeys(int(which[0][cell]) for cell in crossed if danger[cell] >= 0.0)
-        named = sorted((texts[number] for number in numbers), key=len)
-        said = " and ".join(text for text in named[:_MOST_NAMED] if len(text) <= _LONGEST_NAME)
-        return f"on every way there a constraint would hold{said and ', on the shortest one ' + said}"
+        crossed_cells = [grid.cell(*point) for point in points_along(centres, grid.cell_size)]
+        texts, indices = most_dangerous(parts, (1, *grid.shape))
+        crossed_numbers = dict.fromkeys(
+            int(indices[0][cell]) for cell in crossed_cells if danger[cell] >= 0.0
+        )
+        crossed_texts = sorted((texts[number] for number in crossed_numbers), key=len)
+        listing = " and ".join(text for text in crossed_texts[:_MOST_NAMED] if len(text) <= _LONGEST_NAME)
+        return f"on every way there a constraint would hold{listing and ', on the shortest one ' + listing}"
 
     def _danger_on_the_way(
-        self, target: Target, constraints: Cubes, about: Sequence[int]
+        self, target: Target, constraints: Cubes, proposition_numbers: Sequence[int]
     ) -> tuple[np.ndarray, Grid, MapParts]:
         """Return the constraints' robustness with the object carried over each cell, (rows, columns).
 
@@ -267,13 +286,16 @@ class Movables:
         centre = centre_of(tracked.footprint)
         grid = settings.workspace.grid.reaching(*centre)
         # the constraints decide here; all objects are supports, so none is an obstacle
-        free = Workspace(grid, supports=frozenset(self.sample.objects))
-        formulas = [self.propositions[number] for number in about]
-        places = {number: place for place, number in enumerate(about)}
-        cubes = tuple(tuple((places[n], value) for n, value in cube) for cube in constraints)
-        moved = (moved_object(tracked, *centre, turn) for turn in dict.fromkeys((0.0, target.turn)))
-        samples = (with_objects(self.sample, {target.name: carried}) for carried in moved)
-        maps = [proposition_maps(formulas, self.regions, sample, target.name, free) for sample in samples]
+        free_workspace = Workspace(grid, supports=frozenset(self.sample.objects))
+        formulas = [self.propositions[proposition] for proposition in proposition_numbers]
+        positions = {proposition: place for place, proposition in enumerate(proposition_numbers)}
+        cubes = tuple(tuple((positions[number], value) for number, value in cube) for cube in constraints)
+        carried_objects = (moved_object(tracked, *centre, turn) for turn in dict.fromkeys((0.0, target.turn)))
+        samples = (with_objects(self.sample, {target.name: carried}) for carried in carried_objects)
+        maps = [
+            proposition_maps(formulas, self.regions, sample, target.name, free_workspace)
+            for sample in samples
+        ]
         danger = np.maximum.reduce([danger_of(turned, cubes)[0] for turned in maps])
         return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
 
@@ -286,12 +308,12 @@ class Movables:
         """Return the maps of all propositions for an object."""
         if name not in self._maps:
             workspace = self.settings.workspace
-            pushes = self.settings.skill == "push"
+            is_pushed = self.settings.skill == "push"
             # a pushed object crosses all cells from its start, which may be outside the workspace
             centre = centre_of(self.sample.objects[name].footprint)
-            grid = workspace.grid.reaching(*centre) if pushes else workspace.grid
-            about = self.propositions, self.regions, self.sample, name
-            self._maps[name] = proposition_maps(*about, workspace, grid)
+            grid = workspace.grid.reaching(*centre) if is_pushed else workspace.grid
+            subject = self.propositions, self.regions, self.sample, name
+            self._maps[name] = proposition_maps(*subject, workspace, grid)
         return self._maps[name]
 
 
@@ -306,23 +328,25 @@ def with_choice(
 
     The best candidate is the first one of `by_cost`; among equal ones, the first candidate.
     """
-    order = by_cost(candidates, settings)
-    if not order:
+    targets_by_index = by_cost(candidates, settings)
+    if not targets_by_index:
         causes = "; ".join(f"{candidate.name}: {candidate.rejected}" for candidate in candidates)
         kind = "no object can do it" if causes else "no object that can be moved matters to it"
         return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
-    return choose_candidate(replace(consideration, candidates=tuple(candidates)), next(iter(order)))
+    return choose_candidate(
+        replace(consideration, candidates=tuple(candidates)), next(iter(targets_by_index))
+    )
 
 
 def choose_candidate(
     consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
 ) -> Consideration:
     """Return an edge with one candidate chosen, or none, and with the planned motions."""
-    marked = tuple(
-        replace(candidate, is_chosen=place == number)
-        for place, candidate in enumerate(consideration.candidates)
+    candidates = tuple(
+        replace(candidate, is_chosen=index == number)
+        for index, candidate in enumerate(consideration.candidates)
     )
-    return replace(consideration, candidates=marked, motions=motions)
+    return replace(consideration, candidates=candidates, motions=motions)
 
 
 def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
@@ -368,8 +392,8 @@ class PredictedState(NamedTuple):
     def after(self, name: str, pose: Pose) -> PredictedState:
         """Return the predicted state after a motion of an object."""
         (x, y, turn), moved = pose, dict(self.moved)
-        *_, turned = moved.get(name, (0.0, 0.0, 0.0))
-        moved[name] = x, y, turned + turn
+        *_, previous_turn = moved.get(name, (0.0, 0.0, 0.0))
+        moved[name] = x, y, previous_turn + turn
         return PredictedState(move_objects(self.sample, {name: pose}), tuple(sorted(moved.items())))
 
 
@@ -410,14 +434,14 @@ class Expectations:
     def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
         """Return the distance of an object in a sample to each of the others."""
         self.budget.spend(_LOOK)
-        apart = [distance_between(name, neighbour) for neighbour in others]
-        return values_in(sample, apart, self.regions)[0] if apart else []
+        distance_formulas = [distance_between(name, neighbour) for neighbour in others]
+        return values_in(sample, distance_formulas, self.regions)[0] if distance_formulas else []
 
     def movables(self, scene: PredictedState) -> Movables:
         """Return the movable objects of a scene."""
         if scene.moved not in self._movables:
-            about = self.formulas, self.regions, scene.sample, self.settings, self.attempts
-            self._movables[scene.moved] = Movables(*about)
+            subject = self.formulas, self.regions, scene.sample, self.settings, self.attempts
+            self._movables[scene.moved] = Movables(*subject)
         return self._movables[scene.moved]
 
     def states_after(self, scene: PredictedState, state: int) -> frozenset[int]:
@@ -427,7 +451,10 @@ class Expectations:
     def robustness(self, sample: Sample, cubes: Cubes) -> float:
         """Return the robustness of a disjunction of cubes in a sample."""
         lower, upper = self.values(sample)
-        return max(min((lower[n] if w else -upper[n] for n, w in cube), default=0.0) for cube in cubes)
+        return max(
+            min((lower[number] if is_wanted else -upper[number] for number, is_wanted in cube), default=0.0)
+            for cube in cubes
+        )
 
     def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
         """Return the constraints as conjunctions of relations, none of which may hold."""
@@ -441,10 +468,12 @@ class Expectations:
 
     def traps(self, state: int) -> Cubes:
         """Return the guards of the transitions that lose acceptance."""
-        lost = (self.automaton.transition(state, target) for target in self.automaton.successors[state])
+        transitions = (
+            self.automaton.transition(state, target) for target in self.automaton.successors[state]
+        )
         return tuple(
             cube
-            for transition in lost
+            for transition in transitions
             if transition is not None and transition.target not in self.automaton.can_accept
             for cube in transition.guard
         )
@@ -513,21 +542,21 @@ class MotionOrder:
     places: Mapping[str, Pose]
     robustness: float
     least: float
-    _dead: set[tuple[frozenset[str], Moved]] = field(default_factory=set)
+    _dead_ends: set[tuple[frozenset[str], Moved]] = field(default_factory=set)
     _targets: dict[tuple[Moved, int, str], Target | None] = field(default_factory=dict)
-    _most_parked: int = _MOST_PARKED
+    _max_parked: int = _MOST_PARKED
     _has_parked: bool = False
 
     def __post_init__(self) -> None:
         symbol = self.expected.symbol(self.begin)
-        self._idle = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
+        self._idle_states = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
 
     def find(self) -> Ordered | None:
         """Return the first order with the fewest parked objects; None if none is found."""
-        for self._most_parked in range(_MOST_PARKED + 1):
+        for self._max_parked in range(_MOST_PARKED + 1):
             # a dead end may be passable with more parked objects
-            self._dead.clear()
-            self._has_parked = self._most_parked == 0
+            self._dead_ends.clear()
+            self._has_parked = self._max_parked == 0
             sequence = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
             # if no object could be parked, a larger limit does not help
             if sequence is not None or not self._has_parked:
@@ -535,37 +564,53 @@ class MotionOrder:
         return None
 
     def _motions(
-        self, scene: PredictedState, state: int, left: frozenset[str], parked: tuple[str, ...] = ()
+        self,
+        scene: PredictedState,
+        state: int,
+        remaining_names: frozenset[str],
+        parked_names: tuple[str, ...] = (),
     ) -> Ordered | None:
         """Return the motions of the remaining objects, with the resulting scene and state."""
-        if not left:
+        if not remaining_names:
             return Ordered((), scene, state) if self._is_done(state) else None
-        if (left, scene.moved) in self._dead or not self._spend(0):
+        if (remaining_names, scene.moved) in self._dead_ends or not self._spend(0):
             return None
-        is_first = len(left) == len(self.places)
-        for name in sorted(left):
-            key = scene.moved, state, name
-            if key not in self._targets:
+        is_first = len(remaining_names) == len(self.places)
+        for name in sorted(remaining_names):
+            target_key = scene.moved, state, name
+            if target_key not in self._targets:
                 # checked first, because the automaton's next state costs less than the object's path
-                after = scene.after(name, self._place_of(scene, name))
-                leads_on = self._next_state(after, state, is_first) >= 0
-                self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
-            target = self._targets[key]
-            still = tuple(parked_name for parked_name in parked if parked_name != name)
-            if (sequence := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
+                next_scene = scene.after(name, self._place_of(scene, name))
+                leads_on = self._next_state(next_scene, state, is_first) >= 0
+                self._targets[target_key] = self._target(scene, state, name, is_first) if leads_on else None
+            target = self._targets[target_key]
+            still_parked = tuple(parked_name for parked_name in parked_names if parked_name != name)
+            if (
+                sequence := self._on(scene, state, target, remaining_names - {name}, still_parked, is_first)
+            ) is not None:
                 return sequence
-        if len(parked) < self._most_parked:
+        if len(parked_names) < self._max_parked:
             # parking does not help an object whose motion takes another edge
-            places = {mover: scene.after(mover, self._place_of(scene, mover)) for mover in sorted(left)}
-            able = [mover for mover in places if self._next_state(places[mover], state, is_first) != _ASTRAY]
-            for name in able:
-                for blocker, target in self._aside(scene, state, name, left, parked, is_first):
-                    more, self._has_parked = (*parked, blocker), True
-                    if blocker not in parked and (
-                        sequence := self._on(scene, state, target, left, more, is_first)
+            scene_by_name = {
+                mover: scene.after(mover, self._place_of(scene, mover)) for mover in sorted(remaining_names)
+            }
+            able_names = [
+                mover
+                for mover in scene_by_name
+                if self._next_state(scene_by_name[mover], state, is_first) != _ASTRAY
+            ]
+            for name in able_names:
+                for blocker, target in self._aside(
+                    scene, state, name, remaining_names, parked_names, is_first
+                ):
+                    parked_with_blocker, self._has_parked = (*parked_names, blocker), True
+                    if blocker not in parked_names and (
+                        sequence := self._on(
+                            scene, state, target, remaining_names, parked_with_blocker, is_first
+                        )
                     ):
                         return sequence._replace(is_aside=True)
-        self._dead.add((left, scene.moved))
+        self._dead_ends.add((remaining_names, scene.moved))
         return None
 
     def _on(
@@ -573,24 +618,26 @@ class MotionOrder:
         scene: PredictedState,
         state: int,
         target: Target | None,
-        left: frozenset[str],
-        parked: tuple[str, ...],
+        remaining_names: frozenset[str],
+        parked_names: tuple[str, ...],
         is_first: bool,
     ) -> Ordered | None:
         """Return a motion and the motions of the remaining objects; None if any is impossible."""
         if target is None:
             return None
-        after = scene.after(target.name, target.pose)
-        if (reached := self._next_state(after, state, is_first)) < 0:
+        next_scene = scene.after(target.name, target.pose)
+        if (next_state := self._next_state(next_scene, state, is_first)) < 0:
             return None
-        rest = self._motions(after, reached, left, parked)
-        return None if rest is None else Ordered((target, *rest.motions), rest.scene, rest.state)
+        later = self._motions(next_scene, next_state, remaining_names, parked_names)
+        return None if later is None else Ordered((target, *later.motions), later.scene, later.state)
 
     def _is_done(self, state: int) -> bool:
         automaton = self.expected.automaton
         if len(self.aims) > 1:
             return state in automaton.accepting
-        return state == self.aims[0].target or (state in automaton.can_accept and state not in self._idle)
+        return state == self.aims[0].target or (
+            state in automaton.can_accept and state not in self._idle_states
+        )
 
     def _next_state(self, scene: PredictedState, state: int, is_first: bool) -> int:
         """Return the state after a motion; `_LOST` or `_ASTRAY` if it is not on the path."""
@@ -598,30 +645,32 @@ class MotionOrder:
         # later samples repeat the scene, and may take further transitions
         for _ in range(len(self.aims)):
             states = self.expected.states_after(scene, state)
-            (after,) = states if len(states) == 1 else (_LOST,)
-            if after not in self.expected.automaton.can_accept:
+            (next_state,) = states if len(states) == 1 else (_LOST,)
+            if next_state not in self.expected.automaton.can_accept:
                 return _LOST
-            if is_strict and after != aim and after not in self._idle:
+            if is_strict and next_state != aim and next_state not in self._idle_states:
                 return _ASTRAY
-            if after == state:
+            if next_state == state:
                 break
-            state = after
+            state = next_state
             # after the edge is taken, time alone may take further transitions
             is_strict = is_strict and state != aim
         return state
 
-    def _aims_hold(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
+    def _aims_hold(self, scene: PredictedState, remaining_names: frozenset[str], parked_name: str) -> bool:
         """Return whether the aims hold in the end if a parked object without its own place stays aside."""
-        if parked in self.places:
+        if parked_name in self.places:
             return True
-        final_sample = move_objects(scene.sample, {name: self._place_of(scene, name) for name in left})
+        final_sample = move_objects(
+            scene.sample, {name: self._place_of(scene, name) for name in remaining_names}
+        )
         return all(self.expected.robustness(final_sample, aim.guard) >= 0.0 for aim in self.aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
         """Return the target pose of an object, with the turn from its orientation in a scene."""
-        (x, y, turn), still = self.places[name], (0.0, 0.0, 0.0)
-        turned = dict(scene.moved).get(name, still)[2] - dict(self.begin.moved).get(name, still)[2]
-        return x, y, turn - turned
+        (x, y, turn), zero = self.places[name], (0.0, 0.0, 0.0)
+        turn_so_far = dict(scene.moved).get(name, zero)[2] - dict(self.begin.moved).get(name, zero)[2]
+        return x, y, turn - turn_so_far
 
     def _constraints_at(self, state: int, is_first: bool) -> Cubes:
         """Return the guards that must not hold during the next motion."""
@@ -641,9 +690,9 @@ class MotionOrder:
             return self._carry_target(scene, name, tracked, constraints)
         if not self._spend(1):
             return None
-        movables, place = self.expected.movables(scene), self._place_of(scene, name)
+        movables, pose = self.expected.movables(scene), self._place_of(scene, name)
         gradient = movables.gradient(name, self.aims[0].guard, constraints)
-        target = target_in(gradient, tracked, settings, place, movables.failed_here(name))
+        target = target_in(gradient, tracked, settings, pose, movables.failed_here(name))
         if isinstance(target, str) or movables.is_repeated(target):
             return None
         return replace(target, robustness=self.robustness)
@@ -654,13 +703,13 @@ class MotionOrder:
         """Return the motion of a carried object to its place; None if it is impossible."""
         settings, (x, y, turn) = self.expected.settings, self._place_of(scene, name)
         moved_sample = move_objects(scene.sample, {name: (x, y, turn)})
-        others = [
+        obstacle_names = [
             neighbour
             for neighbour in moved_sample.objects
             if neighbour != name and neighbour not in settings.workspace.supports
         ]
         if (
-            min(self.expected.clearances(moved_sample, name, others), default=math.inf)
+            min(self.expected.clearances(moved_sample, name, obstacle_names), default=math.inf)
             <= settings.workspace.clearance
         ):
             return None
@@ -684,35 +733,49 @@ class MotionOrder:
         scene: PredictedState,
         state: int,
         name: str,
-        left: frozenset[str],
-        parked: tuple[str, ...],
+        remaining_names: frozenset[str],
+        parked_names: tuple[str, ...],
         is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
         """Yield motions that park the objects that block the path or the place of an object."""
         constraints, settings = self._constraints_at(state, is_first), self.expected.settings
-        names = [movable for movable in self.expected.movables(scene).names if movable != name]
-        names = [movable for movable in names if movable in left or movable not in {*parked, *self.places}]
+        other_names = [movable for movable in self.expected.movables(scene).names if movable != name]
+        other_names = [
+            movable
+            for movable in other_names
+            if movable in remaining_names or movable not in {*parked_names, *self.places}
+        ]
         if settings.skill == "push" and not self._spend(1):
             return
-        way = self._way_past(scene, name, names, constraints)
-        if way is None:
+        swept_object = self._way_past(scene, name, other_names, constraints)
+        if swept_object is None:
             return
-        bound = self._bound_by(scene, {name: way}, constraints)
-        beside = self._beside(scene, name, names)
-        clearances = self.expected.clearances(with_objects(scene.sample, {name: way}), name, names)
-        for blocker, clearance in zip(names, clearances, strict=True):
-            in_way = blocker in beside or clearance <= settings.workspace.clearance
-            if (in_way or blocker in bound) and self._spend(3):
+        bound_names = self._bound_by(scene, {name: swept_object}, constraints)
+        beside_names = self._beside(scene, name, other_names)
+        clearances = self.expected.clearances(
+            with_objects(scene.sample, {name: swept_object}), name, other_names
+        )
+        for blocker, clearance in zip(other_names, clearances, strict=True):
+            is_in_way = blocker in beside_names or clearance <= settings.workspace.clearance
+            if (is_in_way or blocker in bound_names) and self._spend(3):
                 for target in self._parking_motions(
-                    scene, state, blocker, {name: way}, left, is_first, blocker in beside
+                    scene,
+                    state,
+                    blocker,
+                    {name: swept_object},
+                    remaining_names,
+                    is_first,
+                    blocker in beside_names,
                 ):
                     self.expected.budget.parking_places += 1
-                    after = scene.after(target.name, target.pose)
+                    next_scene = scene.after(target.name, target.pose)
                     movables = self.expected.movables(scene)
                     # a constraint may hold at every place of the blocker; then parking does not help
-                    if not in_way and blocker in self._bound_by(after, {name: way}, constraints):
+                    if not is_in_way and blocker in self._bound_by(
+                        next_scene, {name: swept_object}, constraints
+                    ):
                         continue
-                    if not self._aims_hold(after, left, blocker):
+                    if not self._aims_hold(next_scene, remaining_names, blocker):
                         continue
                     target_with_way = movables.with_way(target, constraints)
                     if isinstance(target_with_way, Target) and not movables.is_repeated(target_with_way):
@@ -723,9 +786,9 @@ class MotionOrder:
     ) -> TrackedObject | None:
         """Return an object with the area that it covers on its path, without regard to `others`."""
         settings, tracked = self.expected.settings, scene.sample.objects[name]
-        place = self._place_of(scene, name)
+        pose = self._place_of(scene, name)
         if settings.skill == "place":
-            return moved_object(tracked, *place)
+            return moved_object(tracked, *pose)
         workspace = settings.workspace
         conjunctions = [
             conjunction
@@ -733,46 +796,46 @@ class MotionOrder:
             if not _subjects_of(conjunction, others)
         ]
         formulas, constraints = _cubes_of(conjunctions)
-        free = replace(workspace, supports=workspace.supports.union(others))
-        about = formulas, self.expected.regions, scene.sample, name, free
-        maps = proposition_maps(*about, self.expected.movables(scene).maps_of(name).grid)
+        free_workspace = replace(workspace, supports=workspace.supports.union(others))
+        subject = formulas, self.expected.regions, scene.sample, name, free_workspace
+        maps = proposition_maps(*subject, self.expected.movables(scene).maps_of(name).grid)
         gradient = gradient_map(maps, ((),), constraints, workspace, settings.constraint_margin)
-        target = target_in(gradient, tracked, settings, place)
+        target = target_in(gradient, tracked, settings, pose)
         if isinstance(target, str):
             return None
         # the step is half a radius, so that successive footprints leave no gap for another object
         step = max(workspace.grid.cell_size, radius_of(tracked) / 2.0)
-        parts = [
+        covered_parts = [
             part
             for x, y in points_along(target.waypoints, step)
             for part in moved_object(tracked, x, y).footprint.parts
         ]
-        parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
-        return replace(tracked, footprint=Footprint(tuple(parts)))
+        covered_parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
+        return replace(tracked, footprint=Footprint(tuple(covered_parts)))
 
     def _bound_by(
         self, scene: PredictedState, covered: Mapping[str, TrackedObject], constraints: Cubes
     ) -> set[str]:
         """Return the objects in the constraints that would hold with a moved object on its path."""
-        ((name, way),) = covered.items()
+        ((name, swept_object),) = covered.items()
         relations, cubes = self.expected.relations_about(name, constraints)
-        lower, upper = self.expected.values(with_objects(scene.sample, {name: way}), relations)
+        lower, upper = self.expected.values(with_objects(scene.sample, {name: swept_object}), relations)
         bounds = lower[len(self.expected.formulas) :], upper[len(self.expected.formulas) :]
         margin = self.expected.settings.constraint_margin
-        held = {number for cube in cubes if _danger(cube, *bounds) >= -margin for number, _ in cube}
+        held_numbers = {number for cube in cubes if _danger(cube, *bounds) >= -margin for number, _ in cube}
         return {
             tracked_name
             for tracked_name in scene.sample.objects
-            if any(concerns(relations[number], tracked_name) for number in held)
+            if any(concerns(relations[number], tracked_name) for number in held_numbers)
         }
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
         """Return the neighbours of an object that may have blocked its failed motion."""
         if not self.expected.movables(scene).failed_here(name):
             return set()
-        near = BESIDE * radius_of(scene.sample.objects[name])
+        near_distance = BESIDE * radius_of(scene.sample.objects[name])
         clearances = zip(others, self.expected.clearances(scene.sample, name, others), strict=True)
-        return {neighbour for neighbour, clearance in clearances if clearance <= near}
+        return {neighbour for neighbour, clearance in clearances if clearance <= near_distance}
 
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
@@ -789,7 +852,7 @@ class MotionOrder:
         state: int,
         name: str,
         covered: Mapping[str, TrackedObject],
-        left: frozenset[str],
+        remaining_names: frozenset[str],
         is_first: bool,
         is_beside: bool,
     ) -> Iterator[Target]:
@@ -801,53 +864,67 @@ class MotionOrder:
         settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
         movables = self.expected.movables(scene)
-        now, gradient = movables.maps_of(name), movables.gradient(name, self.aims[0].guard, constraints)
-        places = {mover: self._place_of(scene, mover) for mover in left if mover != name}
-        final_sample = move_objects(scene.sample, places)
-        later = self.expected.relations_about(name, self._constraints_at(state, is_first=False))
-        clear, maps = self._is_kept(with_objects(final_sample, covered), name, now.grid, *later)
-        good = (gradient.blocked == FREE) & clear
-        after = np.ones_like(good)
+        maps_now, gradient = movables.maps_of(name), movables.gradient(name, self.aims[0].guard, constraints)
+        final_poses = {mover: self._place_of(scene, mover) for mover in remaining_names if mover != name}
+        final_sample = move_objects(scene.sample, final_poses)
+        later_relations = self.expected.relations_about(name, self._constraints_at(state, is_first=False))
+        is_clear, maps = self._is_kept(
+            with_objects(final_sample, covered), name, maps_now.grid, *later_relations
+        )
+        good_cells = (gradient.blocked == FREE) & is_clear
+        later_cells = np.ones_like(good_cells)
         if settings.skill == "push":
-            after, _ = self._is_kept(final_sample, name, now.grid, *later)
-            onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
+            later_cells, _ = self._is_kept(final_sample, name, maps_now.grid, *later_relations)
+            reachable_cells = _reachable_from(
+                centre_of(tracked.footprint), maps_now.grid, gradient.blocked == FREE
+            )
             if name in self.places:
                 # the other objects will be at their places, and must not block the parked object's path
-                onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
-            after &= onwards
-            good &= after
+                reachable_cells &= _reachable_from(
+                    self._place_of(scene, name)[:2], maps_now.grid, later_cells
+                )
+            later_cells &= reachable_cells
+            good_cells &= later_cells
         # an object that is picked up or pushed again needs room
         room = np.minimum(maps.clearance, gradient.clearance)
-        roomy = good & (room >= settings.room)
+        roomy_cells = good_cells & (room >= settings.room)
         if settings.skill == "place":
             # near a constraint, the next motion might have to stop
-            spare = settings.constraint_margin + 2.0 * now.grid.cell_size
-            far = roomy & (danger_of(maps, later[1]) < -spare)
-            roomy = far if far.any() else roomy
-        (blocked,) = covered
+            spare_margin = settings.constraint_margin + 2.0 * maps_now.grid.cell_size
+            far_cells = roomy_cells & (danger_of(maps, later_relations[1]) < -spare_margin)
+            roomy_cells = far_cells if far_cells.any() else roomy_cells
+        (blocked_name,) = covered
         if is_beside:
-            good &= distance_to([centre_of(tracked.footprint)], now.grid) > 2.0 * now.grid.cell_size
-            far = good & (now.room([blocked]) > BESIDE * radius_of(scene.sample.objects[blocked]))
-            roomy = roomy & far if (roomy & far).any() else far
-        free = np.ones_like(good)
+            good_cells &= (
+                distance_to([centre_of(tracked.footprint)], maps_now.grid) > 2.0 * maps_now.grid.cell_size
+            )
+            far_cells = good_cells & (
+                maps_now.room([blocked_name]) > BESIDE * radius_of(scene.sample.objects[blocked_name])
+            )
+            roomy_cells = roomy_cells & far_cells if (roomy_cells & far_cells).any() else far_cells
+        untried_cells = np.ones_like(good_cells)
         for is_at_edge in (False, True) if settings.skill == "push" else (False,):
             if is_at_edge:
                 # in a corridor no place is clear of a path through the middle, so its edges are tried
                 if is_beside:
                     return
-                good = roomy = (gradient.blocked == FREE) & after & free
+                good_cells = roomy_cells = (gradient.blocked == FREE) & later_cells & untried_cells
             for _ in range(_MOST_PLACES):
-                among = roomy if roomy.any() else good
-                if is_at_edge and among.any():
-                    among = among & (maps.clearance >= maps.clearance[among].max() - now.grid.cell_size / 2.0)
-                target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
+                allowed_cells = roomy_cells if roomy_cells.any() else good_cells
+                if is_at_edge and allowed_cells.any():
+                    allowed_cells = allowed_cells & (
+                        maps.clearance >= maps.clearance[allowed_cells].max() - maps_now.grid.cell_size / 2.0
+                    )
+                target = nearest_target(
+                    gradient, allowed_cells, tracked, settings, movables.failed_here(name)
+                )
                 if isinstance(target, str):
                     break
                 yield target
                 # the next place to try is at least a diameter away
-                away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
-                free = free & away
-                good, roomy = good & away, roomy & away
+                is_away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
+                untried_cells = untried_cells & is_away
+                good_cells, roomy_cells = good_cells & is_away, roomy_cells & is_away
 
 
 def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> Booleans:
@@ -859,11 +936,12 @@ def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> B
     return reachable(free[0], cell) if free[0][cell] else np.ones(grid.shape, np.bool_)
 
 
-def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
+def _cubes_of(conjunctions: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
     """Return the relations of conjunctions, and the conjunctions as cubes over these relations."""
-    formulas = list(dict.fromkeys(demand.formula for way in ways for demand in way))
+    formulas = list(dict.fromkeys(demand.formula for conjunction in conjunctions for demand in conjunction))
     return formulas, tuple(
-        tuple((formulas.index(demand.formula), demand.wanted) for demand in way) for way in ways
+        tuple((formulas.index(demand.formula), demand.wanted) for demand in conjunction)
+        for conjunction in conjunctions
     )
 
 

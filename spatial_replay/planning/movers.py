@@ -59,20 +59,20 @@ _LENGTHS: Final = (8, 15, 30)
 def motions_between(before: Sample, sample: Sample) -> dict[str, Pose]:
     """Return the motions (x, y, turn) of all objects that moved between two samples."""
     motions = {}
-    for name, now in sample.objects.items():
-        was = before.objects.get(name)
-        if was is not None and was is not now and any(motion := _motion(was, now)):
+    for name, tracked in sample.objects.items():
+        earlier = before.objects.get(name)
+        if earlier is not None and earlier is not tracked and any(motion := _motion(earlier, tracked)):
             motions[name] = motion
     return motions
 
 
-def _motion(was: TrackedObject, now: TrackedObject) -> Pose:
+def _motion(earlier: TrackedObject, newest: TrackedObject) -> Pose:
     """Return the motion (x, y, turn) of an object; x and y are 0 within the uncertainty of its position."""
-    (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
-    turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau)
-    if math.hypot(x - u, y - v) <= was.uncertainty + now.uncertainty:
-        return 0.0, 0.0, turned
-    return x - u, y - v, turned
+    (u, v), (x, y) = centre_of(earlier.footprint), centre_of(newest.footprint)
+    turn = math.remainder((newest.yaw or 0.0) - (earlier.yaw or 0.0), math.tau)
+    if math.hypot(x - u, y - v) <= earlier.uncertainty + newest.uncertainty:
+        return 0.0, 0.0, turn
+    return x - u, y - v, turn
 
 
 def next_sample(before: Sample, sample: Sample, target: Target, skill: Skill) -> Sample:
@@ -93,33 +93,36 @@ def _advance(tracked: TrackedObject, motion: Pose) -> TrackedObject:
 
 def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: Skill) -> TrackedObject:
     """Return the moved object one sample later; it stops at its target unless it strays from its path."""
-    turned = 0.0
+    turn = 0.0
     if target.turn and target.yaw is not None and tracked.yaw is not None:
-        left = math.remainder(target.yaw - tracked.yaw, math.tau)
-        turned = math.copysign(min(abs(motion[2]), abs(left)), motion[2])
+        remaining_turn = math.remainder(target.yaw - tracked.yaw, math.tau)
+        turn = math.copysign(min(abs(motion[2]), abs(remaining_turn)), motion[2])
     x, y = centre_of(tracked.footprint)
-    length = math.hypot(*motion[:2])
-    if length == 0.0:
-        return moved_object(tracked, x, y, turned) if turned else tracked
-    before = x - motion[0], y - motion[1]
+    motion_length = math.hypot(*motion[:2])
+    if motion_length == 0.0:
+        return moved_object(tracked, x, y, turn) if turn else tracked
+    previous_place = x - motion[0], y - motion[1]
     # more than half of its motion leads away from the path
-    strays = _beside_way(target.waypoints, (x, y)) - _beside_way(target.waypoints, before) > length / 2.0
-    if strays:
-        return moved_object(tracked, x + motion[0], y + motion[1], turned)
+    is_straying = (
+        _beside_way(target.waypoints, (x, y)) - _beside_way(target.waypoints, previous_place)
+        > motion_length / 2.0
+    )
+    if is_straying:
+        return moved_object(tracked, x + motion[0], y + motion[1], turn)
     if skill == "push" or len(target.waypoints) > 2:
-        return moved_object(tracked, *_place_on_way(target.waypoints, (x, y), length), turned)
+        return moved_object(tracked, *_place_on_way(target.waypoints, (x, y), motion_length), turn)
     # the robot chooses the path, so only its end is known
-    share = min(1.0, math.dist((x, y), target.waypoints[-1]) / length)
-    return moved_object(tracked, x + share * motion[0], y + share * motion[1], turned)
+    share = min(1.0, math.dist((x, y), target.waypoints[-1]) / motion_length)
+    return moved_object(tracked, x + share * motion[0], y + share * motion[1], turn)
 
 
 def _place_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float], length: float
 ) -> tuple[float, float]:
     """Return a place advanced along a path by a length, with the same offset from the path."""
-    passed, foot = _nearest_on_way(waypoints, place)
-    x, y = _point_at(waypoints, passed + length)
-    return x + place[0] - foot[0], y + place[1] - foot[1]
+    passed_length, path_point = _nearest_on_way(waypoints, place)
+    x, y = _point_at(waypoints, passed_length + length)
+    return x + place[0] - path_point[0], y + place[1] - path_point[1]
 
 
 def _way_from(
@@ -127,13 +130,13 @@ def _way_from(
 ) -> tuple[tuple[float, float], ...]:
     """Return the rest of a path, from an object's current place."""
     place = centre_of(tracked.footprint)
-    passed, _ = _nearest_on_way(waypoints, place)
-    ahead, begin = [], 0.0
+    passed_length, _ = _nearest_on_way(waypoints, place)
+    points_ahead, leg_end = [], 0.0
     for (u, v), (x, y) in pairwise(waypoints):
-        begin += math.dist((u, v), (x, y))
-        if begin > passed:
-            ahead.append((x, y))
-    return (place, *(ahead or waypoints[-1:]))
+        leg_end += math.dist((u, v), (x, y))
+        if leg_end > passed_length:
+            points_ahead.append((x, y))
+    return (place, *(points_ahead or waypoints[-1:]))
 
 
 def _beside_way(waypoints: Sequence[tuple[float, float]], place: tuple[float, float]) -> float:
@@ -145,26 +148,29 @@ def _nearest_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float]
 ) -> tuple[float, tuple[float, float]]:
     """Return the point of a path nearest to a place, preceded by its distance along the path."""
-    begin, nearest, at = 0.0, math.inf, (0.0, place)
+    leg_start, least_distance, nearest_point = 0.0, math.inf, (0.0, place)
     for (u, v), (x, y) in pairwise(waypoints):
-        whole = math.dist((u, v), (x, y))
-        if whole > 0.0:
-            share = ((place[0] - u) * (x - u) + (place[1] - v) * (y - v)) / whole**2
+        leg_length = math.dist((u, v), (x, y))
+        if leg_length > 0.0:
+            share = ((place[0] - u) * (x - u) + (place[1] - v) * (y - v)) / leg_length**2
             share = min(max(share, 0.0), 1.0)
-            foot = u + share * (x - u), v + share * (y - v)
-            if math.dist(foot, place) < nearest:
-                nearest, at = math.dist(foot, place), (begin + share * whole, foot)
-        begin += whole
-    return at
+            leg_point = u + share * (x - u), v + share * (y - v)
+            if math.dist(leg_point, place) < least_distance:
+                least_distance, nearest_point = (
+                    math.dist(leg_point, place),
+                    (leg_start + share * leg_length, leg_point),
+                )
+        leg_start += leg_length
+    return nearest_point
 
 
 def _point_at(waypoints: Sequence[tuple[float, float]], length: float) -> tuple[float, float]:
     """Return the point at a length along a path, or the end of a shorter path."""
     for (u, v), (x, y) in pairwise(waypoints):
-        whole = math.dist((u, v), (x, y))
-        if length <= whole and whole > 0.0:
-            return u + length / whole * (x - u), v + length / whole * (y - v)
-        length -= whole
+        leg_length = math.dist((u, v), (x, y))
+        if length <= leg_length and leg_length > 0.0:
+            return u + length / leg_length * (x - u), v + length / leg_length * (y - v)
+        length -= leg_length
     return waypoints[-1]
 
 
@@ -191,34 +197,34 @@ class MotionTimes:
     """
 
     approach: int = 0
-    _length: float = 0.0
-    _samples: int = 0
-    _newest: float = 0.0
-    _stood: int = 0
+    _total_length: float = 0.0
+    _sample_count: int = 0
+    _newest_length: float = 0.0
+    _standing_samples: int = 0
 
     def end(self) -> None:
         """End a motion."""
-        self._newest, self._stood = 0.0, 0
+        self._newest_length, self._standing_samples = 0.0, 0
 
     def observe(self, length: float, least: float) -> None:
         """Add the distance that the object moved between two samples; a distance up to `least` is a stand."""
         if length <= least:
-            self._newest = 0.0
-            self._stood += 1
+            self._newest_length = 0.0
+            self._standing_samples += 1
             return
-        self.approach = max(self.approach, self._stood)
-        self._newest, self._stood = length, 0
-        self._length += length
-        self._samples += 1
+        self.approach = max(self.approach, self._standing_samples)
+        self._newest_length, self._standing_samples = length, 0
+        self._total_length += length
+        self._sample_count += 1
 
     def timing(self, cell_size: float) -> Timing:
         """Return the expected timing of the current motion, or of the next one.
 
         Without an earlier motion, the expected step is one cell.
         """
-        mean = self._length / self._samples if self._samples else cell_size
-        rest = 0 if self._newest else max(self.approach - self._stood, 0)
-        return Timing(max(self._newest, mean), rest, self.approach)
+        mean_step = self._total_length / self._sample_count if self._sample_count else cell_size
+        rest = 0 if self._newest_length else max(self.approach - self._standing_samples, 0)
+        return Timing(max(self._newest_length, mean_step), rest, self.approach)
 
 
 class Course(NamedTuple):
@@ -286,36 +292,49 @@ class Lookout:
             motions: motions of all objects between two samples.
             timing: timing of the motion to the target.
         """
-        others = self._others(motions, target)
-        if not others:
+        other_motions = self._others(motions, target)
+        if not other_motions:
             return None
         name, tracked = target.name, sample.objects[target.name]
-        start, way = centre_of(tracked.footprint), _way_from(target.waypoints, tracked)
+        start, waypoints = centre_of(tracked.footprint), _way_from(target.waypoints, tracked)
         skill = self._settings.skill
-        numbers = _numbers_ahead(way, timing, skill)
-        about = sample, states, others, name, numbers
+        sample_numbers = _numbers_ahead(waypoints, timing, skill)
+        scene_inputs = sample, states, other_motions, name, sample_numbers
         # the start of the motion is not known, so several start times are tested
-        ways = [_places(way, timing, share, numbers, skill) for share in _beginnings(way, timing, skill)]
+        place_series = [
+            _places(waypoints, timing, share, sample_numbers, skill)
+            for share in _beginnings(waypoints, timing, skill)
+        ]
         # the last prospect is for an object at rest
-        *prospects, staying = self._prospects(*about, [*ways, np.tile(start, (len(numbers), 1))])
-        going = Prospect(*map(min, zip(*prospects, strict=True)))
-        if going.perhaps == math.inf:
+        *prospects, staying_prospect = self._prospects(
+            *scene_inputs, [*place_series, np.tile(start, (len(sample_numbers), 1))]
+        )
+        going_prospect = Prospect(*map(min, zip(*prospects, strict=True)))
+        if going_prospect.perhaps == math.inf:
             return None
         # tuples compare `perhaps` first, then `surely`
-        best = max(going, staying)
-        aside: Target | None = None
-        if best.perhaps < math.inf:
+        best_prospect = max(going_prospect, staying_prospect)
+        aside_target: Target | None = None
+        if best_prospect.perhaps < math.inf:
             clear_ways = self._clear_ways(sample, name, _ways_aside(start, timing.step))
             # a motion aside is a new motion, so it begins with the full approach
-            afresh = timing._replace(rest=timing.approach)
-            ways = [_places(clear_way, afresh, 1.0, numbers, skill) for clear_way in clear_ways]
-            for aside_way, prospect in zip(clear_ways, self._prospects(*about, ways), strict=True):
-                if prospect > best:
-                    aside = Target(
+            new_timing = timing._replace(rest=timing.approach)
+            place_series = [
+                _places(clear_way, new_timing, 1.0, sample_numbers, skill) for clear_way in clear_ways
+            ]
+            for aside_way, prospect in zip(
+                clear_ways, self._prospects(*scene_inputs, place_series), strict=True
+            ):
+                if prospect > best_prospect:
+                    aside_target = Target(
                         name, *aside_way[-1], 0.0, tracked.yaw, tuple(aside_way), target.robustness
                     )
-                    best = prospect
-        return Evasion(aside, f"{' and '.join(sorted(others))} may come too near") if best > going else None
+                    best_prospect = prospect
+        return (
+            Evasion(aside_target, f"{' and '.join(sorted(other_motions))} may come too near")
+            if best_prospect > going_prospect
+            else None
+        )
 
     def past_others(
         self,
@@ -332,22 +351,22 @@ class Lookout:
             aim: edge of the push.
             timing: timing of the push.
         """
-        skill, others = self._settings.skill, self._others(motions, target)
-        stops = _stops(target.waypoints, skill)
-        if not others or not stops:
+        skill, other_motions = self._settings.skill, self._others(motions, target)
+        stop_indices = _stops(target.waypoints, skill)
+        if not other_motions or not stop_indices:
             return target
-        number = _numbers_ahead(target.waypoints, timing, skill)[-1]
-        ahead = {
-            name: _advance(sample.objects[name], (number * x, number * y, number * turn))
-            for name, (x, y, turn) in others.items()
+        last_number = _numbers_ahead(target.waypoints, timing, skill)[-1]
+        moved_objects = {
+            name: _advance(sample.objects[name], (last_number * x, last_number * y, last_number * turn))
+            for name, (x, y, turn) in other_motions.items()
         }
-        sample = with_objects(sample, ahead)
+        sample = with_objects(sample, moved_objects)
         movables = Movables(self._formulas, self._regions, sample, self._settings, Attempts())
         gradient = movables.gradient(target.name, aim.progress.cubes, aim.constraints.cubes)
-        direct = target_in(gradient, sample.objects[target.name], self._settings, target.pose)
-        if isinstance(direct, str) or len(_stops(direct.waypoints, skill)) >= len(stops):
+        direct_target = target_in(gradient, sample.objects[target.name], self._settings, target.pose)
+        if isinstance(direct_target, str) or len(_stops(direct_target.waypoints, skill)) >= len(stop_indices):
             return target
-        return replace(target, waypoints=(*direct.waypoints[:-1], (target.x, target.y)))
+        return replace(target, waypoints=(*direct_target.waypoints[:-1], (target.x, target.y)))
 
     def _others(self, motions: Mapping[str, Pose], target: Target) -> dict[str, Pose]:
         """Return the motions of all other moving objects."""
@@ -366,15 +385,15 @@ class Lookout:
         movables = Movables(self._formulas, self._regions, sample, settings, Attempts())
         # without progress and constraints, cells are blocked only by objects, obstacles and reach
         gradient = movables.gradient(name, ((),), ())
-        grid, free = gradient.grid, gradient.blocked[0] == FREE
-        clear = []
+        grid, is_free = gradient.grid, gradient.blocked[0] == FREE
+        clear_ways = []
         for way in ways:
             points = list(points_along(way, grid.cell_size))
             # a carried object passes over others, so only the end of its path must be free
             points = points if settings.skill == "push" else points[-1:]
-            if grid.contains(np.array(points)).all() and all(free[grid.cell(*point)] for point in points):
-                clear.append(way)
-        return clear
+            if grid.contains(np.array(points)).all() and all(is_free[grid.cell(*point)] for point in points):
+                clear_ways.append(way)
+        return clear_ways
 
     def _prospects(
         self,
@@ -382,8 +401,8 @@ class Lookout:
         states: frozenset[int],
         motions: Mapping[str, Pose],
         name: str,
-        numbers: Sequence[int],
-        ways: Sequence[Floats],
+        sample_numbers: Sequence[int],
+        place_series: Sequence[Floats],
     ) -> list[Prospect]:
         """Return the prospect of each path, which is given as places (N, 2) in the predicted samples.
 
@@ -391,42 +410,58 @@ class Lookout:
             motions: motions of the other objects between two samples.
             numbers: numbers of the predicted samples, counted from now.
         """
-        if not ways:
+        if not place_series:
             return []
         # measured positions count as certain; only predictions of others are uncertain
-        certain = {who: replace(tracked, uncertainty=0.0) for who, tracked in sample.objects.items()}
-        courses = {who: _course_ahead(certain[who], motion, numbers) for who, motion in motions.items()}
-        courses[name] = Course(np.concatenate(ways))
-        trace = _trace_ahead(replace(sample, objects=certain, reported_ns={}), courses, numbers)
+        certain_objects = {
+            object_name: replace(tracked, uncertainty=0.0) for object_name, tracked in sample.objects.items()
+        }
+        courses = {
+            object_name: _course_ahead(certain_objects[object_name], motion, sample_numbers)
+            for object_name, motion in motions.items()
+        }
+        courses[name] = Course(np.concatenate(place_series))
+        trace = _trace_ahead(
+            replace(sample, objects=certain_objects, reported_ns={}), courses, sample_numbers
+        )
         leaves = leaf_values(TraceScene(trace, self._regions), self._formulas, {})
         # the first two rows are bounds without uncertainty, the last two with it
-        surely, perhaps = (leaves[0], leaves[min(1, len(leaves) - 1)]), (leaves[-2 % len(leaves)], leaves[-1])
-        count = len(numbers)
+        sure_bounds, possible_bounds = (
+            (leaves[0], leaves[min(1, len(leaves) - 1)]),
+            (leaves[-2 % len(leaves)], leaves[-1]),
+        )
+        sample_count = len(sample_numbers)
         return [
             Prospect(
                 *(
-                    self._until_loss(states, [ends[:, begin : begin + count] for ends in bounds], numbers)
-                    for bounds in (perhaps, surely)
+                    self._until_loss(
+                        states,
+                        [bound[:, first_row : first_row + sample_count] for bound in bounds],
+                        sample_numbers,
+                    )
+                    for bounds in (possible_bounds, sure_bounds)
                 )
             )
-            for begin in range(0, len(trace), count)
+            for first_row in range(0, len(trace), sample_count)
         ]
 
-    def _until_loss(self, states: frozenset[int], bounds: Sequence[Floats], numbers: Sequence[int]) -> float:
+    def _until_loss(
+        self, states: frozenset[int], bounds: Sequence[Floats], sample_numbers: Sequence[int]
+    ) -> float:
         """Return the number of samples until acceptance may be lost, by bounds (P, N) of the propositions."""
         can_accept = self._automaton.can_accept
         is_sure = states <= can_accept
-        passed = 0
-        rows = zip(*(ends.T.tolist() for ends in bounds), strict=True)
-        for number, (lower, upper) in zip(numbers, rows, strict=True):
+        previous_number = 0
+        bounds_by_sample = zip(*(bound.T.tolist() for bound in bounds), strict=True)
+        for number, (lower, upper) in zip(sample_numbers, bounds_by_sample, strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
             # the samples since the previous predicted one are assumed equal to this one
-            for _ in range(number - passed):
-                before, states = states, self._automaton.step_set(states, symbol)
-                if states == before:
+            for _ in range(number - previous_number):
+                previous_states, states = states, self._automaton.step_set(states, symbol)
+                if states == previous_states:
                     break
-            passed = number
+            previous_number = number
             if not states <= can_accept if is_sure else states.isdisjoint(can_accept):
                 return number
         return math.inf
@@ -440,17 +475,17 @@ def least_motion(settings: Settings) -> float:
 def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> tuple[int, ...]:
     """Return the numbers of the predicted samples until a motion has ended; later ones are sparser."""
     length = sum(math.dist(begin, end) for begin, end in pairwise(way))
-    ended = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
-    last = math.ceil(min(max(ended, AHEAD), MOST_AHEAD))
+    end_sample = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
+    last_sample = math.ceil(min(max(end_sample, AHEAD), MOST_AHEAD))
     # every sample of the first second at 30 Hz, then every third up to `AHEAD`, then every ninth
-    return (*range(1, 31), *range(33, AHEAD + 1, 3), *range(AHEAD + 9, last + 9, 9))
+    return (*range(1, 31), *range(33, AHEAD + 1, 3), *range(AHEAD + 9, last_sample + 9, 9))
 
 
 def _beginnings(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> list[float]:
     """Return the tested start times of a motion, as shares of its longest rests."""
-    longest = max(timing.rest, timing.approach if _stops(way, skill) else 0)
-    count = min(1 + math.ceil(longest / _BEGINNINGS), _MOST_BEGINNINGS)
-    return np.linspace(0.0, 1.0, count).tolist() if longest else [0.0]
+    longest_rest = max(timing.rest, timing.approach if _stops(way, skill) else 0)
+    start_count = min(1 + math.ceil(longest_rest / _BEGINNINGS), _MOST_BEGINNINGS)
+    return np.linspace(0.0, 1.0, start_count).tolist() if longest_rest else [0.0]
 
 
 def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
@@ -458,67 +493,75 @@ def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
     if skill != "push":
         return []
     angles = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(way)]
-    turns = (abs(math.remainder(after - before, math.tau)) for before, after in pairwise(angles))
-    return [number for number, turn in enumerate(turns, 1) if turn > _CORNER]
+    turns = (abs(math.remainder(next_angle - angle, math.tau)) for angle, next_angle in pairwise(angles))
+    return [corner_index for corner_index, turn in enumerate(turns, 1) if turn > _CORNER]
 
 
 def _places(
-    way: Sequence[tuple[float, float]], timing: Timing, share: float, numbers: Sequence[int], skill: Skill
+    way: Sequence[tuple[float, float]],
+    timing: Timing,
+    rest_share: float,
+    sample_numbers: Sequence[int],
+    skill: Skill,
 ) -> Floats:
     """Return the places (N, 2) of an object on a path in predicted samples, for a share of its rests."""
     points = np.array(way)
-    lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
+    path_lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     rests = np.zeros(len(way))
     rests[0] = timing.rest
     rests[_stops(way, skill)] = timing.approach
-    leaves = lengths / timing.step + share * np.cumsum(rests)
-    comes = leaves - share * rests
-    times = np.stack((comes, leaves), axis=1).reshape(-1)
-    passed = np.interp(numbers, times, np.repeat(lengths, 2))
-    return np.stack([np.interp(passed, lengths, points[:, axis]) for axis in (0, 1)], axis=1)
+    leave_times = path_lengths / timing.step + rest_share * np.cumsum(rests)
+    arrival_times = leave_times - rest_share * rests
+    course_times = np.stack((arrival_times, leave_times), axis=1).reshape(-1)
+    passed_lengths = np.interp(sample_numbers, course_times, np.repeat(path_lengths, 2))
+    return np.stack([np.interp(passed_lengths, path_lengths, points[:, axis]) for axis in (0, 1)], axis=1)
 
 
-def _course_ahead(tracked: TrackedObject, motion: Pose, numbers: Sequence[int]) -> Course:
+def _course_ahead(tracked: TrackedObject, motion: Pose, sample_numbers: Sequence[int]) -> Course:
     """Return the predicted course of an object that moves by itself."""
-    steps, length = np.array(numbers, np.float64), math.hypot(*motion[:2])
-    places = np.array(centre_of(tracked.footprint)) + steps[:, None] * np.array(motion[:2])
-    return Course(places, motion[2], np.minimum(steps, _UNSURE) * length)
+    sample_steps, length = np.array(sample_numbers, np.float64), math.hypot(*motion[:2])
+    places = np.array(centre_of(tracked.footprint)) + sample_steps[:, None] * np.array(motion[:2])
+    return Course(places, motion[2], np.minimum(sample_steps, _UNSURE) * length)
 
 
-def _trace_ahead(sample: Sample, courses: Mapping[str, Course], numbers: Sequence[int]) -> Trace:
+def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: Sequence[int]) -> Trace:
     """Return a trace that repeats a sample, with some objects moved along courses.
 
     The trace is as long as the longest course. A shorter course, over `numbers`, is repeated.
     """
-    now = Trace.from_samples([sample])
-    count = max(len(course.places) for course in courses.values())
-    footprints, rows = now.footprints, np.repeat(now.rows, count, axis=0)
-    yaws, uncertainties, class_codes = [now.yaw], [now.uncertainty], [now.class_code]
+    start_trace = Trace.from_samples([sample])
+    sample_count = max(len(course.places) for course in courses.values())
+    footprints, rows = start_trace.footprints, np.repeat(start_trace.rows, sample_count, axis=0)
+    yaws, uncertainties, class_codes = [start_trace.yaw], [start_trace.uncertainty], [start_trace.class_code]
     for name, course in courses.items():
-        tracked, column, length = sample.objects[name], now.names.index(name), len(course.places)
-        rows[:, column] = len(footprints) + np.arange(count) % length
-        turns = course.turn * np.array(numbers if course.turn else [0] * length, np.float64)
+        tracked, column, course_length = (
+            sample.objects[name],
+            start_trace.names.index(name),
+            len(course.places),
+        )
+        rows[:, column] = len(footprints) + np.arange(sample_count) % course_length
+        turns = course.turn * np.array(sample_numbers if course.turn else [0] * course_length, np.float64)
         # a turning object has another orientation at each place, so poses are added one by one
         if course.turn:
             for place, turn in zip(course.places, turns, strict=True):
                 footprints = with_poses(footprints, tracked, place[None, :], np.array([turn]))
         else:
             footprints = with_poses(footprints, tracked, course.places, np.zeros(1))
-        row = now.rows[0, column]
-        uncertainty = np.zeros(length) if course.uncertainty is None else course.uncertainty
-        yaws.append(now.yaw[row] + turns)
+        object_row = start_trace.rows[0, column]
+        uncertainty = np.zeros(course_length) if course.uncertainty is None else course.uncertainty
+        yaws.append(start_trace.yaw[object_row] + turns)
         uncertainties.append(uncertainty)
-        class_codes.append(np.full(length, now.class_code[row]))
+        class_codes.append(np.full(course_length, start_trace.class_code[object_row]))
     return Trace(
-        times_ns=np.arange(count, dtype=np.int64),
-        names=now.names,
+        times_ns=np.arange(sample_count, dtype=np.int64),
+        names=start_trace.names,
         rows=rows,
         footprints=footprints,
         yaw=np.concatenate(yaws),
         uncertainty=np.concatenate(uncertainties),
         class_code=np.concatenate(class_codes),
-        classes=now.classes,
-        signals={signal: np.repeat(values, count) for signal, values in now.signals.items()},
+        classes=start_trace.classes,
+        signals={signal: np.repeat(values, sample_count) for signal, values in start_trace.signals.items()},
     )
 
 

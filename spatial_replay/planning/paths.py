@@ -46,19 +46,19 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
     row, column = start
     is_free = free.copy()
     is_free[row, column] = True
-    ends = np.argwhere(goals & is_free)
-    if not len(ends):
+    goal_cells = np.argwhere(goals & is_free)
+    if not len(goal_cells):
         return None
-    first, last = ends.min(axis=0) + 1, ends.max(axis=0) + 1
-    box = np.array([first[0], last[0], first[1], last[1]])
+    first_goal, last_goal = goal_cells.min(axis=0) + 1, goal_cells.max(axis=0) + 1
+    goal_box = np.array([first_goal[0], last_goal[0], first_goal[1], last_goal[1]])
     # with a border of blocked cells, the search needs no check of bounds
-    cells = search(_add_border(is_free), _add_border(goals & is_free), box, row + 1, column + 1) - 1
+    cells = search(_add_border(is_free), _add_border(goals & is_free), goal_box, row + 1, column + 1) - 1
     if not len(cells):
         return None
     steps = np.abs(np.diff(cells, axis=0))
-    diagonal = int(steps.min(axis=1).sum())
-    straight = int(steps.max(axis=1).sum()) - diagonal
-    return Path(read_only_integers(cells), straight + ROOT_2 * diagonal)
+    diagonal_steps = int(steps.min(axis=1).sum())
+    straight_steps = int(steps.max(axis=1).sum()) - diagonal_steps
+    return Path(read_only_integers(cells), straight_steps + ROOT_2 * diagonal_steps)
 
 
 def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
@@ -72,19 +72,21 @@ def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
     is_free[start[0] + 1, start[1] + 1] = True
     width, is_open = is_free.shape[1], is_free.ravel()
     lengths = np.full(is_free.size, np.inf)
-    newest = np.array([(start[0] + 1) * width + start[1] + 1])
-    lengths[newest] = 0.0
+    newest_cells = np.array([(start[0] + 1) * width + start[1] + 1])
+    lengths[newest_cells] = 0.0
     # only cells that became nearer in the last round can bring others nearer
-    while newest.size:
-        nearer = []
+    while newest_cells.size:
+        nearer_cells = []
         for down, right in product((-1, 0, 1), repeat=2):
-            after, length = newest + down * width + right, ROOT_2 if down and right else 1.0
+            neighbours, step_length = newest_cells + down * width + right, ROOT_2 if down and right else 1.0
             # a diagonal step needs both adjacent cells free
-            is_step = is_open[after] & is_open[newest + down * width] & is_open[newest + right]
-            is_step &= lengths[newest] + length < lengths[after]
-            lengths[after[is_step]] = lengths[newest[is_step]] + length
-            nearer.append(after[is_step])
-        newest = np.unique(np.concatenate(nearer))
+            is_step = (
+                is_open[neighbours] & is_open[newest_cells + down * width] & is_open[newest_cells + right]
+            )
+            is_step &= lengths[newest_cells] + step_length < lengths[neighbours]
+            lengths[neighbours[is_step]] = lengths[newest_cells[is_step]] + step_length
+            nearer_cells.append(neighbours[is_step])
+        newest_cells = np.unique(np.concatenate(nearer_cells))
     return np.asarray(lengths.reshape(is_free.shape)[1:-1, 1:-1])
 
 
@@ -93,15 +95,15 @@ def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
     reached = np.zeros(free.shape, np.bool_)
     reached[cell] = True
     while True:
-        count = np.count_nonzero(reached)
+        reached_count = np.count_nonzero(reached)
         # four directions suffice, because a diagonal step needs both adjacent cells free
-        for turns in range(4):
+        for quarter_turns in range(4):
             # free cells behind a reached cell, without a blocked cell in between
-            open_cells, view = np.rot90(free, turns), np.rot90(reached, turns)
-            place = np.arange(len(view))[:, None]
-            last_reached = np.maximum.accumulate(np.where(view, place, -1))
-            view |= last_reached > np.maximum.accumulate(np.where(open_cells, -1, place))
-        if np.count_nonzero(reached) == count:
+            open_cells, reached_view = np.rot90(free, quarter_turns), np.rot90(reached, quarter_turns)
+            row_indices = np.arange(len(reached_view))[:, None]
+            last_reached = np.maximum.accumulate(np.where(reached_view, row_indices, -1))
+            reached_view |= last_reached > np.maximum.accumulate(np.where(open_cells, -1, row_indices))
+        if np.count_nonzero(reached) == reached_count:
             return reached
 
 
@@ -122,36 +124,36 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
         (K, 2), the start, the turns and the goal; (0, 2) if there is no path.
     """
     rows, columns = free.shape
-    straight = np.full(rows * columns, -1, np.int64)
-    diagonal = np.zeros(rows * columns, np.int64)
-    parent = np.full(rows * columns, -1, np.int64)
-    closed = np.zeros(rows * columns, np.bool_)
+    straights = np.full(rows * columns, -1, np.int64)
+    diagonals = np.zeros(rows * columns, np.int64)
+    parents = np.full(rows * columns, -1, np.int64)
+    is_closed = np.zeros(rows * columns, np.bool_)
     directions = np.zeros((8, 2), np.int64)
-    first = start_row * columns + start_column
-    straight[first] = 0
+    start_cell = start_row * columns + start_column
+    straights[start_cell] = 0
     # the number of the cell breaks ties, so that equal inputs give equal paths
-    queue = [(_at_least(start_row, start_column, box), np.int64(first))]
+    queue = [(_at_least(start_row, start_column, box), np.int64(start_cell))]
     while len(queue) > 0:
-        current = heapq.heappop(queue)[1]
-        if closed[current]:
+        cell = heapq.heappop(queue)[1]
+        if is_closed[cell]:
             continue
-        closed[current] = True
-        row, column = current // columns, current % columns
+        is_closed[cell] = True
+        row, column = cell // columns, cell % columns
         if goals[row, column]:
-            return _turns(parent, current, columns)
-        if parent[current] < 0:
-            count = 0
+            return _turns(parents, cell, columns)
+        if parents[cell] < 0:
+            direction_count = 0
             for down in range(-1, 2):
                 for right in range(-1, 2):
                     if down != 0 or right != 0:
-                        directions[count, 0], directions[count, 1] = down, right
-                        count += 1
+                        directions[direction_count, 0], directions[direction_count, 1] = down, right
+                        direction_count += 1
         else:
-            down = _sign(row - parent[current] // columns)
-            right = _sign(column - parent[current] % columns)
-            count = _directions(free, row, column, down, right, directions)
-        for number in range(count):
-            down, right = directions[number, 0], directions[number, 1]
+            down = _sign(row - parents[cell] // columns)
+            right = _sign(column - parents[cell] % columns)
+            direction_count = _directions(free, row, column, down, right, directions)
+        for direction in range(direction_count):
+            down, right = directions[direction, 0], directions[direction, 1]
             is_diagonal = down != 0 and right != 0
             if is_diagonal:
                 steps = _jump_diagonal(free, goals, row, column, down, right)
@@ -159,46 +161,49 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
                 steps = _jump_straight(free, goals, row, column, down, right)
             if steps == 0:
                 continue
-            cell = (row + steps * down) * columns + column + steps * right
-            new_straight = straight[current] + (0 if is_diagonal else steps)
-            new_diagonal = diagonal[current] + (steps if is_diagonal else 0)
+            next_cell = (row + steps * down) * columns + column + steps * right
+            new_straight = straights[cell] + (0 if is_diagonal else steps)
+            new_diagonal = diagonals[cell] + (steps if is_diagonal else 0)
             # computed from step counts, so that equally long paths have bitwise equal lengths
             length = new_straight + ROOT_2 * new_diagonal
-            if straight[cell] >= 0 and straight[cell] + ROOT_2 * diagonal[cell] <= length:
+            if straights[next_cell] >= 0 and straights[next_cell] + ROOT_2 * diagonals[next_cell] <= length:
                 continue
-            straight[cell], diagonal[cell] = new_straight, new_diagonal
-            parent[cell] = current
+            straights[next_cell], diagonals[next_cell] = new_straight, new_diagonal
+            parents[next_cell] = cell
             least_ahead = _at_least(row + steps * down, column + steps * right, box)
-            heapq.heappush(queue, (length + least_ahead, np.int64(cell)))
+            heapq.heappush(queue, (length + least_ahead, np.int64(next_cell)))
     return np.zeros((0, 2), np.int64)
 
 
 @piece
 def _at_least(row: int, column: int, box: Integers) -> float:
     """Return a lower bound of the distance to the goals: the distance to their box without obstacles."""
-    rows = max(box[0] - row, row - box[1], 0)
-    columns = max(box[2] - column, column - box[3], 0)
-    return float(abs(rows - columns) + ROOT_2 * min(rows, columns))
+    row_gap = max(box[0] - row, row - box[1], 0)
+    column_gap = max(box[2] - column, column - box[3], 0)
+    return float(abs(row_gap - column_gap) + ROOT_2 * min(row_gap, column_gap))
 
 
 @piece
-def _directions(free: Flags, row: int, column: int, down: int, right: int, ways: Integers) -> int:
+def _directions(free: Flags, row: int, column: int, down: int, right: int, directions: Integers) -> int:
     """Write the possible next directions after a step into `ways`, and return their number."""
     if down != 0 and right != 0:
-        ways[0, 0], ways[0, 1] = down, 0
-        ways[1, 0], ways[1, 1] = 0, right
-        ways[2, 0], ways[2, 1] = down, right
+        directions[0, 0], directions[0, 1] = down, 0
+        directions[1, 0], directions[1, 1] = 0, right
+        directions[2, 0], directions[2, 1] = down, right
         return 3
-    ways[0, 0], ways[0, 1] = down, right
-    count = 1
+    directions[0, 0], directions[0, 1] = down, right
+    direction_count = 1
     for side in (-1, 1):
         aside_down, aside_right = side * right, side * down
         beside_row, beside_column = row + aside_down, column + aside_right
         if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
-            ways[count, 0], ways[count, 1] = aside_down, aside_right
-            ways[count + 1, 0], ways[count + 1, 1] = down + aside_down, right + aside_right
-            count += 2
-    return count
+            directions[direction_count, 0], directions[direction_count, 1] = aside_down, aside_right
+            directions[direction_count + 1, 0], directions[direction_count + 1, 1] = (
+                down + aside_down,
+                right + aside_right,
+            )
+            direction_count += 2
+    return direction_count
 
 
 @piece
@@ -245,16 +250,16 @@ def _sign(value: int) -> int:
 
 
 @piece
-def _turns(parent: Integers, last: np.int64, columns: int) -> Integers:
+def _turns(parents: Integers, last: np.int64, columns: int) -> Integers:
     """Return the cells (K, 2) from the start to `last`, by their parents."""
-    count = 1
-    at = last
-    while parent[at] >= 0:
-        at = parent[at]
-        count += 1
-    cells = np.empty((count, 2), np.int64)
-    at = last
-    for k in range(count - 1, -1, -1):
-        cells[k, 0], cells[k, 1] = at // columns, at % columns
-        at = parent[at]
+    cell_count = 1
+    cell = last
+    while parents[cell] >= 0:
+        cell = parents[cell]
+        cell_count += 1
+    cells = np.empty((cell_count, 2), np.int64)
+    cell = last
+    for k in range(cell_count - 1, -1, -1):
+        cells[k, 0], cells[k, 1] = cell // columns, cell % columns
+        cell = parents[cell]
     return cells

@@ -130,47 +130,47 @@ class Planner:
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
         # in sentences, a spec names a long proposition that is its only one, unless the spec is `G …`
-        uses = Counter(name for names in self._specs for name in names)
-        temporal = (part for part in iter_formulas(formula) if isinstance(part, Temporal))
-        uses += Counter(part.name for part in temporal if part.name and part.operator == "G")
-        spec_names = (next((name for name in names if uses[name] == 1), None) for names in self._specs)
-        named = [
+        name_counts = Counter(name for names in self._specs for name in names)
+        temporal_parts = (part for part in iter_formulas(formula) if isinstance(part, Temporal))
+        name_counts += Counter(part.name for part in temporal_parts if part.name and part.operator == "G")
+        spec_names = (next((name for name in names if name_counts[name] == 1), None) for names in self._specs)
+        named_propositions = [
             replace(proposition, name=spec_name)
             if spec_name and len(proposition.literal(True)) > _LONGEST_WANTED
             else proposition
             for proposition, spec_name in zip(self.automaton.propositions, spec_names, strict=True)
         ]
-        self._words = self.automaton.with_propositions(named)
+        self._named_automaton = self.automaton.with_propositions(named_propositions)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
         # the states if goals that only empty groups satisfy are still open
-        self._tested = self._states
-        self._awaited: list[Group] = []
+        self._tested_states = self._states
+        self._empty_groups: list[Group] = []
         # time of the newest observation of each object
-        self._seen: dict[str, int] = {}
+        self._seen_ns: dict[str, int] = {}
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
         self._stop_reason = ""
-        self._lost: Loss | None = None
-        self._pruned: dict[Edge, Reason] = {}
+        self._loss: Loss | None = None
+        self._prune_reasons: dict[Edge, Reason] = {}
         # pruned edges that several motions may still take
-        self._passed: set[Edge] = set()
+        self._joint_edges: set[Edge] = set()
         self._attempts = Attempts()
-        self._running: Step | None = None
+        self._current_step: Step | None = None
         # motions of the objects between the newest two samples
-        self._motions: dict[str, Pose] = {}
-        self._times = MotionTimes()
-        self._decided: Sample | None = None
+        self._object_motions: dict[str, Pose] = {}
+        self._motion_times = MotionTimes()
+        self._decision_sample: Sample | None = None
         # whether the motion must stop because of objects that move by themselves
         self._is_evaded = False
         # the motion that is delayed until other objects have passed
-        self._delayed: Target | None = None
+        self._delayed_target: Target | None = None
         # whether no sample came during the last motion aside
         self._is_idle = False
-        self._yielded = 0
-        self._waiting: Step | None = None
-        self._ahead: tuple[int, ...] = ()
-        self._steps = 0
+        self._yield_count = 0
+        self._wait_step: Step | None = None
+        self._expected_states: tuple[int, ...] = ()
+        self._step_count = 0
         # the budget of the newest decision
         self._budget = Budget(MOST_MAPS)
 
@@ -238,78 +238,90 @@ class Planner:
         """
         require_sample(sample)
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
-            at, last = times_apart(sample.time_ns, self._sample.time_ns)
-            raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
+            sample_time, previous_time = times_apart(sample.time_ns, self._sample.time_ns)
+            raise TraceError(
+                f"a sample at {sample_time} follows one at {previous_time}; give times that increase"
+            )
         if self._settings is None:
             self._settings = Settings(Workspace.around(sample))
         if self._sample is None:
             refuse_unknown(self._settings.movable or (), sample, self._formulas)
-        before, self._sample = self._sample, sample
-        self._motions = {} if before is None else motions_between(before, sample)
-        running = None if self._running is None else self._running.target
-        if running is not None and running.name in sample.objects:
-            length = math.hypot(*self._motions.get(running.name, (0.0, 0.0))[:2])
-            self._times.observe(length, least_motion(self._settings))
+        previous_sample, self._sample = self._sample, sample
+        self._object_motions = {} if previous_sample is None else motions_between(previous_sample, sample)
+        running_target = None if self._current_step is None else self._current_step.target
+        if running_target is not None and running_target.name in sample.objects:
+            moved_length = math.hypot(*self._object_motions.get(running_target.name, (0.0, 0.0))[:2])
+            self._motion_times.observe(moved_length, least_motion(self._settings))
         self._is_evaded = False
-        states, symbol = self._states, self._symbol
+        previous_states, previous_symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
-        self._states = self.automaton.step_set(states, self._symbol)
-        self._seen |= dict.fromkeys(sample.objects, sample.time_ns)
+        self._states = self.automaton.step_set(previous_states, self._symbol)
+        self._seen_ns |= dict.fromkeys(sample.objects, sample.time_ns)
         self._test(sample)
-        if self._lost is None and self._states.isdisjoint(self.automaton.can_accept):
-            text = loss_text(self._words, states, symbol, self._symbol)
-            self._lost = Loss(sample.time_ns, text)
-        self._stop_reason = self._why_stop(before, sample)
+        if self._loss is None and self._states.isdisjoint(self.automaton.can_accept):
+            condition = loss_text(self._named_automaton, previous_states, previous_symbol, self._symbol)
+            self._loss = Loss(sample.time_ns, condition)
+        self._stop_reason = self._why_stop(previous_sample, sample)
         # a wait ends early if the automaton is not in the state to which time alone should have led
-        self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
+        self._expected_states = (
+            self._expected_states[1:] if not self._states.isdisjoint(self._expected_states[:1]) else ()
+        )
 
     def _test(self, sample: Sample) -> None:
-        """Update `_tested`: propositions of empty groups count as open, unless that loses acceptance."""
-        groups = [groups_without_members(formula, sample) for formula in self._formulas]
-        closed = self.automaton.step_set(self._tested, self._symbol)
-        symbol = [None if empty else value for empty, value in zip(groups, self._symbol, strict=True)]
-        still_open = self.automaton.step_set(self._tested, symbol) & self.automaton.can_accept
-        self._awaited = [] if still_open <= closed else [group for empty in groups for group in empty]
-        self._tested = closed | still_open
+        """Update `_tested_states`: empty groups' propositions count as open, unless that loses acceptance."""
+        empty_groups = [groups_without_members(formula, sample) for formula in self._formulas]
+        closed_states = self.automaton.step_set(self._tested_states, self._symbol)
+        symbol = [None if empty else value for empty, value in zip(empty_groups, self._symbol, strict=True)]
+        open_states = self.automaton.step_set(self._tested_states, symbol) & self.automaton.can_accept
+        self._empty_groups = (
+            [] if open_states <= closed_states else [group for empty in empty_groups for group in empty]
+        )
+        self._tested_states = closed_states | open_states
 
     @property
     def _lacks_members(self) -> bool:
         """Whether only groups without members satisfy the specification."""
         accepting = self.automaton.accepting
-        return bool(self._awaited) and self._states <= accepting and not self._tested <= accepting
+        return bool(self._empty_groups) and self._states <= accepting and not self._tested_states <= accepting
 
-    def _why_stop(self, before: Sample | None, sample: Sample) -> str:
+    def _why_stop(self, previous_sample: Sample | None, sample: Sample) -> str:
         """Return the reason why the motion must stop after two consecutive samples; "" if it may continue."""
-        target = None if self._running is None else self._running.target
-        if before is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
+        target = None if self._current_step is None else self._current_step.target
+        if previous_sample is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
             return ""
-        was, now = before.objects.get(target.name), sample.objects.get(target.name)
-        if was is None or now is None:
+        previous_object, tracked = previous_sample.objects.get(target.name), sample.objects.get(target.name)
+        if previous_object is None or tracked is None:
             return ""
-        symbol = self._observer.symbol(next_sample(before, sample, target, self.settings.skill))
-        if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):
+        next_symbol = self._observer.symbol(next_sample(previous_sample, sample, target, self.settings.skill))
+        if not self.automaton.step_set(self._states, next_symbol).isdisjoint(self.automaton.can_accept):
             evasion = self._evasion(target)
             self._is_evaded = evasion is not None
             return "" if evasion is None else f"stopped: {evasion.reason}"
-        changes = zip(self._words.propositions, self._symbol, symbol, strict=True)
-        changed = [
-            proposition.literal(bool(after)) for proposition, value, after in changes if after is not value
+        changes = zip(self._named_automaton.propositions, self._symbol, next_symbol, strict=True)
+        causes = [
+            proposition.literal(bool(next_value))
+            for proposition, value, next_value in changes
+            if next_value is not value
         ]
-        numbers = [number for number, value in enumerate(self._symbol) if symbol[number] is not value]
-        self._is_evaded = self._is_about_movers(numbers, target.name)
+        changed_numbers = [
+            number for number, value in enumerate(self._symbol) if next_symbol[number] is not value
+        ]
+        self._is_evaded = self._is_about_movers(changed_numbers, target.name)
         return (
-            f"stopped: with the next sample, {' and '.join(changed) or 'the specification would be violated'}"
+            f"stopped: with the next sample, {' and '.join(causes) or 'the specification would be violated'}"
         )
 
-    def _is_about_movers(self, numbers: Iterable[int], name: str) -> bool:
+    def _is_about_movers(self, proposition_numbers: Iterable[int], name: str) -> bool:
         """Return whether a proposition concerns another object that has moved since the decision."""
-        moved = {} if self._decided is None else motions_between(self._decided, self._newest())
-        formulas = [self._formulas[number] for number in numbers]
-        return any(concerns(formula, mover) for mover in moved.keys() - {name} for formula in formulas)
+        motions = (
+            {} if self._decision_sample is None else motions_between(self._decision_sample, self._newest())
+        )
+        formulas = [self._formulas[number] for number in proposition_numbers]
+        return any(concerns(formula, mover) for mover in motions.keys() - {name} for formula in formulas)
 
     def _evasion(self, target: Target) -> Evasion | None:
         """Return how to evade moving objects; None if a motion to a target may continue."""
-        return self._lookout.evasion(self._newest(), self._states, self._motions, target, self._timing)
+        return self._lookout.evasion(self._newest(), self._states, self._object_motions, target, self._timing)
 
     @property
     def _lookout(self) -> Lookout:
@@ -317,7 +329,7 @@ class Planner:
 
     @property
     def _timing(self) -> Timing:
-        return self._times.timing(self.settings.workspace.grid.cell_size)
+        return self._motion_times.timing(self.settings.workspace.grid.cell_size)
 
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).
@@ -329,20 +341,20 @@ class Planner:
             UsageError: no sample was observed yet, or the last step was not concluded.
         """
         self._newest()
-        if self._running is not None:
+        if self._current_step is not None:
             raise UsageError(
-                f"step {self._running.number} is being executed; conclude it with its outcome first"
+                f"step {self._current_step.number} is being executed; conclude it with its outcome first"
             )
-        if self._waiting is not None and self._waits_on(self._waiting):
-            return self._waiting
+        if self._wait_step is not None and self._waits_on(self._wait_step):
+            return self._wait_step
         step = self._next_step()
-        self._delayed = None
-        if step.target is not None and self._yielded < MOST_YIELDED:
+        self._delayed_target = None
+        if step.target is not None and self._yield_count < MOST_YIELDED:
             step = self._yielding(step, step.target)
-        self._running = step if step.kind == "execute" else None
-        self._decided = self._newest()
-        self._waiting = step if step.kind == "wait" else None
-        self._ahead = step.ahead
+        self._current_step = step if step.kind == "execute" else None
+        self._decision_sample = self._newest()
+        self._wait_step = step if step.kind == "wait" else None
+        self._expected_states = step.ahead
         return step
 
     def conclude(self, outcome: Outcome) -> None:
@@ -355,54 +367,56 @@ class Planner:
         """
         if not isinstance(outcome, Outcome):
             raise UsageError(f"{outcome!r} is no outcome; give an Outcome(succeeded, reason)")
-        step = self._running
+        step = self._current_step
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")
-        self._running = None
-        self._times.end()
+        self._current_step = None
+        self._motion_times.end()
         # a concluded motion is over, so the object counts as standing
-        self._motions.pop(step.target.name, None)
+        self._object_motions.pop(step.target.name, None)
         # a controller returns the stop reason unchanged
         is_stopped = not outcome.succeeded and outcome.reason == self._stop_reason
-        if self._delayed is not None:
+        if self._delayed_target is not None:
             # a motion aside is no attempt at an edge
             self._attempts.motions += 1
-            self._is_idle = self._decided is self._newest()
-        elif is_stopped and self._is_evaded and self._yielded < MOST_YIELDED:
+            self._is_idle = self._decision_sample is self._newest()
+        elif is_stopped and self._is_evaded and self._yield_count < MOST_YIELDED:
             # stopped for a moving object, which does not count as a failure
             self._attempts.motions += 1
             self._attempts.withdraw(step.aim.edge, step.target.name)
         else:
-            about = step.aim, step.target, outcome, self.states, self._newest()
-            self._attempts.conclude(*about, is_stopped=is_stopped)
-            self._yielded = 0 if outcome.succeeded else self._yielded
+            motion_record = step.aim, step.target, outcome, self.states, self._newest()
+            self._attempts.conclude(*motion_record, is_stopped=is_stopped)
+            self._yield_count = 0 if outcome.succeeded else self._yield_count
 
     def _yielding(self, step: Step, target: Target) -> Step:
         """Return the step of a motion, or a step that first evades moving objects."""
         if step.aim is None:
             return step
-        target = self._lookout.past_others(self._newest(), self._motions, target, step.aim, self._timing)
+        target = self._lookout.past_others(
+            self._newest(), self._object_motions, target, step.aim, self._timing
+        )
         evasion = self._evasion(target)
         if evasion is None:
             return replace(step, target=target)
         self._attempts.withdraw(step.aim.edge, target.name)
-        self._delayed = target
-        self._yielded += 1
+        self._delayed_target = target
+        self._yield_count += 1
         # without a sample during the last motion aside, the robot did not move; so wait instead
-        aside = None if self._is_idle else evasion.aside
+        aside_target = None if self._is_idle else evasion.aside
         self._is_idle = False
-        if aside is None:
+        if aside_target is None:
             return replace(step, kind="wait", target=None, reason=f"wait: {evasion.reason}")
-        place = f"({aside.x:.4g}, {aside.y:.4g})"
-        reason = f"{aside.name} goes aside to {place}: {evasion.reason}"
-        return replace(step, target=aside, reason=reason)
+        place_text = f"({aside_target.x:.4g}, {aside_target.y:.4g})"
+        reason = f"{aside_target.name} goes aside to {place_text}: {evasion.reason}"
+        return replace(step, target=aside_target, reason=reason)
 
     def _waits_on(self, step: Step) -> bool:
-        if self._delayed is not None:
-            self._yielded += 1
-            evasion = self._evasion(self._delayed) if self._yielded < MOST_YIELDED else None
+        if self._delayed_target is not None:
+            self._yield_count += 1
+            evasion = self._evasion(self._delayed_target) if self._yield_count < MOST_YIELDED else None
             return evasion is not None and evasion.aside is None
-        return bool(self._ahead) if step.ahead else self._is_blind() or self._lacks_members
+        return bool(self._expected_states) if step.ahead else self._is_blind() or self._lacks_members
 
     def _is_blind(self) -> bool:
         """Return whether unknown propositions leave several states possible that do not all accept."""
@@ -412,13 +426,13 @@ class Planner:
     def _next_step(self) -> Step:
         self._budget = Budget(MOST_MAPS)
         if self._lacks_members:
-            groups = absence_text(self._awaited, self._newest())
-            return self._decision("wait", (), f"nothing shows that it is done: no object is in {groups}")
+            groups_text = absence_text(self._empty_groups, self._newest())
+            return self._decision("wait", (), f"nothing shows that it is done: no object is in {groups_text}")
         if self._states <= self.automaton.accepting:
-            if self._tested <= self.automaton.accepting:
+            if self._tested_states <= self.automaton.accepting:
                 return self._decision("hold", (), "the specification is satisfied: hold")
             # groups have members now, which do not satisfy the goal yet
-            self._states = self._tested
+            self._states = self._tested_states
         if self._is_blind():
             return self._decision("wait", (), f"not enough is seen: {self._unknown()}")
         state = worst_state(self.automaton, self.states)
@@ -432,71 +446,80 @@ class Planner:
     def _step_from(self, state: int) -> Step:
         """Return the step for the first edge that can be taken, over paths of increasing length."""
         idle = idle_transitions(self.automaton, state, self._symbol)
-        foresight = self._foresight(self._attempts)
-        considered: list[Consideration] = []
-        undecided: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
+        lookahead = self._foresight(self._attempts)
+        considerations: list[Consideration] = []
+        undecided_aims: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
         # time takes idle transitions without any motion, so they remain possible
-        given_up = frozenset(self._pruned) - self._passed
-        pruned = given_up - idle.edges
-        while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
-            aim = consideration_of(self._words, path, pruned, self._symbol)
+        given_up_edges = frozenset(self._prune_reasons) - self._joint_edges
+        pruned_edges = given_up_edges - idle.edges
+        while (path := next(self.automaton.paths(state, pruned_edges), None)) and not idle.along(path):
+            aim = consideration_of(self._named_automaton, path, pruned_edges, self._symbol)
             aim = replace(
                 aim,
                 failed=self._attempts.failures(aim.edge),
-                order=order_text(self.automaton, path, pruned | idle.edges),
+                order=order_text(self.automaton, path, pruned_edges | idle.edges),
             )
-            exhausted = self._attempts.why_not_again(aim.edge, self.settings.attempts)
-            if exhausted is not None:
-                considered.append(replace(aim, pruned=exhausted))
-                self._passed.discard(aim.edge)
+            limit_reason = self._attempts.why_not_again(aim.edge, self.settings.attempts)
+            if limit_reason is not None:
+                considerations.append(replace(aim, pruned=limit_reason))
+                self._joint_edges.discard(aim.edge)
             else:
-                aim = self._consider(aim, path, foresight.movables)
-                before = pruned | given_up
-                undecided[len(considered)] = aim, path, before
-                considered.append(foresight.decide(aim, path, before))
-                self._passed.add(aim.edge)
-            if (reason := considered[-1].pruned) is None:
-                return self._running_step(considered)
-            self._pruned[aim.edge] = reason
-            pruned |= {aim.edge, *equivalent_edges(self.automaton, aim, idle, pruned, self._symbol)}
+                aim = self._consider(aim, path, lookahead.movables)
+                pruned_before = pruned_edges | given_up_edges
+                undecided_aims[len(considerations)] = aim, path, pruned_before
+                considerations.append(lookahead.decide(aim, path, pruned_before))
+                self._joint_edges.add(aim.edge)
+            if (reason := considerations[-1].pruned) is None:
+                return self._running_step(considerations)
+            self._prune_reasons[aim.edge] = reason
+            pruned_edges |= {
+                aim.edge,
+                *equivalent_edges(self.automaton, aim, idle, pruned_edges, self._symbol),
+            }
         # edges that need several motions, or a motion that failed before, come after all other edges
-        for number, (alone, way, before) in undecided.items():
-            decision = foresight.decide(alone, way, before, together=True)
+        for index, (single_aim, aim_path, pruned_before) in undecided_aims.items():
+            decision = lookahead.decide(single_aim, aim_path, pruned_before, together=True)
             if decision.pruned and self._attempts.motions > 0:
                 # a motion may fail by chance, so a failed motion is repeated if there is no other
-                again = self._foresight(self._attempts.forgiven())
-                repeated = self._consider(alone, way, again.movables)
-                repeated = again.decide(repeated, way, before, together=True)
-                decision = decision if repeated.pruned else repeated
-            considered[number] = decision
+                repeat_lookahead = self._foresight(self._attempts.forgiven())
+                repeat_decision = self._consider(single_aim, aim_path, repeat_lookahead.movables)
+                repeat_decision = repeat_lookahead.decide(
+                    repeat_decision, aim_path, pruned_before, together=True
+                )
+                decision = decision if repeat_decision.pruned else repeat_decision
+            considerations[index] = decision
             if decision.pruned is None:
-                return self._running_step(considered[: number + 1])
-            self._pruned[decision.edge] = decision.pruned
-            self._passed.discard(decision.edge)
+                return self._running_step(considerations[: index + 1])
+            self._prune_reasons[decision.edge] = decision.pruned
+            self._joint_edges.discard(decision.edge)
         if path is not None:
-            considered.append(consideration_of(self._words, path, pruned, self._symbol))
-            return self._waiting_step(considered, idle.along(path))
+            considerations.append(consideration_of(self._named_automaton, path, pruned_edges, self._symbol))
+            return self._waiting_step(considerations, idle.along(path))
         why = ""
-        if considered and self.settings.motions > 1 and not self._attempts.are_any:
-            first = considered[0].pruned
-            is_later = any(reason.kind == LATER for reason in self._pruned.values())
-            why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
-        said = why_no_path(self.automaton, state, self._pruned, why)
+        if considerations and self.settings.motions > 1 and not self._attempts.are_any:
+            first_reason = considerations[0].pruned
+            is_later = any(reason.kind == LATER for reason in self._prune_reasons.values())
+            why = lookahead.why_not(state) or (
+                "" if first_reason is None or is_later else first_reason.detail
+            )
+        sentence = why_no_path(self.automaton, state, self._prune_reasons, why)
         if self._budget.left <= 0:
-            said += f"; the search ended after {MOST_MAPS} maps, and there may be a way that it did not find"
-        return self._decision("no path", considered, said)
+            sentence += (
+                f"; the search ended after {MOST_MAPS} maps, and there may be a way that it did not find"
+            )
+        return self._decision("no path", considerations, sentence)
 
     def _foresight(self, attempts: Attempts) -> Lookahead:
-        about = self.automaton, self._formulas, self._regions, self.settings
-        return Lookahead(Expectations(*about, attempts, self._budget), self._newest())
+        automaton_inputs = self.automaton, self._formulas, self._regions, self.settings
+        return Lookahead(Expectations(*automaton_inputs, attempts, self._budget), self._newest())
 
     def _consider(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
     ) -> Consideration:
         """Return an edge with its candidates and the best one chosen; pruned if no single motion takes it."""
-        later = moved_later(path, self._symbol, self._formulas, movables.names)
+        later_names = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
-            movables.candidate(name, consideration, later, refine=True)
+            movables.candidate(name, consideration, later_names, refine=True)
             for name in movables.names_for(consideration.progress)
         ]
         return with_choice(replace(consideration, pruned=None), candidates, self.settings)
@@ -511,12 +534,16 @@ class Planner:
         if target is None:
             raise UsageError("the chosen object has no target")
         self._attempts.begin(aim.edge, target.name, self._newest(), self.settings)
-        self._pruned.pop(aim.edge, None)
+        self._prune_reasons.pop(aim.edge, None)
         verb = "push" if self.settings.skill == "push" else "place"
-        edge = f"{aim.edge[0]} -> {aim.edge[1]}"
-        which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
-        what = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
-        reason = f"{self._why(aim, target)}. {what}"
+        edge_text = f"{aim.edge[0]} -> {aim.edge[1]}"
+        count_text = (
+            f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
+        )
+        action = (
+            f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){count_text} for the edge {edge_text}"
+        )
+        reason = f"{self._why(aim, target)}. {action}"
         return replace(self._decision("execute", considered, reason), target=target)
 
     def bans(self, consideration: Consideration, pruned: Iterable[tuple[Edge, Reason]]) -> tuple[Ban, ...]:
@@ -526,39 +553,41 @@ class Planner:
             pruned: pruned edges, whose guards the bans may also forbid.
         """
         source = consideration.edge[0]
-        given_up: list[str] = []
+        pruned_guards: list[str] = []
         for edge, _ in pruned:
-            transition = self._words.transition(*edge) if edge[0] == source else None
+            transition = self._named_automaton.transition(*edge) if edge[0] == source else None
             if transition is not None and edge != consideration.edge and not transition.is_cut:
-                given_up += guards_of(self._words, [transition]).texts
-        return bans_of(consideration.constraints.texts, given_up)
+                pruned_guards += guards_of(self._named_automaton, [transition]).texts
+        return bans_of(consideration.constraints.texts, pruned_guards)
 
     def _why(self, aim: Consideration, target: Target) -> str:
         """Return the reason why an object is moved, and why it is preferred to other objects."""
         name = target.name
-        wrong = (
+        unmet_by_cube = (
             [literal for literal in cube if self._symbol[literal[0]] is not literal[1]]
             for cube in aim.progress.cubes
         )
-        unmet = min(wrong, key=len)
-        relevant = [literal for literal in unmet if concerns(self._formulas[literal[0]], name)]
-        later = [motion.name for motion in aim.motions[1:]]
-        others = [mover for mover in later if mover != name]
-        if aim.is_joint and others and (name in later or not relevant):
-            failed = self._attempts.failed_here(others[0], self._newest(), self.settings)
-            why = "could not be moved next to it" if failed else "has to pass"
-            return f"{name} goes aside: {others[0]} {why}"
-        goal = " and ".join(self._wanted_text(*literal) for literal in relevant or unmet)
-        why = f"{name} moves{goal and f': {goal} is wanted'}"
-        rivals = [
+        unmet_literals = min(unmet_by_cube, key=len)
+        relevant_literals = [
+            literal for literal in unmet_literals if concerns(self._formulas[literal[0]], name)
+        ]
+        later_names = [motion.name for motion in aim.motions[1:]]
+        other_names = [mover for mover in later_names if mover != name]
+        if aim.is_joint and other_names and (name in later_names or not relevant_literals):
+            failed_targets = self._attempts.failed_here(other_names[0], self._newest(), self.settings)
+            sentence = "could not be moved next to it" if failed_targets else "has to pass"
+            return f"{name} goes aside: {other_names[0]} {sentence}"
+        goal = " and ".join(self._wanted_text(*literal) for literal in relevant_literals or unmet_literals)
+        sentence = f"{name} moves{goal and f': {goal} is wanted'}"
+        rival_targets = [
             candidate.target for candidate in aim.candidates if candidate.target and not candidate.is_chosen
         ]
-        if aim.is_joint or not rivals:
-            return why
-        rival = min(rivals, key=lambda rival: costs_of(rival, self.settings.skill))
-        names = [candidate.name for candidate in aim.candidates]
-        is_later = names.index(rival.name) > names.index(name)
-        return f"{why}; {rival.name} could do it with {self._comparison(rival, target, is_later)}"
+        if aim.is_joint or not rival_targets:
+            return sentence
+        rival = min(rival_targets, key=lambda rival: costs_of(rival, self.settings.skill))
+        candidate_names = [candidate.name for candidate in aim.candidates]
+        is_later = candidate_names.index(rival.name) > candidate_names.index(name)
+        return f"{sentence}; {rival.name} could do it with {self._comparison(rival, target, is_later)}"
 
     def _comparison(self, rival: Target, target: Target, is_later: bool) -> str:
         """Return the difference between the target of a rival and the chosen target.
@@ -567,31 +596,36 @@ class Planner:
             is_later: whether the rival comes later in the order of objects.
         """
         skill = self.settings.skill
-        rows = list(zip(_COMPARED[skill], costs_of(rival, skill), costs_of(target, skill), strict=True))
-        (same, *_), *costs = rows[0]
+        comparisons = list(
+            zip(_COMPARED[skill], costs_of(rival, skill), costs_of(target, skill), strict=True)
+        )
+        (equal_words, *_), *costs = comparisons[0]
         if costs[0] != costs[1]:
-            return _difference_text(rows[0])
-        equal = f"{same} ({abs(costs[0]):.3g})"
-        (same, *_), *costs = rows[1]
+            return _difference_text(comparisons[0])
+        equality = f"{equal_words} ({abs(costs[0]):.3g})"
+        (equal_words, *_), *costs = comparisons[1]
         if costs[0] != costs[1]:
-            return f"{equal}, and {_difference_text(rows[1])}"
+            return f"{equality}, and {_difference_text(comparisons[1])}"
         order = "by name" if self.settings.movable is None else "in `movable`"
-        return f"{equal} and {same}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
+        return f"{equality} and {equal_words}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
 
     def _wanted_text(self, number: int, value: bool) -> str:
         """Return the text of a literal with the names of its specs; only the names for a long text."""
-        text, specs = self._words.propositions[number].literal(value), " and ".join(self._specs[number])
-        if not specs or self._words.propositions[number].name:
+        text, spec_text = (
+            self._named_automaton.propositions[number].literal(value),
+            " and ".join(self._specs[number]),
+        )
+        if not spec_text or self._named_automaton.propositions[number].name:
             return text
-        return specs if len(text) > _LONGEST_WANTED else f"{text} ({specs})"
+        return spec_text if len(text) > _LONGEST_WANTED else f"{text} ({spec_text})"
 
     def _decision(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
-        number, self._steps = self._steps, self._steps + 1
-        pruned = tuple(sorted(self._pruned.items()))
+        step_number, self._step_count = self._step_count, self._step_count + 1
+        pruned_reasons = tuple(sorted(self._prune_reasons.items()))
         time_ns = self._newest().time_ns
-        lost = self._lost
-        about = self.states, tuple(considered), None, pruned, reason
-        return Step(number, time_ns, kind, *about, lost=lost, search=self._budget.search)
+        lost = self._loss
+        step_fields = self.states, tuple(considered), None, pruned_reasons, reason
+        return Step(step_number, time_ns, kind, *step_fields, lost=lost, search=self._budget.search)
 
     def _newest(self) -> Sample:
         if self._sample is None:
@@ -600,10 +634,10 @@ class Planner:
 
     def _unknown(self) -> str:
         """Return the labels of the unknown propositions in the newest sample, with the reasons."""
-        numbers = [number for number, value in enumerate(self._symbol) if value is None]
-        labels = ", ".join(self._words.propositions[number].label for number in numbers)
-        formulas = [self._formulas[number] for number in numbers]
-        reasons = unknown_reasons(formulas, self._newest(), self._seen, self._regions)
+        unknown_numbers = [number for number, value in enumerate(self._symbol) if value is None]
+        labels = ", ".join(self._named_automaton.propositions[number].label for number in unknown_numbers)
+        formulas = [self._formulas[number] for number in unknown_numbers]
+        reasons = unknown_reasons(formulas, self._newest(), self._seen_ns, self._regions)
         return f"{labels} unknown: {'; '.join(reasons)}" if reasons else f"{labels} unknown"
 
 
@@ -614,11 +648,11 @@ _COMPARED: Final = {"push": (_LENGTH, _ROBUSTNESS), "place": (_ROBUSTNESS, _LENG
 _LEADS_NOWHERE: Final = "but no motions lead on from there"
 
 
-def _difference_text(row: tuple[tuple[str, str, str], float, float]) -> str:
+def _difference_text(comparison: tuple[tuple[str, str, str], float, float]) -> str:
     """Return the comparison of a rival's cost with the least cost, in words."""
-    (_, worse, better), cost, least = row
-    numbers = f"({abs(cost):.3g}, here {abs(least):.3g})"
-    return f"{worse} {numbers}" if cost > least else f"{better} {numbers}, {_LEADS_NOWHERE}"
+    (_, worse, better), cost, least_cost = comparison
+    numbers_text = f"({abs(cost):.3g}, here {abs(least_cost):.3g})"
+    return f"{worse} {numbers_text}" if cost > least_cost else f"{better} {numbers_text}, {_LEADS_NOWHERE}"
 
 
 MOST_YIELDED: Final = 1800

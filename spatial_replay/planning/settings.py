@@ -113,8 +113,8 @@ class Grid:
         left, below = max(-column, 0), max(-row, 0)
         right, above = max(column + 1 - self.columns, 0), max(row + 1 - self.rows, 0)
         columns, rows = self.columns + left + right, self.rows + below + above
-        added = max(left, below, right, above)
-        if not added or added > max(self.shape) or columns * rows > MOST_CELLS:
+        most_added = max(left, below, right, above)
+        if not most_added or most_added > max(self.shape) or columns * rows > MOST_CELLS:
             return self
         xmin, ymin = self.xmin - left * self.cell_size, self.ymin - below * self.cell_size
         return Grid(xmin, ymin, self.cell_size, columns, rows)
@@ -206,19 +206,19 @@ class Workspace:
         parts = [part for tracked in sample.objects.values() for part in tracked.footprint.parts]
         if not parts:
             raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
-        low = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)
-        high = np.max([part.vertices.max(axis=0) + part.radius for part in parts], axis=0)
-        longer = float((high - low).max()) or 1.0
-        (xmin, ymin), (xmax, ymax) = (low - longer / 2).tolist(), (high + longer / 2).tolist()
-        return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
+        lowest = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)
+        highest = np.max([part.vertices.max(axis=0) + part.radius for part in parts], axis=0)
+        longer_side = float((highest - lowest).max()) or 1.0
+        (xmin, ymin), (xmax, ymax) = (lowest - longer_side / 2).tolist(), (highest + longer_side / 2).tolist()
+        return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer_side / CELLS_AROUND))
 
     def turns(self, yaw: float | None) -> Floats:
         """Return the angles by which an object with an orientation may be turned, (A,), radians."""
         if not self.keeps_yaw:
             return np.array(self.yaws) - (yaw or 0.0) if self.yaws else np.zeros(1)
         # the shorter direction of each turn
-        turned = () if yaw is None else (math.remainder(angle - yaw, math.tau) for angle in self.yaws)
-        return np.array([0.0, *turned])
+        turn_angles = () if yaw is None else (math.remainder(angle - yaw, math.tau) for angle in self.yaws)
+        return np.array([0.0, *turn_angles])
 
     def within_reach(self, grid: Grid) -> Booleans:
         """Return whether the robot reaches the centre of each cell of a grid, (rows, columns).
@@ -229,8 +229,8 @@ class Workspace:
             return np.ones(grid.shape, np.bool_)
         centres = grid.centres()
         distance = np.hypot(*(centres - np.array(self.base)).T)
-        reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)
-        return np.asarray(reached.reshape(grid.shape))
+        is_reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)
+        return np.asarray(is_reached.reshape(grid.shape))
 
 
 def refuse_faults(faults: Iterable[str]) -> None:
@@ -396,17 +396,17 @@ def settings_from_text(text: str) -> Settings:
         raise LogError(f"the planner's settings in the log cannot be read: {error}") from error
 
 
-def _settings(read: dict[str, Any]) -> Settings:
-    xmin, ymin, cell_size, columns, rows = read["grid"]
+def _settings(document: dict[str, Any]) -> Settings:
+    xmin, ymin, cell_size, columns, rows = document["grid"]
     workspace = Workspace(
         Grid(float(xmin), float(ymin), float(cell_size), int(columns), int(rows)),
         obstacles=tuple(
             Footprint(tuple(ConvexPart(vertices, radius) for vertices, radius in parts))
-            for parts in read["obstacles"]
+            for parts in document["obstacles"]
         ),
-        **{key: value(read[key]) for key, value in _OF_WORKSPACE.items() if key != "obstacles"},
+        **{key: value(document[key]) for key, value in _OF_WORKSPACE.items() if key != "obstacles"},
     )
-    return Settings(workspace, **{key: _plain(key, read[key]) for key in _PLAIN})
+    return Settings(workspace, **{key: _plain(key, document[key]) for key in _PLAIN})
 
 
 # ------------------------------------------------------------------------------------- files and options
@@ -447,12 +447,14 @@ def parse_setting(text: str) -> Mapping[str, Any]:
         UsageError: there is no such setting, or the value is not valid.
     """
     key, equals, value = text.partition("=")
-    kinds = schema_of("planning", "settings")["properties"]
-    if not equals or key not in kinds:
-        hint = nearest_hint(key, kinds) or f"the keys are {', '.join(kinds)}"
+    schema_by_key = schema_of("planning", "settings")["properties"]
+    if not equals or key not in schema_by_key:
+        hint = nearest_hint(key, schema_by_key) or f"the keys are {', '.join(schema_by_key)}"
         raise UsageError(f"--set {text!r:.100}: give KEY=VALUE; {hint}")
-    options = [kinds[key], *kinds[key].get("anyOf", ())]
-    is_list = kinds[key].get("type") == "array" or any("names" in kind.get("$ref", "") for kind in options)
+    value_schemas = [schema_by_key[key], *schema_by_key[key].get("anyOf", ())]
+    is_list = schema_by_key[key].get("type") == "array" or any(
+        "names" in kind.get("$ref", "") for kind in value_schemas
+    )
     if is_list and value.strip() != "null" and not value.strip().startswith("["):
         value = f"[{value}]"
     option = f"--set {key}"
@@ -472,10 +474,14 @@ def changed_settings(base: Settings | None, changes: Mapping[str, Any]) -> Setti
     """
     grid = _changed_grid(None if base is None else base.workspace.grid, changes)
     workspace = Workspace(grid) if base is None else replace(base.workspace, grid=grid)
-    of_workspace = {key: read(changes[key]) for key, read in _OF_WORKSPACE.items() if key in changes}
-    plain = {key: _plain(key, changes[key]) for key in _PLAIN if key in changes}
-    workspace = replace(workspace, **of_workspace)
-    return Settings(workspace, **plain) if base is None else replace(base, workspace=workspace, **plain)
+    workspace_values = {key: read(changes[key]) for key, read in _OF_WORKSPACE.items() if key in changes}
+    plain_values = {key: _plain(key, changes[key]) for key in _PLAIN if key in changes}
+    workspace = replace(workspace, **workspace_values)
+    return (
+        Settings(workspace, **plain_values)
+        if base is None
+        else replace(base, workspace=workspace, **plain_values)
+    )
 
 
 def _changed_grid(grid: Grid | None, changes: Mapping[str, Any]) -> Grid:
@@ -485,8 +491,8 @@ def _changed_grid(grid: Grid | None, changes: Mapping[str, Any]) -> Grid:
         return grid
     if grid is not None:
         xmax, ymax = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
-        before = {"area": (grid.xmin, grid.ymin, xmax, ymax), "cell_size": grid.cell_size}
-        changes = {**before, **changes}
+        grid_values = {"area": (grid.xmin, grid.ymin, xmax, ymax), "cell_size": grid.cell_size}
+        changes = {**grid_values, **changes}
     xmin, ymin, xmax, ymax = map(float, changes["area"])
     return Grid.over(xmin, ymin, xmax, ymax, float(changes["cell_size"]))
 

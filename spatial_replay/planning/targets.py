@@ -81,17 +81,17 @@ def find_target(
         failed: places (x, y) where earlier motions failed.
         failures: targets of failed motions in the current scene.
     """
-    good = good_cells(gradient, settings, failed, failures)
-    if not good.any():
+    is_good = good_cells(gradient, settings, failed, failures)
+    if not is_good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
-        roomy = good & (room >= least_room(good, room, settings, failures))
-        values = np.where(roomy, gradient.robustness, -np.inf)
+        is_roomy = is_good & (room >= least_room(is_good, room, settings, failures))
+        cell_values = np.where(is_roomy, gradient.robustness, -np.inf)
         # the nearest of equally robust cells
-        away = distance_to([centre_of(tracked.footprint)], gradient.grid)
-        values = np.where(values >= values.max() - _EQUAL, -away, -np.inf)
-        return _best_target(gradient, values, tracked)
-    return _nearest_cell(gradient, good, tracked, settings, failures)
+        distance = distance_to([centre_of(tracked.footprint)], gradient.grid)
+        cell_values = np.where(cell_values >= cell_values.max() - _EQUAL, -distance, -np.inf)
+        return _best_target(gradient, cell_values, tracked)
+    return _nearest_cell(gradient, is_good, tracked, settings, failures)
 
 
 def good_cells(
@@ -101,22 +101,22 @@ def good_cells(
     failures: Sequence[Target] = (),
 ) -> Booleans:
     """Return the cells that will do as a target, (A, rows, columns); arguments as in `find_target`."""
-    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    good: Booleans = holds & ~avoided_cells(gradient, settings, failed)
+    is_met = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    is_good: Booleans = is_met & ~avoided_cells(gradient, settings, failed)
     if settings.skill == "place" and failures:
         # cells at least a finger's width from failed targets; without any, cells with other poses than these
-        for apart in (_spread(settings), _SAME * _cell(settings)):
-            untried = good & ~tried_poses(gradient, failures, apart)
-            if untried.any():
-                return untried
-    return good
+        for radius in (_spread(settings), _SAME * _cell(settings)):
+            is_untried = is_good & ~tried_poses(gradient, failures, radius)
+            if is_untried.any():
+                return is_untried
+    return is_good
 
 
 def tried_cells(candidate: Candidate, settings: Settings) -> Booleans:
     """Return the cells that would do but for failed motions of a candidate, (A, rows, columns)."""
     gradient = candidate.map
-    good = good_cells(gradient, settings, candidate.failed, candidate.failures)
-    return np.asarray((gradient.blocked == FREE) & (gradient.robustness >= settings.margin) & ~good)
+    is_good = good_cells(gradient, settings, candidate.failed, candidate.failures)
+    return np.asarray((gradient.blocked == FREE) & (gradient.robustness >= settings.margin) & ~is_good)
 
 
 def least_room(good: Booleans, room: Floats, settings: Settings, failures: Sequence[Target] = ()) -> float:
@@ -127,9 +127,9 @@ def least_room(good: Booleans, room: Floats, settings: Settings, failures: Seque
         room, failures: as in `find_target`.
     """
     # after failures, the cells with the most room count if no cell has the preferred room
-    most = float(room[good].max(initial=-math.inf))
-    preferred = min(settings.room, most) if failures else settings.room
-    return preferred if most >= preferred else -math.inf
+    most_room = float(room[good].max(initial=-math.inf))
+    preferred = min(settings.room, most_room) if failures else settings.room
+    return preferred if most_room >= preferred else -math.inf
 
 
 def target_in(
@@ -143,11 +143,11 @@ def target_in(
     cell = gradient.cell_of(*pose)
     if gradient.blocked[cell] != FREE:
         return REASONS[gradient.blocked[cell]]
-    goal = np.zeros(gradient.blocked.shape, np.bool_)
-    goal[cell] = True
+    goal_cells = np.zeros(gradient.blocked.shape, np.bool_)
+    goal_cells[cell] = True
     if settings.skill == "place":
         return _target(gradient, tracked, cell, (centre_of(tracked.footprint), pose[:2]))
-    return _nearest_cell(gradient, goal, tracked, settings, failures)
+    return _nearest_cell(gradient, goal_cells, tracked, settings, failures)
 
 
 def nearest_target(
@@ -162,19 +162,21 @@ def nearest_target(
         return "there is no place for it"
     if settings.skill == "push":
         return _nearest_cell(gradient, good, tracked, settings, failures)
-    away = distance_to([centre_of(tracked.footprint)], gradient.grid)
-    return _best_target(gradient, np.where(good, -away, -np.inf), tracked)
+    distance = distance_to([centre_of(tracked.footprint)], gradient.grid)
+    return _best_target(gradient, np.where(good, -distance, -np.inf), tracked)
 
 
-def _best_target(gradient: GradientMap, values: Floats, tracked: TrackedObject) -> Target:
-    turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
+def _best_target(gradient: GradientMap, cell_values: Floats, tracked: TrackedObject) -> Target:
+    turn, row, column = (
+        int(index) for index in np.unravel_index(int(np.argmax(cell_values)), cell_values.shape)
+    )
     start, end = centre_of(tracked.footprint), gradient.grid.centre(row, column)
     return _target(gradient, tracked, (turn, row, column), (start, end))
 
 
 def _nearest_cell(
     gradient: GradientMap,
-    good: np.ndarray,
+    goal_cells: np.ndarray,
     tracked: TrackedObject,
     settings: Settings,
     failures: Sequence[Target],
@@ -183,33 +185,33 @@ def _nearest_cell(
     if not gradient.grid.contains(np.array(start)):
         return "it lies too far outside the workspace"
     cell = gradient.grid.cell(*start)
-    towards = _failed_directions(gradient.grid, tracked, failures)
-    entry = _path_into_reach(gradient, cell, settings, towards)
-    if entry is None:
+    failed_cells = _failed_directions(gradient.grid, tracked, failures)
+    entry_path = _path_into_reach(gradient, cell, settings, failed_cells)
+    if entry_path is None:
         return "no free path leads into reach" + _but_for(failures)
-    row, column = entry.cells[-1].tolist()
-    free = (gradient.blocked[0] == FREE) & ~towards
-    paths = {0: shortest_path(free, (row, column), good[0])}
-    if paths[0] is None:
+    row, column = entry_path.cells[-1].tolist()
+    is_free = (gradient.blocked[0] == FREE) & ~failed_cells
+    path_by_layer = {0: shortest_path(is_free, (row, column), goal_cells[0])}
+    if path_by_layer[0] is None:
         # other orientations are tried only if the object cannot keep its orientation
         for layer in range(1, len(gradient.turns)):
-            goals = _turnable(gradient, layer, good[layer] & free, settings)
-            paths[layer] = shortest_path(free, (row, column), goals)
-    routes = [(path.length, layer, path) for layer, path in paths.items() if path is not None]
+            goals = _turnable(gradient, layer, goal_cells[layer] & is_free, settings)
+            path_by_layer[layer] = shortest_path(is_free, (row, column), goals)
+    routes = [(path.length, layer, path) for layer, path in path_by_layer.items() if path is not None]
     if not routes:
         return "no free path leads to a good place" + _but_for(failures)
-    _, turned, path = min(routes, key=lambda route: route[0])
-    cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
+    _, best_layer, path = min(routes, key=lambda route: route[0])
+    cells = [(row, column) for row, column in (*entry_path.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the centre of its cell need not go to this centre first
-    first = 0
+    first_corner = 0
     if cells[0] == cell and len(cells) > 1:
-        first = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
-    turns = [gradient.grid.centre(*corner) for corner in cells[first:]]
-    way = (start, *turns)
+        first_corner = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
+    corners = [gradient.grid.centre(*corner) for corner in cells[first_corner:]]
+    waypoints = (start, *corners)
     # after a failed push, a straight first leg might begin in the failed direction again
     if not failures:
-        way = _without_corners(way, gradient, free, settings)
-    return _target(gradient, tracked, (turned, *cells[-1]), way)
+        waypoints = _without_corners(waypoints, gradient, is_free, settings)
+    return _target(gradient, tracked, (best_layer, *cells[-1]), waypoints)
 
 
 class Ways(NamedTuple):
@@ -231,66 +233,75 @@ def ways_of(candidate: Candidate, target: Target, settings: Settings) -> Ways | 
     gradient, failures = candidate.map, candidate.failures
     grid = gradient.grid
     tracked = gradient.made_of.now.about.sample.objects[candidate.name]
-    towards = _failed_directions(grid, tracked, failures)
-    entry = _path_into_reach(gradient, grid.cell(*centre_of(tracked.footprint)), settings, towards)
-    if entry is None:
+    failed_cells = _failed_directions(grid, tracked, failures)
+    entry_path = _path_into_reach(gradient, grid.cell(*centre_of(tracked.footprint)), settings, failed_cells)
+    if entry_path is None:
         return None
-    free = (gradient.blocked[0] == FREE) & ~towards
-    row, column = entry.cells[-1].tolist()
-    lengths = (entry.length + lengths_from(free, (row, column))) * grid.cell_size
+    is_free = (gradient.blocked[0] == FREE) & ~failed_cells
+    row, column = entry_path.cells[-1].tolist()
+    lengths = (entry_path.length + lengths_from(is_free, (row, column))) * grid.cell_size
     layer, *_ = gradient.cell_of(*target.pose)
-    good = good_cells(gradient, settings, candidate.failed, failures)[layer]
+    is_good = good_cells(gradient, settings, candidate.failed, failures)[layer]
     if layer:
-        able = _turnable(gradient, layer, good & free, settings)
-        lengths = np.where(good & ~able, np.inf, lengths)
-    of_good = np.where(good, lengths, np.inf)
-    shortest = float(of_good.min())
+        is_turnable = _turnable(gradient, layer, is_good & is_free, settings)
+        lengths = np.where(is_good & ~is_turnable, np.inf, lengths)
+    good_lengths = np.where(is_good, lengths, np.inf)
+    shortest = float(good_lengths.min())
     if not math.isfinite(shortest):
         return None
-    away = distance_to([(target.x, target.y)], grid)
-    end = np.where(of_good <= shortest * (1.0 + _EQUAL), away, np.inf)
-    row, column = (int(index) for index in np.unravel_index(int(np.argmin(end)), end.shape))
+    target_distance = distance_to([(target.x, target.y)], grid)
+    end_distance = np.where(good_lengths <= shortest * (1.0 + _EQUAL), target_distance, np.inf)
+    row, column = (int(index) for index in np.unravel_index(int(np.argmin(end_distance)), end_distance.shape))
     return Ways(lengths, shortest, grid.centre(row, column))
 
 
 def _without_corners(
-    way: Sequence[tuple[float, float]], gradient: GradientMap, free: Booleans, settings: Settings
+    waypoints: Sequence[tuple[float, float]], gradient: GradientMap, free: Booleans, settings: Settings
 ) -> tuple[tuple[float, float], ...]:
     """Return a path in which straight legs over free and clear cells replace corners.
 
     A pushing robot has to take hold again at each corner.
     """
     grid = gradient.grid
-    least = settings.workspace.clearance + grid.cell_size / math.sqrt(2.0)
-    passable = free & (gradient.clearance[0] > least)
+    least_clearance = settings.workspace.clearance + grid.cell_size / math.sqrt(2.0)
+    passable_cells = free & (gradient.clearance[0] > least_clearance)
 
     def is_passable(leg: Sequence[tuple[float, float]]) -> bool:
         points = points_along(leg, grid.cell_size / _PLACES_IN_CELL)
-        return all(passable[grid.cell(*point)] for point in points)
+        return all(passable_cells[grid.cell(*point)] for point in points)
 
-    straightened, rest = [way[0]], list(way[1:])
-    while rest:
+    corners, remaining_points = [waypoints[0]], list(waypoints[1:])
+    while remaining_points:
         farthest = next(
-            (place for place in range(len(rest) - 1, 0, -1) if is_passable((straightened[-1], rest[place]))),
+            (
+                index
+                for index in range(len(remaining_points) - 1, 0, -1)
+                if is_passable((corners[-1], remaining_points[index]))
+            ),
             0,
         )
-        straightened.append(rest[farthest])
-        rest = rest[farthest + 1 :]
-    return tuple(straightened)
+        corners.append(remaining_points[farthest])
+        remaining_points = remaining_points[farthest + 1 :]
+    return tuple(corners)
 
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
     """Return the goals (rows, columns) in which an object can be turned to the orientation of a layer."""
     # only the box around the goals is measured, instead of the whole grid
-    able = np.zeros(goals.shape, np.bool_)
+    is_turnable = np.zeros(goals.shape, np.bool_)
     if goals.any():
-        low, left = np.argwhere(goals).min(axis=0).tolist()
-        high, right = (np.argwhere(goals).max(axis=0) + 1).tolist()
+        first_row, first_column = np.argwhere(goals).min(axis=0).tolist()
+        end_row, end_column = (np.argwhere(goals).max(axis=0) + 1).tolist()
         grid, size = gradient.grid, gradient.grid.cell_size
-        corner = grid.xmin + left * size, grid.ymin + low * size
-        around, turn = Grid(*corner, size, right - left, high - low), float(gradient.turns[layer])
-        able[low:high, left:right] = can_turn_in(around, gradient, turn, settings)
-    return able & goals
+        corner = grid.xmin + first_column * size, grid.ymin + first_row * size
+        goal_grid, turn = (
+            Grid(*corner, size, end_column - first_column, end_row - first_row),
+            float(gradient.turns[layer]),
+        )
+        is_turnable[first_row:end_row, first_column:end_column] = can_turn_in(
+            goal_grid, gradient, turn, settings
+        )
+    return is_turnable & goals
 
 
 def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settings) -> Booleans:
@@ -298,14 +309,14 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
 
     At several orientations during the turn, no obstacle may touch it and no constraint may hold.
     """
-    count = math.ceil(abs(turn) / _SWEPT)
-    about = gradient.made_of.now.about
-    yaw = about.sample.objects[gradient.name].yaw or 0.0
-    yaws = tuple(yaw + turn * number / count for number in range(1, count))
+    step_count = math.ceil(abs(turn) / _SWEPT)
+    subject = gradient.made_of.now.about
+    yaw = subject.sample.objects[gradient.name].yaw or 0.0
+    yaws = tuple(yaw + turn * number / step_count for number in range(1, step_count))
     if not yaws:
         return np.ones(grid.shape, np.bool_)
     workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
-    maps = proposition_maps(*about, gradient.name, workspace, grid)
+    maps = proposition_maps(*subject, gradient.name, workspace, grid)
     is_kept = danger_of(maps, gradient.made_of.constraints) < -settings.constraint_margin
     return np.asarray(((maps.clearance > workspace.clearance) & is_kept).all(axis=0))
 
@@ -319,14 +330,14 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
     grid, workspace = gradient.grid, settings.workspace
     points = list(points_along(leg, grid.cell_size / _PLACES_IN_CELL))
     # at any point of a cell the clearance is at most half a diagonal less than at the centre
-    least = workspace.clearance + grid.cell_size / math.sqrt(2.0)
-    if all(gradient.clearance[0][grid.cell(*point)] > least for point in points):
+    least_clearance = workspace.clearance + grid.cell_size / math.sqrt(2.0)
+    if all(gradient.clearance[0][grid.cell(*point)] > least_clearance for point in points):
         return True
     # maps of one cell without propositions measure only the clearance
-    about = gradient.made_of.now.about
+    subject = gradient.made_of.now.about
     return all(
         proposition_maps(
-            (), about.regions, about.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
+            (), subject.regions, subject.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
         ).clearance[0, 0, 0]
         > workspace.clearance
         # the first point is where the object is already
@@ -341,102 +352,106 @@ def _spot(x: float, y: float, size: float) -> Grid:
 
 def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
     """Return the cells (rows, columns) near an object that are in about the direction of a failed push."""
-    towards = np.zeros(grid.shape, np.bool_)
+    failed_cells = np.zeros(grid.shape, np.bool_)
     centre, radius = centre_of(tracked.footprint), radius_of(tracked)
     offsets = (grid.centres() - np.array(centre)).reshape(*grid.shape, 2)
-    away = np.hypot(offsets[..., 0], offsets[..., 1])
+    distances = np.hypot(offsets[..., 0], offsets[..., 1])
     for failure in failures:
         angle = _beginning(failure, radius)
-        along = offsets @ np.array([math.cos(angle), math.sin(angle)])
-        towards |= (away > grid.cell_size) & (away <= radius) & (along >= math.cos(_ASIDE) * away)
-    return towards
+        forward_distances = offsets @ np.array([math.cos(angle), math.sin(angle)])
+        failed_cells |= (
+            (distances > grid.cell_size)
+            & (distances <= radius)
+            & (forward_distances >= math.cos(_ASIDE) * distances)
+        )
+    return failed_cells
 
 
 def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject) -> bool:
     """Return whether a push begins in about the direction of a failed push."""
     radius = radius_of(tracked)
-    begins = _beginning(target, radius)
-    turned = (math.remainder(begins - _beginning(failure, radius), math.tau) for failure in failures)
-    return any(abs(angle) < _ASIDE / 2.0 for angle in turned)
+    direction = _beginning(target, radius)
+    angles = (math.remainder(direction - _beginning(failure, radius), math.tau) for failure in failures)
+    return any(abs(angle) < _ASIDE / 2.0 for angle in angles)
 
 
 def _beginning(target: Target, distance: float) -> float:
     """Return the first direction of a path: the angle to its first point at a distance, or to its end."""
-    begin, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
-    x, y = next((point for point in points if math.dist(point, begin) >= distance), target.waypoints[-1])
-    return math.atan2(y - begin[1], x - begin[0])
+    start, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
+    x, y = next((point for point in points if math.dist(point, start) >= distance), target.waypoints[-1])
+    return math.atan2(y - start[1], x - start[0])
 
 
 def _path_into_reach(
-    gradient: GradientMap, cell: tuple[int, int], settings: Settings, towards: Booleans
+    gradient: GradientMap, cell: tuple[int, int], settings: Settings, failed_cells: Booleans
 ) -> Path | None:
     """Return the path to the nearest free cell.
 
     A path may cross cells out of reach only if it starts in one. It may cross constrained cells only if it
     starts in one, but no occupied cells. From an occupied cell it first jumps to the nearest passable cell.
     """
-    free = gradient.blocked[0] == FREE
+    is_free = gradient.blocked[0] == FREE
     is_reached = settings.workspace.within_reach(gradient.grid)[cell]
-    passable = free if is_reached else free | (gradient.blocked[0] == OUT_OF_REACH)
-    if not passable[cell]:
-        empty = gradient.clearance[0] > settings.workspace.clearance
-        passable = passable | (empty & (gradient.blocked[0] == CONSTRAINED))
-    passable = passable & ~towards
-    return shortest_path(passable, cell if passable[cell] else _nearest(passable, cell), free)
+    is_passable = is_free if is_reached else is_free | (gradient.blocked[0] == OUT_OF_REACH)
+    if not is_passable[cell]:
+        is_empty = gradient.clearance[0] > settings.workspace.clearance
+        is_passable = is_passable | (is_empty & (gradient.blocked[0] == CONSTRAINED))
+    is_passable = is_passable & ~failed_cells
+    return shortest_path(is_passable, cell if is_passable[cell] else _nearest(is_passable, cell), is_free)
 
 
 def _nearest(cells: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
     """Return the nearest of `cells` to a cell."""
-    places = np.argwhere(cells)
-    row, column = places[int(np.argmin(((places - np.array(cell)) ** 2).sum(axis=1)))].tolist()
+    indices = np.argwhere(cells)
+    row, column = indices[int(np.argmin(((indices - np.array(cell)) ** 2).sum(axis=1)))].tolist()
     return row, column
 
 
 def _target(
     gradient: GradientMap,
     tracked: TrackedObject,
-    place: tuple[int, int, int],
+    cell: tuple[int, int, int],
     waypoints: tuple[tuple[float, float], ...],
 ) -> Target:
     x, y = waypoints[-1]
-    turn = float(gradient.turns[place[0]])
+    turn = float(gradient.turns[cell[0]])
     yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return Target(gradient.name, x, y, turn, yaw, waypoints, float(gradient.robustness[place]))
+    return Target(gradient.name, x, y, turn, yaw, waypoints, float(gradient.robustness[cell]))
 
 
 def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) -> str:
-    enough = gradient.robustness >= settings.margin
-    if not enough.any():
-        best = float(gradient.robustness.max())
-        if why := _why_too_large(gradient):
-            return why
-        about = gradient.made_of.then.about
-        formulas = [about.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
-        nowhere = f"no place is good enough: {best:.4g} at best, {settings.margin:.4g} needed"
-        return "; ".join([nowhere, *seam_texts(formulas, about.regions)])
-    counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
-    if counts[FREE] and has_failed:
+    is_enough = gradient.robustness >= settings.margin
+    if not is_enough.any():
+        best_robustness = float(gradient.robustness.max())
+        if size_text := _why_too_large(gradient):
+            return size_text
+        subject = gradient.made_of.then.about
+        formulas = [subject.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
+        sentence = f"no place is good enough: {best_robustness:.4g} at best, {settings.margin:.4g} needed"
+        return "; ".join([sentence, *seam_texts(formulas, subject.regions)])
+    counts_by_reason = np.bincount(gradient.blocked[is_enough], minlength=len(REASONS))
+    if counts_by_reason[FREE] and has_failed:
         return "it was tried wherever it would hold"
-    reasons = zip(counts[1:].tolist(), REASONS[1:], strict=True)
-    causes = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
+    count_reasons = zip(counts_by_reason[1:].tolist(), REASONS[1:], strict=True)
+    causes = ", ".join(f"{count} cells: {reason}" for count, reason in count_reasons if count)
     return f"blocked wherever it would hold: {causes}"
 
 
 def _why_too_large(gradient: GradientMap) -> str:
     """Return a sentence on a region or object that is too small for a map's object; "" if there is none."""
-    about = gradient.made_of.then.about
+    subject = gradient.made_of.then.about
     formulas = [
-        about.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
+        subject.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
     ]
     for formula in formulas:
         for atom in iter_formulas(formula):
             if not isinstance(atom, Atom) or atom.relation != "enclosedin":
                 continue
-            inner, outer = (_outlines_of(term, about) for term in atom.terms)
+            inner, outer = (_outlines_of(term, subject) for term in atom.terms)
             if getattr(atom.terms[0], "name", "") != gradient.name or not inner or not outer:
                 continue
-            room = _extent(outer, 0.0)
-            excess = min(float((_extent(inner, turn) - room).max()) for turn in gradient.turns.tolist())
+            outer_size = _extent(outer, 0.0)
+            excess = min(float((_extent(inner, turn) - outer_size).max()) for turn in gradient.turns.tolist())
             if excess > 0.0:
                 return f"{gradient.name} is {excess:.3g} too large for {format_term(atom.terms[1])}"
     return ""
@@ -446,12 +461,12 @@ _Rounded: TypeAlias = tuple[Floats, float]
 """Corners (N, 2) and rounding radius of an outline."""
 
 
-def _outlines_of(term: Term, about: MapSubject) -> list[_Rounded]:
+def _outlines_of(term: Term, subject: MapSubject) -> list[_Rounded]:
     """Return the outlines of an object or region; none for other terms."""
     name = getattr(term, "name", "")
-    if isinstance(term, TrackedName) and name in about.sample.objects:
-        return [(part.vertices, part.radius) for part in about.sample.objects[name].footprint.parts]
-    if base_of(term) is term and (outline := about.regions.get(name)) is not None:
+    if isinstance(term, TrackedName) and name in subject.sample.objects:
+        return [(part.vertices, part.radius) for part in subject.sample.objects[name].footprint.parts]
+    if base_of(term) is term and (outline := subject.regions.get(name)) is not None:
         return [(np.array(outline.vertices), outline.radius)]
     return []
 
@@ -460,10 +475,10 @@ def _extent(outlines: Sequence[_Rounded], turn: float) -> Floats:
     """Return the width along x and y of outlines that are turned by an angle."""
     cosine, sine = math.cos(turn), math.sin(turn)
     rotation = np.array([[cosine, sine], [-sine, cosine]])
-    ends = [(vertices @ rotation, radius) for vertices, radius in outlines]
-    high = np.max([vertices.max(axis=0) + radius for vertices, radius in ends], axis=0)
-    low = np.min([vertices.min(axis=0) - radius for vertices, radius in ends], axis=0)
-    return np.asarray(high - low)
+    turned_outlines = [(vertices @ rotation, radius) for vertices, radius in outlines]
+    highest = np.max([vertices.max(axis=0) + radius for vertices, radius in turned_outlines], axis=0)
+    lowest = np.min([vertices.min(axis=0) - radius for vertices, radius in turned_outlines], axis=0)
+    return np.asarray(highest - lowest)
 
 
 # ----------------------------------------------------------------------------------------------- refinement
@@ -488,52 +503,56 @@ def refine_target(
         failures: targets of failed motions, which are avoided if possible.
     """
     size = settings.workspace.grid.cell_size
-    spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
-    pose, best, least = target.pose, target.robustness, -math.inf
-    apart = _spread(settings)
+    spacing, turn_spacing, halvings = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
+    pose, best_robustness, required_room = target.pose, target.robustness, -math.inf
+    avoided_radius = _spread(settings)
     if is_repeated(target, failures, settings):
         # any other place that is good enough is better
-        best = settings.margin - 2.0 * _BETTER
-    if _is_near(target, failures, apart):
-        apart = _SAME * _cell(settings)
-    for number in range(_MOST_GRIDS):
+        best_robustness = settings.margin - 2.0 * _BETTER
+    if _is_near(target, failures, avoided_radius):
+        avoided_radius = _SAME * _cell(settings)
+    for grid_number in range(_MOST_GRIDS):
         x, y, turn = pose
-        low = x - 2.5 * spacing, y - 2.5 * spacing
-        turns = [0.0] if turning == 0.0 else [-turning, 0.0, turning]
+        corner = x - 2.5 * spacing, y - 2.5 * spacing
+        turn_offsets = [0.0] if turn_spacing == 0.0 else [-turn_spacing, 0.0, turn_spacing]
         yaws = (
-            tuple((tracked.yaw or 0.0) + turn + offset for offset in turns) if settings.workspace.yaws else ()
+            tuple((tracked.yaw or 0.0) + turn + offset for offset in turn_offsets)
+            if settings.workspace.yaws
+            else ()
         )
-        gradient, room = measure(Grid(*low, spacing, 5, 5), yaws)
+        gradient, room = measure(Grid(*corner, spacing, 5, 5), yaws)
         # other places need the preferred room only if the target itself has it
-        if number == 0:
+        if grid_number == 0:
             middle = len(gradient.turns) // 2, 2, 2
-            least = settings.room if room[middle] >= settings.room else -math.inf
-        good = (gradient.blocked == FREE) & (room >= least) & _near(gradient, target, tracked, settings)
-        good &= ~tried_poses(gradient, failures, apart)
-        values = np.where(good, gradient.robustness, -np.inf)
-        place = tuple(map(int, np.unravel_index(int(np.argmax(values)), values.shape)))
-        if values[place] > best + _BETTER:
-            best = float(values[place])
-            pose = (*gradient.grid.centre(*place[1:]), float(gradient.turns[place[0]]))
-        elif halved == _HALVED:
+            required_room = settings.room if room[middle] >= settings.room else -math.inf
+        is_good = (
+            (gradient.blocked == FREE) & (room >= required_room) & _near(gradient, target, tracked, settings)
+        )
+        is_good &= ~tried_poses(gradient, failures, avoided_radius)
+        cell_values = np.where(is_good, gradient.robustness, -np.inf)
+        best_cell = tuple(map(int, np.unravel_index(int(np.argmax(cell_values)), cell_values.shape)))
+        if cell_values[best_cell] > best_robustness + _BETTER:
+            best_robustness = float(cell_values[best_cell])
+            pose = (*gradient.grid.centre(*best_cell[1:]), float(gradient.turns[best_cell[0]]))
+        elif halvings == _HALVED:
             break
         else:
-            spacing, turning, halved = spacing / 2.0, turning / 2.0, halved + 1
+            spacing, turn_spacing, halvings = spacing / 2.0, turn_spacing / 2.0, halvings + 1
     if pose == target.pose:
         return target
     x, y, turn = pose
     yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
+    return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best_robustness)
 
 
 def tried_poses(gradient: GradientMap, failures: Sequence[Target], radius: float) -> Booleans:
     """Return whether each pose of a map is within a radius of a failed target, (A, rows, columns)."""
-    same = np.zeros(gradient.blocked.shape, np.bool_)
+    is_tried = np.zeros(gradient.blocked.shape, np.bool_)
     centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
     for failure in failures:
-        near = np.hypot(centres[..., 0] - failure.x, centres[..., 1] - failure.y) <= radius
-        same |= (np.abs(gradient.turns - failure.turn) <= _SAME_TURN)[:, None, None] & near
-    return same
+        is_near = np.hypot(centres[..., 0] - failure.x, centres[..., 1] - failure.y) <= radius
+        is_tried |= (np.abs(gradient.turns - failure.turn) <= _SAME_TURN)[:, None, None] & is_near
+    return is_tried
 
 
 def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) -> bool:
@@ -562,9 +581,11 @@ def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, setting
     """Return whether each pose is within the permitted distance of a target, (A, rows, columns)."""
     offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
     # with a tolerance, because places of grids are rounded
-    near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
-    turned = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (1.0 + 1e-9)
-    return np.asarray(turned[:, None, None] & near.reshape(gradient.grid.shape))
+    is_near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
+    is_turn_allowed = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (
+        1.0 + 1e-9
+    )
+    return np.asarray(is_turn_allowed[:, None, None] & is_near.reshape(gradient.grid.shape))
 
 
 def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> float:
@@ -583,14 +604,14 @@ def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
 
     The dual problem is solved by accelerated projected gradients.
     """
-    gram, missing = normals @ normals.T, least - normals @ point
+    gram, shortfall = normals @ normals.T, least - normals @ point
     # the largest eigenvalue bounds the curvature, so its inverse is a safe step
     rate = 1.0 / max(float(np.linalg.norm(gram, 2)), 1e-12)
-    weights = ahead = np.zeros(len(least))
+    weights = lookahead = np.zeros(len(least))
     for number in range(400):
         # Nesterov's momentum, in its common form k / (k + 3)
-        newest = np.maximum(ahead + rate * (missing - gram @ ahead), 0.0)
-        weights, ahead = newest, newest + number / (number + 3.0) * (newest - weights)
+        new_weights = np.maximum(lookahead + rate * (shortfall - gram @ lookahead), 0.0)
+        weights, lookahead = new_weights, new_weights + number / (number + 3.0) * (new_weights - weights)
     return np.asarray(point + normals.T @ weights)
 
 
@@ -606,10 +627,10 @@ def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomC
     gradient = candidate.map
     if settings.skill != "place" or settings.room <= 0.0:
         return None
-    good = (gradient.blocked == FREE) & ~avoided_cells(gradient, settings, candidate.failed)
+    is_good = (gradient.blocked == FREE) & ~avoided_cells(gradient, settings, candidate.failed)
     room = gradient.made_of.now.room(candidate.room_from)
-    tight = good & (room < settings.room) & (gradient.robustness > target.robustness)
-    if not tight.any():
+    is_tight = is_good & (room < settings.room) & (gradient.robustness > target.robustness)
+    if not is_tight.any():
         return None
-    place = np.unravel_index(int(np.argmax(np.where(tight, gradient.robustness, -np.inf))), tight.shape)
-    return RoomCost(float(gradient.robustness[place]), float(room[place]))
+    cell = np.unravel_index(int(np.argmax(np.where(is_tight, gradient.robustness, -np.inf))), is_tight.shape)
+    return RoomCost(float(gradient.robustness[cell]), float(room[cell]))
