@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """The kind of a step: move an object, hold because the specification is satisfied, wait, or stop because no
-path to acceptance is left. A wait is for an observation, for time to pass, or for moving objects."""
+path to acceptance is left. A step waits for an observation, for time to pass, or for moving objects."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
 """Stages of a motion: picking the object, moving it, placing it at the target."""
@@ -33,7 +33,7 @@ class Reason:
     """The reason why an edge was pruned.
 
     Attributes:
-        kind: text that is the same for all edges with the same cause.
+        kind: text that all edges with an equal cause share.
         detail: text that differs between edges, such as the cause for each object; may be empty.
     """
 
@@ -79,8 +79,9 @@ class Target:
         name: name of the object.
         x, y: centre of the object at the target, footprint units.
         turn: angle by which the object is turned, radians.
-        yaw: orientation of the object at the target, radians; None if it has none.
-        waypoints: points (x, y) of the path with both ends; only the ends if the robot may choose the path.
+        yaw: orientation of the object at the target, radians; None for an object without orientation.
+        waypoints: points (x, y) of the path, including its start and end. Only these two are given if the
+            robot may choose the path.
         robustness: robustness of the progress set with the object at the target.
     """
 
@@ -94,7 +95,7 @@ class Target:
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """x, y and turn."""
+        """The pose (x, y, turn)."""
         return self.x, self.y, self.turn
 
     @property
@@ -118,13 +119,14 @@ class Candidate:
     Attributes:
         name: name of the object.
         map: robustness of the progress set over the positions of the object.
-        target: target of the object; None if it was rejected.
-        rejected: reason of the rejection; empty if it was not rejected.
-        is_chosen: whether this is the object to move.
+        target: target of the object; None for a rejected object.
+        rejected: reason of the rejection; empty if the object was not rejected.
+        is_chosen: whether the planner moves this object.
         failed: places (x, y) of earlier failed motions, which a target avoids.
         room_from: names of the objects from which the target keeps room; None for all objects.
         failures: targets of failed motions in the current scene.
-        rule: rule by which the target was chosen together with other motions; empty if it was chosen alone.
+        rule: rule by which the target was chosen together with other motions; empty for a target that was
+            chosen alone.
     """
 
     name: str
@@ -143,18 +145,18 @@ class Consideration:
     """An edge that a planner considered.
 
     Attributes:
-        path: states from the current state to an accepting state; the edge is its first transition.
+        path: states from the current state to an accepting state; the edge is the path's first transition.
         edge: source and target state.
-        progress: guard of the edge, which has to hold to take it.
-        constraints: guards of other edges, which must not hold on the way.
-        candidates: considered objects in the order of the settings' `movable` or, without it, by name.
-        pruned: reason why the edge was pruned; None if it was not pruned.
-        motions: planned motions to acceptance, beginning with the chosen candidate's; empty if the planner
-            does not look ahead.
+        progress: guard of the edge, which must hold to take the edge.
+        constraints: guards of other edges, which must not hold before the edge is taken.
+        candidates: considered objects in the order of the settings' `movable`; by name without `movable`.
+        pruned: reason why the edge was pruned; None for an edge that was not pruned.
+        motions: planned motions to acceptance, beginning with the chosen candidate's motion. Empty if the
+            planner does not look ahead.
         is_joint: whether several objects are moved for the edge. The chosen candidate's map then has the
             other objects at the ends of their motions.
         failed: number of failed motions for the edge that count as attempts.
-        order: reason why the edge precedes edges of equally short paths; empty if there are none.
+        order: reason why the edge precedes edges of equally short paths; empty without such edges.
     """
 
     path: tuple[int, ...]
@@ -175,7 +177,7 @@ class Search(NamedTuple):
     Attributes:
         maps: number of computed maps; the evaluation of one sample counts as a quarter of a map.
         arrangements: number of arrangements of several objects for which an order of motions was searched.
-        parking_places: number of parking places tried for objects in the way of others.
+        parking_places: number of parking places tried for objects that are in the way of other objects.
     """
 
     maps: float = 0.0
@@ -188,8 +190,8 @@ class Loss:
     """The loss of acceptance.
 
     Attributes:
-        time_ns: time of the sample from which on the specification cannot be satisfied any more.
-        text: forbidden condition that held in this sample; empty if unknown propositions leave it open.
+        time_ns: time of the first sample from which the specification cannot be satisfied.
+        text: forbidden condition that held in this sample; empty if unknown propositions hide the condition.
     """
 
     time_ns: int
@@ -205,11 +207,11 @@ class Step(Displayed):
         time_ns: time of the newest sample.
         kind: kind of the step.
         states: possible states of the automaton; more than one if propositions are unknown.
-        considered: considered edges, in order; the last one is the aim unless it was pruned.
+        considered: considered edges, in order; the last edge is the aim if it was not pruned.
         target: object to move and its target pose; None without a motion.
         pruned: all pruned edges with their reasons.
         reason: sentence on the decision.
-        ahead: states that a wait expects from time alone; empty if it waits for something else.
+        ahead: states that a wait expects from time alone; empty for any other wait.
         lost: time and cause of the loss of acceptance; None while the specification can be satisfied.
         search: search effort.
     """
@@ -228,14 +230,14 @@ class Step(Displayed):
 
     @property
     def aim(self) -> Consideration | None:
-        """The edge that the step works towards; None without one."""
+        """The edge that the step works towards; None if there is no such edge."""
         return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
 
     def alternatives(self, count: int) -> tuple[Target, ...]:
         """Return the best other places, the most robust first.
 
-        They are centres of free cells for any candidate of the aim, at least two cells from the target and
-        from each other. Paths to them and later motions are not checked.
+        These places are centres of free cells for any candidate of the aim. They are at least two cells from
+        the target and from each other. The paths to these places, and later motions, are not checked.
         """
         targets = []
         for candidate in self.candidates:
@@ -259,7 +261,7 @@ class Step(Displayed):
 
     @property
     def progress(self) -> Guards:
-        """Progress set: guards of which one must hold next; empty without an aim."""
+        """Progress set: guards, one of which must hold next; empty without an aim."""
         return self.aim.progress if self.aim is not None else Guards((), ())
 
     @property
@@ -280,7 +282,7 @@ class Outcome:
     Attributes:
         succeeded: whether the object is at its target, according to the controller.
         reason: sentence on the result.
-        at: stage at which the motion failed; None if it is unknown.
+        at: stage at which the motion failed; None for an unknown stage.
     """
 
     succeeded: bool
@@ -298,9 +300,9 @@ class Outcome:
 
 
 def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
-    """Return the outcome of a wait that ended with the automaton in these states."""
+    """Return the outcome of a wait that ended with the automaton in `states`."""
     if not step.ahead:
-        # only a wait for moving objects has an aim
+        # of these waits, only a wait for moving objects has an aim
         reason = "enough is seen" if step.aim is None else "nothing is in the way any more"
         return Outcome(succeeded=True, reason=reason)
     if states == step.ahead[-1:]:
@@ -322,7 +324,7 @@ class Executor(Protocol):
     def execute(self, step: Step) -> Outcome:
         """Move `step.target.name` to its target, along the waypoints if the path matters to the robot.
 
-        Return when the robot is at rest. The planner must observe samples during the motion or after it. If
-        the planner's `stop_reason` is not empty after a sample, stop the motion and return a failure with
-        this reason.
+        Return when the robot is at rest. The planner must observe samples during or after the motion. If the
+        planner's `stop_reason` is not empty after a sample, stop the motion and return a failure with this
+        reason.
         """

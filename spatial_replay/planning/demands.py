@@ -1,4 +1,4 @@
-"""Sentences on the demands of an edge: its goal, and the conditions to keep or to avoid on the way.
+"""Sentences on the demands of an edge: a goal, and the conditions to keep or to avoid on the way.
 
 A guard is a text of literals joined by "and"; a negative literal is "not …". In sentences, formulas are
 between backquotes.
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 _MOST_PROPOSITIONS: Final = 12
-"""Maximum number of propositions of simplified guards, because each one doubles the truth table."""
+"""Maximum number of propositions of simplified guards; each proposition doubles the truth table."""
 _LONGEST: Final = 100
 """Maximum length of a formula, characters."""
 _MOST_RULES: Final = 4
@@ -48,7 +48,7 @@ def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, .
     """Return the shortest bans that together forbid exactly the guards, in the order of the guards.
 
     Args:
-        given_up: guards of pruned edges; bans may also forbid these, if that makes them shorter.
+        given_up: guards of pruned edges; bans may also forbid these guards, if the bans become shorter.
     """
     return tuple(
         Ban(
@@ -62,7 +62,7 @@ def bans_of(guards: Sequence[str], given_up: Sequence[str] = ()) -> tuple[Ban, .
 
 
 def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
-    """Return the first ban that forbids a guard; without one, the guard itself as a ban."""
+    """Return the first ban that forbids a guard; without such a ban, the guard itself as a ban."""
     literals = _literals_of(guard).items()
     for ban in bans:
         if {(text, True) for text in ban.holding} | {(text, False) for text in ban.failing} <= literals:
@@ -71,7 +71,7 @@ def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
 
 
 def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
-    """Return the rules for the way, with all bans of a single literal in one or two rules."""
+    """Return the rules for the way; all bans of a single literal make up one or two rules."""
     required = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
     avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
     other_rules = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
@@ -88,8 +88,8 @@ def demand_of(literal: str, bans: Iterable[Ban], *, is_required: bool = True) ->
     """Return a literal of a goal as a demand: a relation to reach, to keep or to avoid.
 
     Args:
-        bans: bans on the way; a relation that they require is one to keep.
-        is_required: whether the literal must hold; otherwise it is one of several alternatives.
+        bans: bans on the way; the relations that bans require are relations to keep.
+        is_required: whether the literal must hold; otherwise the literal is one of several alternatives.
     """
     if not is_required:
         return f"one of several: {demand_of(literal, bans)}"
@@ -114,7 +114,7 @@ def wanted_of(guards: Sequence[str], bans: Sequence[Ban]) -> tuple[str, ...]:
 
 
 def _literals_of(guard: str) -> dict[str, bool]:
-    """Return the propositions of a guard, and whether each must hold; none for the guard "true"."""
+    """Return whether each proposition of a guard must hold; empty for the guard "true"."""
     literals = {}
     for literal in _operands_of_and(guard):
         text = literal.removeprefix("not ")
@@ -133,13 +133,13 @@ def _operands_of_and(text: str) -> list[str]:
 
 
 def _without_brackets(text: str) -> str:
-    """Return a text without its outer brackets, if one pair encloses all of it."""
+    """Remove the outer brackets of a text, if one pair encloses the whole text."""
     is_bracketed = text.startswith("(") and text.endswith(")") and min(_depths(text)[:-1]) > 0
     return text[1:-1] if is_bracketed else text
 
 
 def _depths(text: str) -> list[int]:
-    """Return the number of open brackets and quotes after each letter; brackets in quotes do not count."""
+    """Return the number of open brackets and quotes after each letter; brackets in quotes are ignored."""
     letters = _QUOTED.sub(lambda name: f"({' ' * (len(name[0]) - 2)})", text)
     return list(accumulate({"(": 1, ")": -1}.get(letter, 0) for letter in letters))
 
@@ -150,7 +150,7 @@ def _simplify(
     """Return distinct cubes without literals that do not affect the union of all cubes.
 
     Args:
-        ignored: cubes that may belong to the union or not.
+        ignored: cubes that the union may include, but need not.
     """
     names = tuple(dict.fromkeys(name for cube in (*cubes, *ignored) for name in cube))
     simplified = [dict(cube) for cube in cubes]
@@ -171,13 +171,13 @@ def _part_of_table(cube: Mapping[str, bool], names: Sequence[str]) -> tuple[int 
 
 
 def _listing(texts: Sequence[str], conjunction: str) -> str:
-    """Return formulas between backquotes; a conjunction joins the last two."""
+    """Return formulas between backquotes; a conjunction joins the last two formulas."""
     *leading, last = [f"`{_shorten(text)}`" for text in texts] or ["anything"]
     return f"{', '.join(leading)} {conjunction} {last}" if leading else last
 
 
 def _shorten(text: str) -> str:
-    """Return a formula; a long one is shortened to the first operand of its "and"."""
+    """Return a formula; a long formula is shortened to the first operand of its "and"."""
     first_operand, *other_operands = _operands_of_and(text)
     return (
         f"{first_operand} and {len(other_operands)} more" if other_operands and len(text) > _LONGEST else text

@@ -61,7 +61,7 @@ Pose: TypeAlias = tuple[float, float, float]
 _Value = TypeVar("_Value", float, Floats)
 
 MOST_ALTERNATIVES: Final = 32
-"""Maximum number of conjunctions of a formula; further ones are not tried."""
+"""Maximum number of conjunctions of a formula; further conjunctions are not tried."""
 
 
 class Demand(NamedTuple):
@@ -73,7 +73,7 @@ class Demand(NamedTuple):
 
 
 def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bool], ...]]:
-    """Return alternatives that imply a formula, or its negation if not `wanted`, as conjunctions of atoms."""
+    """Return conjunctions of atoms; each implies a formula if `wanted`, else the formula's negation."""
     formula = expand(formula)
     match formula:
         case Truth():
@@ -92,7 +92,7 @@ def alternatives(formula: Formula, wanted: bool) -> list[tuple[tuple[Formula, bo
 
 
 def demands_of(cube: Cube, formulas: Sequence[Formula], least: float) -> list[tuple[Demand, ...]]:
-    """Return alternatives that imply a cube of propositions, as conjunctions of demands."""
+    """Return conjunctions of demands, each of which implies a cube of propositions."""
     options_by_literal = [alternatives(formulas[number], value) for number, value in cube]
     return [
         tuple(Demand(*literal, least) for literal in conjunction)
@@ -119,13 +119,13 @@ def _conjoin(
 def values_in(
     sample: Sample, formulas: Sequence[Formula], regions: Mapping[str, Outline]
 ) -> tuple[list[float], list[float]]:
-    """Return lower and upper bounds of the robustness of formulas in a sample; infinite if it is unknown."""
+    """Return lower and upper bounds of the robustness of formulas in a sample; infinite if unknown."""
     leaves = leaf_values(TraceScene(Trace.from_samples([sample]), regions), formulas, {})
     return leaves[0][:, 0].tolist(), leaves[min(1, len(leaves) - 1)][:, 0].tolist()
 
 
 def surplus(lower: _Value, upper: _Value, demand: Demand) -> _Value:
-    """Return the robustness of a demand minus its margin; negative if the demand is not met, or unknown."""
+    """Return the robustness of a demand minus its margin; negative for an unmet or unknown demand."""
     return (lower if demand.wanted else -upper) - demand.least
 
 
@@ -135,7 +135,7 @@ class Budget:
     Attributes:
         left: number of maps left.
         arrangements: number of arrangements of several objects for which an order of motions was searched.
-        parking_places: number of parking places tried for objects in the way of others.
+        parking_places: number of parking places tried for objects that are in the way of other objects.
     """
 
     def __init__(self, maps: float) -> None:
@@ -148,7 +148,7 @@ class Budget:
         return Search(self._initial_maps - self.left, self.arrangements, self.parking_places)
 
     def spend(self, maps: float = 1.0) -> bool:
-        """Subtract maps from the budget; return False if it is exceeded."""
+        """Subtract maps from the budget; return False if the budget is exceeded."""
         self.left -= maps
         return self.left >= 0.0
 
@@ -180,21 +180,21 @@ _TURNED: Final = math.radians(10.0)
 BESIDE: Final = 1.5
 """Distance up to which a neighbour may block the push of an object, in radii of the object."""
 _LISTED: Final = 4
-"""Maximum number of edges that a reason names; it counts the others."""
+"""Maximum number of edges that a reason names; further edges are only counted."""
 _TRIED: Final = "tried "
 """First word of each kind of reason that counts motions."""
 LATER: Final = "what has to come after it cannot be done"
-"""Kind of reason of an edge that could be taken now, but from which acceptance cannot be reached."""
+"""Kind of the reason for an edge that can be taken now, but does not lead to acceptance."""
 
 
 class Observer:
     """Values of propositions, sample by sample: true if the robustness is at least 0.
 
-    Uncertainty is ignored, as in a `value`, because a robot acts on the most likely state.
+    Uncertainty is ignored, as in the `value` of a result, because a robot acts on the most likely state.
     """
 
     def __init__(self, formulas: Sequence[Formula], regions: Mapping[str, Outline]) -> None:
-        # a leaf may be any formula without temporal operators, so also a proposition that is no atom
+        # a leaf may be any formula without temporal operators, so every proposition is a leaf
         leaves: list[Any] = list(formulas)
         self._leaves = SampleLeaves([leaves], regions)
 
@@ -212,7 +212,7 @@ def unknown_reasons(
     """Return the reasons why propositions are unknown in a sample, without duplicates.
 
     Args:
-        seen: newest time of each object in this sample or earlier ones, ns.
+        seen: newest time of each object in this sample or in earlier samples, ns.
     """
     scene = TraceScene(Trace.from_samples([sample]), regions)
     reasons: dict[str, None] = {}
@@ -230,7 +230,7 @@ def unknown_reasons(
 
 
 def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
-    """Return the open groups without enough members in a proposition; none if any part has members."""
+    """Return the open groups of a proposition that lack members; none if any part has enough members."""
     empty_groups: list[Group] = []
     for leaf in _leaves_of([formula]):
         least_members = 1
@@ -289,7 +289,7 @@ def refuse_template(specification: Specification, name: str) -> None:
 
 
 def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
-    """Return, for each proposition, the names of the innermost specs in a formula that contain it."""
+    """Return the names of the innermost specs that contain each proposition, in a formula."""
     formulas_by_spec = {
         spec.name: list(iter_formulas(spec))[1:] for spec in list(iter_formulas(formula))[1:] if spec.name
     }
@@ -318,7 +318,7 @@ class IdleTransitions(NamedTuple):
         return frozenset(pairwise(self.states))
 
     def along(self, path: Sequence[Transition]) -> tuple[int, ...]:
-        """Return the states along a path that time alone reaches; none if its first edge needs a motion."""
+        """Return the states along a path that time alone reaches; none if the first edge needs a motion."""
         steps = zip(path, self.states[1:], strict=False)
         return tuple(state for _, state in takewhile(lambda step: step[0].target == step[1], steps))
 
@@ -341,8 +341,8 @@ def consideration_of(
 
     Args:
         pruned: edges that are left out of the constraint set.
-        symbol: values of the propositions in the newest sample. The edge that these values take is also left
-            out of the constraint set, unless it loses acceptance.
+        symbol: values of the propositions in the newest sample. The constraint set also omits the edge that
+            these values take, if this edge does not lose acceptance.
     """
     states, edge = (
         (path[0].source, *(transition.target for transition in path)),
@@ -353,7 +353,9 @@ def consideration_of(
 
 
 def order_text(automaton: Automaton, path: Sequence[Transition], without: Collection[Edge]) -> str:
-    """Return the reason why a path's first edge precedes an edge of an equally short path; "" without one.
+    """Return the reason why a path's first edge precedes the edge of an equally short path.
+
+    The result is "" if no other path is equally short.
 
     Args:
         without: pruned edges, and edges that time alone takes.
@@ -374,8 +376,8 @@ def equivalent_edges(
 ) -> Iterator[Edge]:
     """Iterate over edges from idle states with an equal progress set and at least the same constraints.
 
-    A deadline unrolls one edge into a copy for each remaining sample. If one copy is impossible now, the
-    later copies are impossible too, and the planner skips them.
+    A deadline unrolls one edge into a copy for each remaining sample. If a copy is impossible now, the later
+    copies are also impossible, and the planner skips them.
     """
     constraint_cubes = set(consideration.constraints.cubes)
     for edge in ((source, target) for source in idle.states[1:] for target in automaton.successors[source]):
@@ -392,7 +394,7 @@ def _other_edges(
     """Iterate over the transitions that must not be taken before an edge.
 
     Raises:
-        NoAutomatonError: a guard is cut, so its missing cubes would not be avoided.
+        NoAutomatonError: a guard is cut; a motion could not avoid the missing cubes.
     """
     source = edge[0]
     allowed_targets = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
@@ -408,7 +410,7 @@ def _other_edges(
 
 
 def guards_of(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
-    """Return the guards of transitions together."""
+    """Return the guards of all transitions as one set."""
     cubes = tuple(cube for transition in transitions for cube in transition.guard)
     texts = tuple(
         " and ".join(automaton.propositions[number].literal(value) for number, value in cube) or "true"
@@ -418,11 +420,11 @@ def guards_of(automaton: Automaton, transitions: Iterable[Transition]) -> Guards
 
 
 def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, symbol: Symbol) -> str:
-    """Return the condition in a sample that loses acceptance; empty if unknown propositions leave it open.
+    """Return the condition that loses acceptance in a sample; empty if unknown propositions hide it.
 
     Args:
         states: states of the automaton before the sample.
-        before: values of the propositions in the previous sample; () without one.
+        before: values of the propositions in the previous sample; () without a previous sample.
         symbol: values of the propositions in this sample.
     """
     cubes = [
@@ -434,7 +436,7 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
         if all(symbol[number] is value for number, value in cube)
     ]
     cube = min(cubes, key=len, default=())
-    # a condition that has just become true explains more than a condition that held before
+    # a newly true condition explains more than a condition that held before
     changed_literals = [
         literal for literal in cube if before and before[literal[0]] is not symbol[literal[0]]
     ]
@@ -446,7 +448,7 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
 def moved_later(
     path: Sequence[Transition], symbol: Symbol, formulas: Sequence[Formula], names: Iterable[str]
 ) -> frozenset[str]:
-    """Return the objects that may have to be moved for the later edges of a path."""
+    """Return the objects that may need a motion for the later edges of a path."""
     literals = (literal for transition in path[1:] for cube in transition.guard for literal in cube)
     unmet = {number for number, value in literals if symbol[number] is not value}
     return frozenset(name for name in names if any(concerns(formulas[number], name) for number in unmet))
@@ -456,15 +458,15 @@ def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
     """Return the state farthest from acceptance; None if no state can reach acceptance."""
     paths = {state: next(automaton.paths(state), None) for state in states}
     distances = {state: len(path) for state, path in paths.items() if path is not None}
-    # among states of equal distance, the one with the lowest number
+    # among states of equal distance, the state with the lowest number
     return max(distances, key=lambda state: (distances[state], -state), default=None)
 
 
 def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason], why: str = "") -> str:
-    """Return the sentence that every path from a state was pruned, with the edges of each kind of reason.
+    """Return the sentence that every path from a state was pruned, with the pruned edges by kind of reason.
 
     Args:
-        why: infeasible part of the task; if empty, the detail of a reason `LATER`.
+        why: infeasible part of the task; if empty, the detail of a `LATER` reason replaces it.
     """
     pending_states, reachable_states = [state], {state}
     while pending_states:
@@ -503,7 +505,7 @@ class FailedMotion(NamedTuple):
         before: newest sample at the beginning of the motion.
         stayed: whether the object did not move.
         refused: whether no sample came during the motion.
-        at: stage at which the motion failed; None if it is unknown.
+        at: stage at which the motion failed; None for an unknown stage.
     """
 
     target: Target
@@ -519,8 +521,8 @@ class Attempts:
     Failures count separately for each edge and object, so that a robot that often fails can continue.
 
     Attributes:
-        motions: number of concluded motions, without refused ones.
-        planned: motions that were planned after the last motion; empty if that motion failed.
+        motions: number of concluded motions, without refused motions.
+        planned: motions that were planned after the last motion; empty if the last motion failed.
     """
 
     def __init__(self) -> None:
@@ -540,8 +542,8 @@ class Attempts:
         return bool(self._motion_counts)
 
     def forgiven(self) -> Attempts:
-        """Return these attempts with only refused motions as failures, so that other motions are repeated."""
-        # a shallow copy: both share the counts of motions
+        """Return a copy in which only refused motions count as failures; other motions may be repeated."""
+        # a shallow copy shares the counts of motions
         attempts = copy(self)
         attempts._failed_motions, attempts._failed_places = (
             [motion for motion in self._failed_motions if motion.refused],
@@ -550,7 +552,7 @@ class Attempts:
         return attempts
 
     def why_not_again(self, edge: Edge, most_failed: int) -> Reason | None:
-        """Return the reason why an edge is not tried again; None if it may be tried."""
+        """Return the reason why an edge is not tried again; None if the edge may be tried."""
         if (failure_count := self.failures(edge)) >= most_failed:
             return Reason(_count_text(failure_count), self._last_failures.get(edge, ""))
         # a successful motion resets the failures, so without this limit `G F …` could continue forever
@@ -561,11 +563,11 @@ class Attempts:
         )
 
     def failures(self, edge: Edge) -> int:
-        """Return the number of failed motions for an edge of the object with the most failures."""
+        """Return the greatest number of failed motions that one object has for an edge."""
         return max(self._failure_counts.get(edge, Counter()).values(), default=0)
 
     def begin(self, edge: Edge, name: str, sample: Sample, settings: Settings) -> None:
-        """Count a motion of an object for an edge; it counts as failed until it is concluded."""
+        """Count a motion of an object for an edge; until `conclude`, the motion counts as failed."""
         self._failure_counts.setdefault(edge, Counter())[name] += 1
         self._motion_counts[edge] += 1
         self._begin = sample, settings
@@ -585,7 +587,7 @@ class Attempts:
         Args:
             states: states of the automaton after the motion.
             sample: newest sample after the motion.
-            is_stopped: whether the planner stopped the motion; the object then counts as moved.
+            is_stopped: whether the planner stopped the motion. If so, the object counts as moved.
         """
         before, settings = self._begin
         is_refused = before is sample and not outcome.succeeded
@@ -608,15 +610,15 @@ class Attempts:
                 f"moved, but then not at its target: {target.name} at {place_text}"
             )
         elif aim.is_joint and len(aim.motions) < self._least_left.get(aim.edge, MOST_MOTIONS):
-            # one of several motions succeeded, and fewer motions are left than ever before
+            # one of several motions succeeded, and the number of remaining motions is the least so far
             self._least_left[aim.edge] = len(aim.motions)
             self._failure_counts[aim.edge].clear()
         elif aim.is_joint:
-            # a successful detour after a failure; `MOST_MOTIONS` still bounds all motions for the edge
+            # a successful detour after a failure; `MOST_MOTIONS` bounds all motions for the edge
             del self._failure_counts[aim.edge][target.name]
 
     def withdraw(self, edge: Edge, name: str) -> None:
-        """Do not count the newest motion of an object for an edge as an attempt."""
+        """Subtract the newest motion of an object for an edge from the counts."""
         self._failure_counts[edge][name] -= 1
         self._motion_counts[edge] -= 1
 
@@ -625,7 +627,7 @@ class Attempts:
         return self._failed_places.get(name, ())
 
     def needs_room(self, name: str) -> bool:
-        """Return whether an object could not be moved to a place, perhaps for lack of room at the place."""
+        """Return whether lack of room may be the reason why an object could not be moved to a place."""
         return any(
             motion.target.name == name and motion.stayed and motion.at in (None, "place")
             for motion in self._failed_motions
@@ -640,7 +642,7 @@ class Attempts:
     def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
         """Return the targets of failed motions of an object in the scene of a sample.
 
-        For a push that did not move its object, the scene is only the object and its neighbours.
+        After a push that did not move its object, only the object and its neighbours make up the scene.
         """
         return tuple(motion.target for motion in self._here(name, sample, settings))
 
@@ -652,7 +654,7 @@ class Attempts:
 
 
 def _is_at(target: Target, sample: Sample, settings: Settings) -> bool:
-    """Return whether an object is at its target; True for an object that is not in the sample."""
+    """Return whether an object is at its target; True for an object that is missing in the sample."""
     tracked = sample.objects.get(target.name)
     tolerance = settings.workspace.grid.cell_size + (0.0 if tracked is None else tracked.uncertainty)
     return tracked is None or math.dist(centre_of(tracked.footprint), (target.x, target.y)) <= tolerance
@@ -663,7 +665,7 @@ def _count_text(count: int) -> str:
 
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
-    """Return whether all objects stand as before a failed motion; for a push, only nearby objects count."""
+    """Return whether no object has moved since a failed motion; for a push, only near objects count."""
     moved_name, before = motion.target.name, motion.before
     tracked = before.objects[moved_name]
     names = list(dict.fromkeys([moved_name, *before.objects, *sample.objects]))
@@ -681,7 +683,7 @@ def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> 
 
 
 def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
-    """Return the approximate distance between two objects; infinite if the other is missing."""
+    """Return the approximate distance between two objects; infinite if the other object is missing."""
     if other is None:
         return math.inf
     centre_distance = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
@@ -689,7 +691,7 @@ def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
 
 
 def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
-    """Return whether an object has not moved since an earlier sample; True if it is in neither sample."""
+    """Return whether an object has not moved since an earlier sample; True for a missing object."""
     earlier, newest = before.objects.get(name), sample.objects.get(name)
     if earlier is None or newest is None:
         return earlier is newest

@@ -1,12 +1,12 @@
 """Lookahead: a search for motions from a sample to acceptance, over predicted samples.
 
-A predicted motion brings its object to the target at once. Objects are moved one at a time if possible. They
-are arranged together if not, or if an object would have to be moved twice.
+A predicted motion brings its object to the target at once. Objects are moved one at a time if possible.
+Otherwise, or if an object would have to be moved twice, they are arranged together.
 
 An arrangement assigns cells to several objects: a constraint satisfaction problem over the cells of a grid.
-The demands on one object are a map. The demands on two objects depend only on the vector between them, and
-are a stencil. The object with the fewest cells left comes first. Its cells are ordered by their robustness,
-and by the number of cells that they leave to the other objects.
+The demands on one object are a map. The demands on two objects depend only on the vector between the
+objects, and are a stencil. The object with the fewest remaining cells comes first. Its cells are ordered by
+robustness, and by the number of cells that each cell leaves to the other objects.
 """
 
 from __future__ import annotations
@@ -89,25 +89,25 @@ Two objects on 300 x 300 cells need this number, if they are not turned. Without
 fail.
 """
 _MISS: Final = 0.5
-"""Cost of a placement that does not meet all demands, maps; it checks all cells of the remaining objects."""
+"""Cost, in maps, of a placement that does not meet all demands; it checks all cells of the other objects."""
 _MOST_NAMED: Final = 3
 """Maximum number of objects that a sentence names."""
 _ENOUGH: Final = 0.5
-"""Share of its cells that each other object must keep after a choice by robustness."""
+"""Least share of cells that a cell chosen by robustness must leave to each other object."""
 _STRICTLY: Final = 1e-12
 """Least margin of a constraint, because a constraint holds at robustness 0."""
 _MOST_BETWEEN: Final = 3
 """Maximum number of sets, and of arrangements of each set, to try for places between cells."""
 _MOST_STEPS: Final = 12
-"""Maximum number of steps that move objects from cells to places between them."""
+"""Maximum number of steps that move objects from cells to places between cells."""
 _MOST_STALLED: Final = 2
-"""Maximum number of such steps without a gain."""
+"""Maximum number of steps between cells without a gain."""
 _STEP: Final = 0.5
-"""Cost of such a step, maps."""
+"""Cost of a step between cells, maps."""
 _TOWARDS: Final = (1.0 / 16.0, 1e-6)
-"""Margins of demands at places between cells, as shares of a cell; the second is tried if the first fails."""
+"""Margins of demands at places between cells, as shares of a cell, in the order in which they are tried."""
 _NUDGES: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-"""Displacements (x, y) that measure slopes, in small steps; the first is the object's own place."""
+"""Displacements (x, y) that measure slopes, in small steps; the first displacement is zero."""
 _OLDEST_CUTS: Final = 4
 """Number of previous steps whose linearized demands are kept."""
 
@@ -121,10 +121,10 @@ class _Field:
 
     Attributes:
         turns: (A,), angles by which the object is turned, radians.
-        clearance: (A, rows, columns), distance to immovable objects minus the required clearance; -inf out of
-            reach.
-        obstacle_distances: distance to each immovable object; "" is for the workspace's obstacles.
-        gaps: distance to each other movable object minus the required clearance.
+        clearance: (A, rows, columns), distance to immovable objects minus the required clearance; -inf for
+            cells out of reach.
+        obstacle_distances: distance to each immovable object by name; "" is for the workspace's obstacles.
+        gaps: distance to each other movable object by name, minus the required clearance.
         surplus: surplus of each demand on the object.
     """
 
@@ -136,7 +136,7 @@ class _Field:
 
 
 class Arranger:
-    """Search for arrangements of movable objects in one sample that meet demands."""
+    """Search for arrangements of movable objects that meet demands, in one sample."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class Arranger:
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
         self._visit_count = 0
-        # allowed shortfall of a demand at a cell's centre, because another place in the cell may meet it
+        # allowed shortfall of a demand at a cell's centre; another place in the cell may meet the demand
         self._slack = 0.0
         self._is_placed = settings.refine and settings.skill == "place"
 
@@ -168,12 +168,11 @@ class Arranger:
         return tuple(demand for demand, value in demand_surpluses if value < 0.0)
 
     def _surplus_in(self, sample: Sample) -> list[float]:
-        """Return the surplus of each demand in a sample."""
         values = values_in(sample, [demand.formula for demand in self._demands], self._regions)
         return list(map(surplus, *values, self._demands))
 
     def why_hopeless(self) -> str:
-        """Return why no arrangement can meet the demands; "" if no single object proves that."""
+        """Return the reason why no arrangement can meet the demands; "" if no single object proves this."""
         for demand in self._unmet_demands:
             if not self._names_by_demand[demand]:
                 return "no object that can be moved matters to it"
@@ -204,7 +203,7 @@ class Arranger:
         return self._grid.cell_size / math.sqrt(2.0)
 
     def what_stands(self) -> str:
-        """Return a sentence on immovable objects at places where movable ones could go; "" without any."""
+        """Return a sentence on immovable objects at possible places of movable objects, or ""."""
         object_names: dict[str, None] = {}
         for name, field in self._fields.items():
             cells = self._meeting_cells(field, name, tuple(self._movable))
@@ -213,7 +212,7 @@ class Arranger:
         return f"{_standing_text(list(object_names))} there" if object_names else ""
 
     def _standing(self, field: _Field, cells: Booleans) -> list[str]:
-        """Return the immovable objects that occupy some of `cells`, most cells first."""
+        """Return the immovable objects that occupy some of `cells`, sorted by descending number of cells."""
         clearance = self._settings.workspace.clearance
         cell_counts = {
             name: int((cells & (distance <= clearance)).sum())
@@ -224,7 +223,7 @@ class Arranger:
         )
 
     def arrangements(self, most: int) -> Iterator[dict[str, Pose]]:
-        """Yield arrangements, those of the smallest sets of objects first.
+        """Yield arrangements, first for the smallest sets of objects.
 
         If no arrangement over cells meets the demands, places between cells are tried.
 
@@ -238,7 +237,7 @@ class Arranger:
             yield from self._between_cells(most)
 
     def cell_hint(self, most: int) -> str:
-        """Return the advice to use smaller cells if only places between cells meet the demands, or ""."""
+        """Return the advice to use smaller cells, if only places between cells meet the demands; else ""."""
         fits = not self._is_placed and next(self._between_cells(most), None) is not None
         return "smaller cells (cell_size) may help" if fits else ""
 
@@ -250,7 +249,7 @@ class Arranger:
             self._slack = 0.0
 
     def _over_cells(self, max_moved: int) -> Iterator[dict[str, Pose]]:
-        # the number of a set comes before the set, so that equally good sets keep their order
+        # the number in a queue entry precedes the set, so that equally good sets keep their order
         queue = [
             (self._hubs_in(group), len(group), number, group)
             for number, group in enumerate(self._bases(max_moved))
@@ -291,7 +290,7 @@ class Arranger:
                         heapq.heappush(queue, (self._hubs_in(wider), len(wider), group_count, wider))
 
     def _bases(self, max_moved: int) -> list[tuple[str, ...]]:
-        """Return the smallest sets of objects that have an object of every unmet demand."""
+        """Return the smallest sets of objects that have at least one object of every unmet demand."""
         groups: dict[tuple[str, ...], None] = {(): None}
         for demand in self._unmet_demands:
             wider_groups: dict[tuple[str, ...], None] = {}
@@ -303,7 +302,7 @@ class Arranger:
                     wider = tuple(movable for movable in self._movable if movable in group or movable == name)
                     if len(wider) <= max_moved:
                         wider_groups[wider] = None
-            # sets without hubs first: moving only a hub seldom meets all its demands
+            # sets without hubs first, because moving only a hub seldom meets all demands on the hub
             best_groups = sorted(wider_groups, key=self._hubs_in)
             groups = dict.fromkeys(best_groups[:_MOST_SETS])
         return list(groups)
@@ -323,7 +322,7 @@ class Arranger:
         return frozenset(name for name in demand_counts if partner_counts[name] > 1)
 
     def _in_the_way(self, group: tuple[str, ...]) -> list[str]:
-        """Return up to four other objects that block the chosen ones, or take part in unmet demands."""
+        """Return up to four other objects that block the chosen objects or take part in unmet demands."""
         blocked_counts = dict.fromkeys((movable for movable in self._movable if movable not in group), 0)
         for name in group:
             if (field := self._field(name)) is None:
@@ -331,7 +330,7 @@ class Arranger:
             is_open = field.clearance > -self._slack
             cells = is_open & self._meeting_cells(field, name, group)
             if not cells.any():
-                # no cell is good even without all others, but moving the partner may meet a demand on both
+                # no cell is good even without all other objects, but a partner's motion may meet a demand
                 cells = is_open
             for neighbour, gap in field.gaps.items():
                 if neighbour in blocked_counts:
@@ -371,7 +370,7 @@ class Arranger:
         return _Field(maps.turns, clearance, obstacle_distances, gaps, surpluses)
 
     def _meeting_cells(self, field: _Field, name: str, group: tuple[str, ...]) -> Booleans:
-        """Return the cells that meet all demands that concern no other chosen object."""
+        """Return the cells that meet every demand that concerns no other chosen object."""
         is_met = np.ones(field.clearance.shape, np.bool_)
         for demand, surpluses in field.surplus.items():
             if all(movable == name or movable not in group for movable in self._names_by_demand[demand]):
@@ -379,7 +378,7 @@ class Arranger:
         return is_met
 
     def _domains(self, group: tuple[str, ...]) -> dict[str, Booleans] | None:
-        """Return the possible cells of each chosen object, without regard to the other chosen ones."""
+        """Return the possible cells of each chosen object, regardless of the other chosen objects."""
         domains = {}
         for name in group:
             if (field := self._field(name)) is None:
@@ -396,13 +395,13 @@ class Arranger:
     def _conflicts(
         self, group: tuple[str, ...], domains: Mapping[str, Booleans]
     ) -> dict[tuple[str, str], Booleans]:
-        """Return the conflicts of each pair by the vector between its objects, (A, B, rows, columns)."""
+        """Return whether each pair of objects conflicts, by their offset, (A, B, rows, columns)."""
         conflicts = {}
         # turns without possible cells are not measured
         used_turns = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
         for first, second in combinations(group, 2):
             if (stencil := self._stencil(first, second, group, used_turns)) is not None:
-                # both objects may be off the centres of their cells, so twice the slack is allowed
+                # both objects may be off the centres of their cells, so the slack is doubled
                 conflicts[first, second] = is_conflict = stencil < -2.0 * self._slack
                 # seen from the second object, the vector has the opposite sign
                 conflicts[second, first] = is_conflict.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
@@ -453,7 +452,7 @@ class Arranger:
         return stencil
 
     def _turned_in(self, grid: Grid, used_turns: Booleans) -> tuple[Workspace, list[int]]:
-        """Return a workspace without obstacles for the used turns, and the indices of these turns."""
+        """Return a workspace without obstacles for the used turns, and the used turns' indices."""
         yaws, keeps_yaw = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
         if len(used_turns) == 1:
             return Workspace(grid, () if keeps_yaw else yaws), [0]
@@ -493,7 +492,7 @@ class Arranger:
         other_domains: Mapping[str, Booleans],
         stencils: Mapping[tuple[str, str], Booleans],
     ) -> Iterator[Cell]:
-        """Yield some cells: the most robust cell, the cell that leaves most to the others, and corners."""
+        """Yield some cells: the most robust, the one that leaves most cells to other objects, and corners."""
         score = self._score(name)
         shares = np.ones(domain.shape)
         for movable, cells in other_domains.items():
@@ -512,7 +511,7 @@ class Arranger:
         yield from dict.fromkeys(choices)
 
     def _score(self, name: str) -> Floats:
-        """Return the score of each cell of an object, without regard to other chosen objects."""
+        """Return the score of each cell of an object, regardless of other chosen objects."""
         field, settings = self._fields[name], self._settings
         least_gap = np.minimum.reduce([field.clearance, *field.gaps.values()])
         room = least_gap + settings.workspace.clearance
@@ -521,7 +520,7 @@ class Arranger:
         ]
         if demand_surpluses:
             score: Floats = np.minimum.reduce(demand_surpluses)
-            # cells with too little room, and turns of pushed objects, come after all others
+            # cells with too little room, and turns of pushed objects, come after all other cells
             is_last = room < settings.room
             is_last[1:] |= settings.workspace.keeps_yaw
             # more than the range of all scores
@@ -539,13 +538,13 @@ class Arranger:
         return x, y, float(self._fields[name].turns[cell[0]])
 
     def _settle(self, poses: Mapping[str, Pose]) -> dict[str, Pose] | None:
-        """Return poses near `poses` that meet all demands and touch nothing; None if none are found.
+        """Return poses near `poses` that meet all demands and touch nothing; None if no such poses are found.
 
-        Each step goes to the nearest places that meet the demands, which are linearized at this step and at
-        previous steps.
+        Each step goes to the nearest places that meet the linearized demands. Demands are linearized at the
+        places of this step and of previous steps.
         """
         workspace, cell_size = self._settings.workspace, self._grid.cell_size
-        # obstacles become objects, so that distances to them are demands like all others
+        # obstacles become objects, so that distances to obstacles are demands like all other demands
         obstacles = {
             f"obstacle {number}": TrackedObject(obstacle)
             for number, obstacle in enumerate(workspace.obstacles)
@@ -581,7 +580,7 @@ class Arranger:
                     }
                 if stalls > _MOST_STALLED:
                     break
-                # demands that are met by far do not limit the step
+                # demands with a large surplus do not limit the step
                 is_near = surpluses < 2.0 * cell_size
                 normals = slopes[is_near].reshape(-1, places.size)
                 least_values = normals @ places.ravel() - surpluses[is_near] + margin_share * cell_size
@@ -593,7 +592,7 @@ class Arranger:
     def _slopes(
         self, sample: Sample, demands: Sequence[Demand], poses: Mapping[str, Pose], places: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the surplus of demands (D,) with objects at places (N, 2), and its slopes (D, N, 2)."""
+        """Return the surplus of demands (D,) with objects at places (N, 2), and the slopes (D, N, 2)."""
         # slopes are forward differences
         step = 1e-4 * self._grid.cell_size
         objects: dict[str, TrackedObject] = {}
@@ -626,14 +625,14 @@ class Arranger:
 
 
 def _standing_text(names: Sequence[str]) -> str:
-    """Return the beginning of a sentence on immovable objects, with the first names; "" without names."""
+    """Return the beginning of a sentence that names immovable objects; "" without names."""
     phrases = [name or "an obstacle of the workspace" for name in names[:_MOST_NAMED]]
     verb = "stand" if len(phrases) > 1 else "stands"
     return f"{' and '.join(phrases)}, which cannot be moved, {verb}" if phrases else ""
 
 
 def _best(is_allowed: Booleans, cell_values: Floats, tie_values: Floats) -> Cell:
-    """Return the cell with the greatest value; among equal ones, the cell with the greatest `then`."""
+    """Return the allowed cell with the greatest value; equal cells are decided by `tie_values`."""
     allowed_values = np.where(is_allowed, cell_values, -np.inf)
     is_best = allowed_values == allowed_values.max()
     best_index = int(np.argmax(np.where(is_best, tie_values, -np.inf)))
@@ -642,7 +641,7 @@ def _best(is_allowed: Booleans, cell_values: Floats, tie_values: Floats) -> Cell
 
 
 def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> Booleans:
-    """Return the cells (B, rows, columns) of the second object that conflict with a cell of the first."""
+    """Return the second object's cells (B, rows, columns) that conflict with a cell of the first object."""
     conflicts = np.zeros(shape, np.bool_)
     if stencil is None:
         return conflicts
@@ -658,7 +657,7 @@ def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> 
 
 
 def _count_losses(cells: Booleans, stencil: Booleans) -> Floats:
-    """Return how many cells of the second object conflict with each cell of the first, (A, rows, columns).
+    """Count the second object's cells that conflict with each cell of the first object, (A, rows, columns).
 
     The counts are correlations of cells and stencil, computed by Fourier transforms.
     """
@@ -690,9 +689,9 @@ def _is_of(formula: Formula, names: Sequence[str]) -> bool:
 # ---------------------------------------------------------------------------------------------- motions ahead
 
 MOST_MAPS: Final = 230
-"""Maximum number of maps of one decision; the evaluation of one sample counts as a quarter of a map."""
+"""Maximum number of maps of one decision; the evaluation of a sample counts as a quarter of a map."""
 _MOST_WHY_NOT: Final = 60
-"""Maximum number of maps for the reason of an infeasible task, after a decision without a result."""
+"""Maximum number of maps for the reason why a task is infeasible."""
 _JOINT_SHARE: Final = 0.4
 """Maximum share of the remaining maps for one conjunction of demands on several objects."""
 _HOPELESS_SHARE: Final = 0.5
@@ -703,7 +702,7 @@ _MOST_ORDERED: Final = 6
 """Maximum number of arrangements for which an order of motions is searched."""
 _NOT_FOUND: Final = "no arrangement of objects brings it about"
 _STILL_TURN: Final = math.radians(1.0)
-"""Turn up to which an object counts as staying, radians."""
+"""Turn up to which an object counts as unmoved, radians."""
 
 
 class Lookahead:
@@ -730,12 +729,12 @@ class Lookahead:
         *,
         together: bool = False,
     ) -> Consideration:
-        """Return an edge with a candidate from which acceptance can be reached; pruned if there is none.
+        """Return an edge with a candidate whose motion leads to acceptance; pruned without such a candidate.
 
         With the setting `motions` = 1, there is no lookahead.
 
         Args:
-            consideration: edge with the candidates that can take it by one motion, or pruned.
+            consideration: edge with the candidates that can take the edge by one motion, or a pruned edge.
             path: path that begins with the edge.
             pruned: pruned edges.
             together: whether several motions may take the edge, and an object may be moved twice.
@@ -763,12 +762,12 @@ class Lookahead:
     # ------------------------------------------------------------------------------------ one at a time
 
     def _ahead(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
-        """Return motions from a state to acceptance; None if none are found."""
+        """Return motions from a state to acceptance; None if no motions are found."""
         if state in self._automaton.accepting:
             return ()
         search_key = state, scene.moved
         if search_key not in self._solutions:
-            # None for now, so that a search that returns to this scene and state gives up
+            # None during the search, so that a search that returns to this scene and state gives up
             self._solutions[search_key] = None
             self._solutions[search_key] = self._search(scene, state)
         return self._solutions[search_key]
@@ -791,7 +790,7 @@ class Lookahead:
             considered_paths.append((path, consideration))
             pruned_edges.add(consideration.edge)
             pruned_edges |= set(equivalent_edges(automaton, consideration, idle, pruned_edges, symbol))
-        # only after single motions have failed, because finding hopeless edges costs maps
+        # hopeless edges are found only after single motions have failed, because that costs maps
         self._excluded_edges = self._hopeless
         for path, consideration in considered_paths:
             for sequence in islice(self._joint(scene, path, consideration), 2):
@@ -821,7 +820,7 @@ class Lookahead:
             ] = None
 
     def _after(self, target: Target, edge: Transition) -> tuple[Target, ...] | None:
-        """Return the motions to acceptance after a first motion; () if the state after it is uncertain."""
+        """Return the motions to acceptance after a first motion; () if the next state is uncertain."""
         scene = self._start.after(target.name, target.pose)
         states = self._expected.states_after(scene, edge.source)
         return () if len(states) > 1 else self._ahead(scene, *states)
@@ -831,11 +830,11 @@ class Lookahead:
     def _joint(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
     ) -> Iterator[Ordered]:
-        """Yield motions of several objects that take a whole path, or its first edge."""
+        """Yield motions of several objects that take a whole path, or the first edge of the path."""
         if self._settings.motions < 2:
             return
         arrangement_numbers = count(1)
-        # the whole path first, then only its first edge
+        # first the whole path, then only the first edge
         for aim_count in dict.fromkeys((len(path), 1)):
             aims = path[:aim_count]
             if any((aim.source, aim.target) in self._excluded_edges for aim in aims):
@@ -854,7 +853,7 @@ class Lookahead:
                     arranger.arrangements(self._settings.motions), _MOST_ORDERED
                 )
                 if self._expected.attempts.are_any:
-                    # a motion may fail by chance, so places of failed motions are tried after all others
+                    # a motion may fail by chance, so places of failed motions are tried last
                     arrangements = sorted(arrangements, key=self._is_near_failure)
                 for number, poses in zip(arrangement_numbers, arrangements, strict=False):
                     for sequence in self._ordered_from(
@@ -863,10 +862,10 @@ class Lookahead:
                         yield sequence._replace(arrangement=number)
 
     def _resume(self, aims: Sequence[Transition], consideration: Consideration) -> Iterator[Ordered]:
-        """Yield the motions to the places of the last decision, if they still take the edges.
+        """Yield the motions to the places of the last decision, if these motions still take the edges.
 
-        A new arrangement may need more motions than the old plan has left, and its motions may undo earlier
-        motions.
+        The motions of a new arrangement may be more than the remaining motions of the old plan, and may undo
+        earlier motions.
         """
         scene, states = self._start, frozenset({aims[0].source})
         places: dict[str, Pose] = {}
@@ -888,7 +887,7 @@ class Lookahead:
         """Yield conjunctions of demands that take all edges and avoid traps."""
         trap_cubes = self._expected.traps(aims[0].source)
         safety_demands: list[Demand] = []
-        # slightly more than the margin, so that rounding does not leave a constraint at it
+        # slightly more than the margin, so that rounding does not bring a constraint back to the margin
         least_margin = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
         for cube in trap_cubes:
             if len(cube) == 1:
@@ -896,7 +895,7 @@ class Lookahead:
                 conjunctions = alternatives(self._formulas[number], not value)
                 if len(conjunctions) == 1:
                     safety_demands += (Demand(*literal, least_margin) for literal in conjunctions[0])
-        # at most eight combinations of cubes, because their number grows exponentially with the path
+        # at most eight combinations of cubes: their number grows exponentially with the path
         for cubes in islice(product(*(aim.guard for aim in aims)), 8):
             literals = tuple(dict.fromkeys(literal for cube in cubes for literal in cube))
             if any((number, not value) in literals for number, value in literals):
@@ -905,7 +904,7 @@ class Lookahead:
                 yield (*demands, *safety_demands)
 
     def _is_near_failure(self, poses: Mapping[str, Pose]) -> bool:
-        """Return whether an arrangement brings an object near a place where its motion failed."""
+        """Return whether an arrangement brings an object near a place where the object's motion failed."""
         near_distance = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
         return any(
             math.dist(pose[:2], place) <= near_distance
@@ -922,7 +921,7 @@ class Lookahead:
         poses: Mapping[str, Pose],
         reserved_maps: float,
     ) -> Iterator[Ordered]:
-        """Yield the motions to an arrangement in a possible order, if one is found."""
+        """Yield the motions to an arrangement in a possible order, if such an order is found."""
         self._expected.budget.arrangements += 1
         poses = self._without_staying(scene, arranger, poses)
         robustness = self._expected.robustness(move_objects(scene.sample, poses), aims[0].guard)
@@ -938,7 +937,7 @@ class Lookahead:
     def _without_staying(
         self, scene: PredictedState, arranger: Arranger, poses: Mapping[str, Pose]
     ) -> Mapping[str, Pose]:
-        """Return an arrangement without objects that barely move, if it meets the demands without them."""
+        """Drop objects that barely move from an arrangement, if the demands are still met."""
         for name in list(poses):
             x, y, turn = poses[name]
             other_poses = {moved_name: pose for moved_name, pose in poses.items() if moved_name != name}
@@ -954,10 +953,10 @@ class Lookahead:
         sequence: Ordered,
         later_motions: tuple[Target, ...],
     ) -> Consideration:
-        """Return an edge with the first of several motions as its chosen candidate."""
+        """Return an edge whose chosen candidate makes the first of several motions."""
         motions = sequence.motions
         first_motion, sample = motions[0], self._start.sample
-        # a parked object goes to its own place later, so the pose of its first motion is not final
+        # a parked object goes to its own place later, so its first motion's pose is not final
         poses = {motion.name: motion.pose for motion in motions[1:] if motion.name != first_motion.name}
         settings, current_maps = self._settings, self.movables.maps_of(first_motion.name)
         later_maps = proposition_maps(
@@ -997,7 +996,7 @@ class Lookahead:
         poses: Mapping[str, Pose],
         later_motions: tuple[Target, ...],
     ) -> Target:
-        """Return the first of several motions with a refined target, if the later states stay the same."""
+        """Refine the target of the first motion, if the states after each motion do not change."""
         start, *corners, end = target.waypoints
         corners = corners if self._settings.skill == "push" else []
         direct_target = replace(target, waypoints=(start, *corners, end))
@@ -1016,7 +1015,7 @@ class Lookahead:
         return target_with_way if old_states == new_states else target
 
     def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
-        """Return the possible states after each motion, from the newest sample on."""
+        """Return the possible states after each motion; the first motion starts at the newest sample."""
         scene, states, states_by_motion = self._start, frozenset({state}), []
         for motion in motions:
             scene = scene.after(motion.name, motion.pose)
@@ -1028,11 +1027,11 @@ class Lookahead:
 
     @cached_property
     def _hopeless(self) -> frozenset[Edge]:
-        """The edges that need a literal that no arrangement of the objects can fulfil."""
+        """The edges whose guards need a literal that no arrangement of the objects can fulfil."""
         return self._needing(self._hopeless_literals)
 
     def _needing(self, literals: Collection[tuple[int, bool]]) -> frozenset[Edge]:
-        """Return the edges whose guards need one of these literals in every cube."""
+        """Return the edges whose guards have one of these literals in every cube."""
         if not self._automaton.is_listable:
             return frozenset()
         return frozenset(
@@ -1068,7 +1067,8 @@ class Lookahead:
     def why_not(self, state: int) -> str:
         """Return the infeasible condition of every path to acceptance, and the objects in the way.
 
-        Without such a condition, return a sentence on objects for whose motions no order was found, or "".
+        Without an infeasible condition, return a sentence on objects whose motions have no possible order, or
+        "".
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
@@ -1078,11 +1078,11 @@ class Lookahead:
         return f"{self._unordered_names}: there are places for all, but no order of motions to them was found"
 
     def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
-        """Return the demands of a literal that no arrangement meets, and the objects in the way."""
+        """Return a sentence on a literal's demands that no arrangement meets, and on objects in the way."""
         budget = Budget(_MOST_WHY_NOT)
         conjunctions = demands_of((literal,), self._formulas, self._settings.margin)
         demands = next(iter(conjunctions), ())
-        # demands that are not needed for the conflict are dropped, so that the reason names few demands
+        # demands without which the conflict remains are dropped, so that the reason names few demands
         core_demands = list(demands)
         for demand in reversed(demands):
             fewer_demands = tuple(member for member in core_demands if member != demand)
@@ -1101,7 +1101,7 @@ class Lookahead:
         return f"{goals}: {'; '.join(filter(None, sentences))}"
 
     def _why_impossible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> str:
-        """Return "" if an arrangement meets demands, or else why none does, or that none was found."""
+        """Return the reason why no arrangement of objects meets demands, or ""."""
         arranger = Arranger(sample, self._regions, self._settings, demands, budget)
         cause = arranger.why_hopeless()
         arrangement = None if cause else next(arranger.arrangements(self._settings.motions), None)

@@ -24,10 +24,10 @@ from spatial_replay.text import number_text
 
 _MAP, _PATH, _TRAVELLED = "plan/map", "plan/way", "plan/travelled"
 OBSTACLE: Final = "plan/obstacle/"
-"""Start of the ids of the workspace's obstacles; their names follow."""
+"""Prefix of the ids of the workspace's obstacles; an obstacle's name follows the prefix."""
 
 DEPTH: Final = 0.1
-"""Depth of a map below the plane, cells; at depth 0 the map would hide regions in the plane."""
+"""Depth of a map below the plane, cells; a map in the plane would hide regions."""
 _FRAME_DEPTH: Final = 0.5 * DEPTH
 """Depth of lines on a map, cells."""
 
@@ -53,7 +53,7 @@ _MOST_TICKS: Final = 6
 
 
 class MapFrame(NamedTuple):
-    """Lines, texts and faces around a map, and their height, footprint units."""
+    """Lines, texts and faces around a map, and the height of the lines, footprint units."""
 
     entity: SceneEntity
     height: float
@@ -104,7 +104,7 @@ def _obstacle(name: str, obstacle: Footprint, height: float, font_size: float) -
         for corner in range(1, len(ring) - 1):
             area.indices.extend((0, corner, corner + 1))
     xs, ys = zip(*(point for ring in rings for point in ring), strict=True)
-    # above the area, which would cover the name
+    # the name is above the area, because the area would cover it
     _add_text(entity, name, ((min(xs) + max(xs)) / 2.0, max(ys) + 0.75 * font_size), height, font_size)
     return entity
 
@@ -114,7 +114,7 @@ def map_drawing(
 ) -> SceneUpdate:
     """Return the message that draws the newest map, or an empty message without a map.
 
-    White lines below the path and below the outline at the target make both visible on blue cells.
+    White lines below the path and below the outline at the target keep these visible on blue cells.
     """
     message = SceneUpdate()
     if frame is not None:
@@ -131,7 +131,7 @@ def map_drawing(
 def _add_blocked_cells(
     entity: SceneEntity, blocked: Booleans, low_corner: tuple[float, float], cell_size: float, height: float
 ) -> None:
-    """Add a grey area for the blocked cells, which the map leaves transparent; free cells at 0 are white."""
+    """Add a grey area for the blocked cells, which are transparent in the map; free cells at 0 are white."""
     changes = np.diff(np.pad(blocked, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     rows, starts = np.nonzero(changes == 1)
     ends = np.nonzero(changes == -1)[1]
@@ -154,7 +154,10 @@ def _contour(values: Floats, margin: float) -> Floats:
 
 
 def _run_ends(first_rows: Floats, second_rows: Floats, margin: float) -> Floats:
-    """Return row and ends (2 N, 2) of each run of columns where only one of two rows reaches the margin."""
+    """Return the ends (2 N, 2) of runs of columns in which only one of two adjacent rows reaches the margin.
+
+    An end is (index of the first row, column).
+    """
     is_parted: Booleans = (
         np.isfinite(first_rows)
         & np.isfinite(second_rows)
@@ -222,7 +225,7 @@ def _add_scale(
 
 
 def _half_width(text: str) -> float:
-    """Return half the width of a number as a share of the map's size; a digit is half as wide as high."""
+    """Return half the width of a text as a share of the map's size; a digit is half as wide as high."""
     return 0.25 * _FONT * (len(text) + 1)
 
 
@@ -233,7 +236,7 @@ def _round_numbers(low: float, high: float) -> Iterator[float]:
     step = next(
         factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least_step * (1 - 1e-9)
     )
-    # the tolerances keep ticks at the ends in spite of rounding
+    # without the tolerances, rounding could drop ticks at the ends
     for multiple in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
         yield multiple * step
 

@@ -1,8 +1,8 @@
 """Gradient maps (Def. 19): robustness of guards with one object at every cell of a grid.
 
-The positions of the grid become the samples of traces in which only that object moves. A map is evaluated by
-the kernels that evaluate a log, so a cell and an equal sample of a log have the same robustness. Layers name
-the conjunct that limits a cell, and the cause that blocks it.
+The positions of the grid become the samples of traces in which only the object moves. The kernels that
+evaluate a log also evaluate a map, so a cell and an equal sample of a log have the same robustness. Layers
+name the conjunct that limits a cell, and the cause that blocks the cell.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Cube: TypeAlias = tuple[tuple[int, bool], ...]
 """A conjunction of literals (number of a proposition, whether it must hold); the empty cube is true."""
 
 Cubes: TypeAlias = tuple[Cube, ...]
-"""A disjunction of cubes; without cubes it is false."""
+"""A disjunction of cubes; no cube means false."""
 
 FREE: Final = 0
 CONSTRAINED: Final = 1
@@ -64,7 +64,7 @@ REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "ou
 """Reason why a cell is blocked, by its number in `GradientMap.blocked`."""
 
 _AT_ONCE: Final = 1 << 20
-"""Number of values that are measured at once, which takes about 60 MB."""
+"""Maximum number of values that are measured at once; they take about 60 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class GradientMap(Displayed):
 
     Attributes:
         name: name of the object.
-        grid: cells; more than the workspace's if a pushed object starts outside.
+        grid: cells; the grid exceeds the workspace if a pushed object starts outside.
         robustness: (A, rows, columns), in the unit of the relations, also at blocked cells.
         blocked: (A, rows, columns) uint8, `FREE` or the reason why the cell is blocked (see `REASONS`).
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
@@ -91,7 +91,7 @@ class GradientMap(Displayed):
 
     @property
     def values(self) -> Floats:
-        """(A, rows, columns), the robustness, NaN at blocked cells."""
+        """(A, rows, columns), robustness; NaN at blocked cells."""
         return np.where(self.blocked == FREE, self.robustness, np.nan)
 
     def best(self) -> float:
@@ -105,9 +105,9 @@ class GradientMap(Displayed):
         """Return the best poses in free cells (x, y, turn, robustness), at least two cells from each other.
 
         Args:
-            avoided: places (x, y) from which the poses are also at least two cells away.
+            avoided: further places (x, y); the poses are at least two cells from each of these places.
         """
-        # stable, so that equally robust cells keep their order
+        # a stable sort, so that equally robust cells keep their order
         cell_order = np.argsort(
             -np.where(self.blocked == FREE, self.robustness, -np.inf), axis=None, kind="stable"
         )
@@ -139,20 +139,20 @@ def gradient_map(
     margin: float = 0.0,
     after: PropositionMaps | None = None,
 ) -> GradientMap:
-    """Return the map of a progress set, in which cells are blocked if the constraint set would hold.
+    """Return the map of a progress set; cells are blocked where the constraint set would hold.
 
     Args:
-        progress: cubes of which one must hold.
-        constraints: cubes whose robustness must be less than -`margin`; an unknown value counts as holding.
+        progress: cubes, one of which must hold.
+        constraints: cubes whose robustness must be less than -`margin`; an unknown cube counts as holding.
         margin: margin of the constraints, in the unit of the relations, at least 0.
-        after: maps after motions of other objects, for the robustness; blocked cells follow from `maps`.
+        after: maps after motions of other objects, which give the robustness; `maps` gives the blocked cells.
     """
     shape = maps.clearance.shape
     robustness_maps = maps if after is None else after
     robustness = _greatest(robustness_maps.lower, robustness_maps.upper, progress, shape)
     danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
-    # later assignments take precedence: a constrained cell is reported as such, even if it is also occupied
+    # later assignments take precedence: a constrained and occupied cell is reported as constrained
     blocked[robustness == -np.inf] = UNKNOWN
     blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
@@ -176,7 +176,7 @@ def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple
     """Return the robustness of a cube: the minimum over its literals.
 
     Args:
-        positive, negative: bounds of propositions: for literals that must hold, and that must not hold.
+        positive, negative: bounds of the propositions, for positive literals and for negative literals.
     """
     literal_values = (positive[number] if value else -negative[number] for number, value in cube)
     return reduce(np.minimum, literal_values, np.full(shape, np.inf))
@@ -189,7 +189,7 @@ class PropositionMaps:
     Attributes:
         name: name of the object.
         grid: cells.
-        lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf if it is unknown.
+        lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf for unknown values.
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
         distances: (O, A, rows, columns), signed distance to each of `obstacles`.
         turns: (A,), angles by which the object is turned, radians.
@@ -210,14 +210,15 @@ class PropositionMaps:
     static: Mapping[str, Footprint] = field(repr=False)
 
     def room(self, others: Collection[str] | None) -> Floats:
-        """Return the distance to the nearest of some objects, (A, rows, columns); None for all objects."""
+        """Return the distance to the nearest of `others`, (A, rows, columns); None stands for all objects."""
         is_selected = [others is None or name in others for name in self.obstacles]
         return np.asarray(self.distances[is_selected].min(axis=0, initial=np.inf))
 
     def nearest(self) -> NDArray[np.int64]:
-        """Return the index in `obstacles` of what is nearest in each cell, (A, rows, columns).
+        """Return the index of each cell's nearest obstacle in `obstacles`, (A, rows, columns).
 
-        An object that overlaps the moved one comes before the workspace's obstacles, because it has a name.
+        An object that overlaps the moved object precedes the workspace's obstacles, because only objects have
+        names.
         """
         distances = self.distances.copy()
         distances[-1, self.distances[:-1].min(axis=0, initial=np.inf) <= 0.0] = np.inf
@@ -233,7 +234,7 @@ class MapSubject(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """Inputs of a gradient map: maps now, maps after motions of other objects, progress and constraints."""
+    """Inputs of a gradient map: maps now, maps after motions of other objects, progress, constraints."""
 
     now: PropositionMaps
     then: PropositionMaps
@@ -291,7 +292,7 @@ def proposition_maps(
         pieces.append((cell_slice, leaf_bounds[:, : len(moving_propositions)]))
     # propositions that do not depend on the object have the same value in every cell
     fixed_bounds = leaf_values(TraceScene(trace, regions), fixed_propositions, {})[:2, :, :, None]
-    # if everything is known, as in most maps, one array has both bounds
+    # in most maps everything is known, so that one array has both bounds
     bound_count = max(len(fixed_bounds), *(len(leaf_bounds) for _, leaf_bounds in pieces))
     bounds: Floats = np.empty((bound_count, len(propositions), *shape))
     bounds[:, ~is_concerned] = fixed_bounds
@@ -307,7 +308,11 @@ def proposition_maps(
 
 
 def _slices(cell_count: int, value_count: int) -> Iterator[slice]:
-    """Yield slices of `count` places with a total of `values` values, each of at most `_AT_ONCE` values."""
+    """Yield slices of the cells; each slice has at most `_AT_ONCE` values.
+
+    Args:
+        value_count: number of values of all cells.
+    """
     slice_size = max(1, cell_count * _AT_ONCE // max(value_count, 1))
     yield from (slice(first, first + slice_size) for first in range(0, cell_count, slice_size))
 
@@ -323,12 +328,12 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
     )
     measured_expressions = {part for atom in proposition_atoms for part in iter_expressions(atom.expression)}
     pairs = ((distance_between(name, obstacle), distance_between(obstacle, name)) for obstacle in obstacles)
-    # operands in the order in which a proposition measures them, so that the kernel measures them only once
+    # operands have the order of a proposition's operands, so that the kernel measures each pair only once
     return [swapped if swapped.expression in measured_expressions else atom for atom, swapped in pairs]
 
 
 def distance_between(first: str, second: str) -> Atom:
-    """Return the atom whose robustness is the signed distance of two objects."""
+    """Return the atom whose robustness is the signed distance between two objects."""
     return Atom("", "dist", SignedDistance(TrackedName(first), TrackedName(second)))
 
 
@@ -345,7 +350,7 @@ def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) ->
 def _trace_over_poses(
     trace: Trace, tracked: TrackedObject, name: str, centres: Floats, turns: Floats
 ) -> Trace:
-    """Return a trace with a copy of the only sample for each turn and position of the object."""
+    """Return a trace that repeats the only sample, once for each turn and position of the object."""
     footprints = with_poses(trace.footprints, tracked, centres, turns)
     pose_count, column = len(footprints) - len(trace.footprints), trace.names.index(name)
     object_rows = np.full(pose_count, trace.rows[0, column])
@@ -389,7 +394,7 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
     for proposition in propositions:
         for part in iter_formulas(proposition):
             if is_about_having_rates(part):
-                # this part only tests whether a rate exists; the rate itself is a later part, and is refused
+                # this part only tests whether a rate exists; a later part, the rate itself, is refused
                 continue
             terms = list(terms_of(part.expression)) if isinstance(part, Atom) else []
             terms += [part.group] if isinstance(part, Quantified) else []
@@ -401,10 +406,10 @@ def refuse_delays(propositions: Sequence[Formula]) -> None:
 
 
 def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[Formula]) -> None:
-    """Check that objects are in a sample or in a proposition, whose objects may appear later.
+    """Check that objects are in a sample or in a proposition; objects of propositions may appear later.
 
     Raises:
-        UsageError: names every object that is in neither.
+        UsageError: names every object that is in no proposition and not in the sample.
     """
     faults = []
     for name in names:
@@ -424,9 +429,9 @@ def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[
 AVOIDED_CELLS: Final = 2.0
 """Distance of a new target from a place where a motion failed, cells."""
 MOST_LAYERS: Final = 12
-"""Maximum number of conjuncts with a layer in a log, varying ones first; a log names all conjuncts."""
+"""Maximum number of conjuncts with a layer in a log, varying conjuncts first; a log names all conjuncts."""
 MOST_CAUSES: Final = 1000
-"""Maximum number of listed causes; cells with a further cause refer to the last listed one."""
+"""Maximum number of listed causes; cells with a further cause refer to the last listed cause."""
 
 CauseKind: TypeAlias = Literal["constraint", "object", "obstacle", "reach", "unknown", "failed"]
 """Reason why a cell is blocked: a constraint would hold, an object or obstacle occupies the cell, the robot
@@ -443,7 +448,7 @@ class BlockedBy(NamedTuple):
     """A cause that blocks cells.
 
     Attributes:
-        name: name of the object, or text of the constraint that would hold; else empty.
+        name: name of the object, or text of the constraint; empty for other kinds.
         cells: number of blocked cells, over all orientations.
     """
 
@@ -459,9 +464,9 @@ class MapLayers:
     Attributes:
         conjuncts: texts of the L relations in the progress set, or of their negations.
         required: whether each conjunct must hold; False for one of several alternatives.
-        robustness: (L, A, rows, columns), robustness of each conjunct; -inf if it is unknown.
-        limiting: (A, rows, columns), index of the conjunct whose robustness equals the progress set's; -1
-            without one.
+        robustness: (L, A, rows, columns), robustness of each conjunct; -inf for unknown values.
+        limiting: (A, rows, columns), index of the conjunct whose robustness equals the progress set's
+            robustness; -1 without such a conjunct.
         causes: causes that block cells, most cells first.
         blocked_by: (A, rows, columns), index of each cell's cause; -1 for a free cell.
     """
@@ -510,7 +515,7 @@ def map_layers(
 
 
 _Limit: TypeAlias = tuple[Floats, NDArray[np.int64]]
-"""Robustness in each cell, and the index of the relation with this robustness; -1 without one."""
+"""Robustness in each cell, and the index of the relation with this robustness; -1 for no relation."""
 
 
 class _Part(NamedTuple):
@@ -533,7 +538,7 @@ class _Part(NamedTuple):
 
     @property
     def brief(self) -> str:
-        """Its text; a named formula is replaced by its name."""
+        """The part's text; the name replaces the text of a named formula."""
         name = self.formula.name
         return self.text if name is None else name if self.wanted else f"not {name}"
 
@@ -545,7 +550,7 @@ class _Part(NamedTuple):
 
     @property
     def is_every(self) -> bool:
-        """Whether all members must hold, instead of any one."""
+        """Whether all members must hold; if not, one member is enough."""
         return not isinstance(self.formula, Boolean) or (self.formula.operator == "and") == self.wanted
 
     def leaves(self) -> Iterator[_Part]:
@@ -561,7 +566,7 @@ class _Part(NamedTuple):
             yield from chain.from_iterable(member.required_leaves() for member in self.members)
 
     def options(self) -> Iterator[_Part]:
-        """Iterate over alternatives: the part holds if any one of them holds."""
+        """Iterate over alternatives: the part holds if any alternative holds."""
         yield from (
             (self,) if self.is_every else chain.from_iterable(member.options() for member in self.members)
         )
@@ -597,7 +602,7 @@ def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floa
     subject = maps.about
     tracked = subject.sample.objects[maps.name]
     yaw = tracked.yaw or 0.0 if isinstance(tracked, TrackedObject) else 0.0
-    # all objects are declared supports, so that the distances of obstacles are not measured again
+    # all objects are declared supports, so that no distances to obstacles are measured
     all_names = frozenset(subject.sample.objects)
     free_workspace = Workspace(maps.grid, yaws=tuple((maps.turns + yaw).tolist()), supports=all_names)
     part_maps = proposition_maps(formulas, subject.regions, subject.sample, maps.name, free_workspace)
@@ -607,7 +612,7 @@ def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floa
 def _causes(gradient: GradientMap, is_avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
     """Return the causes that block cells, and the index of each cell's cause."""
     maps, blocked = gradient.made_of.now, gradient.blocked
-    # kind and number of a cause as one integer, so that np.unique counts causes
+    # the kind and number of a cause are one integer, so that np.unique counts causes
     codes = np.full(blocked.shape, -1, np.int64)
     for reason, kind_index in _KIND_OF.items():
         codes[blocked == reason] = kind_index * _NUMBERS
@@ -687,7 +692,7 @@ def avoided_cells(
     is_avoided = near(failed, gradient.grid)
     is_met = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     if is_met.any() and not (is_met & ~is_avoided).any():
-        # a motion may fail by chance, so places are tried again, those far from the failures first
+        # a motion may fail by chance, so places are tried again, starting far from the failures
         distances = distance_to(failed, gradient.grid)
         return np.asarray(distances < distances[is_met.any(axis=0)].max() / 2.0)
     return is_avoided

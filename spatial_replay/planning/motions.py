@@ -1,7 +1,7 @@
 """Motions: candidates that can take an edge, predicted samples, and orders of several motions.
 
-An object in the way of another one is parked: it goes aside first, and to its own place, if any, later. So
-two objects can change places, and a pushed object can pass others.
+An object in the way of another object is parked: it goes aside first, and to its own place, if any, later. So
+two objects can change places, and a pushed object can pass other objects.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from spatial_replay.trace.trace import Sample
 _MOST_NAMED: Final = 2
 """Maximum number of constraints that a reason names."""
 _LONGEST_NAME: Final = 60
-"""Maximum length of such a constraint, characters."""
+"""Maximum length of a constraint that a reason names, characters."""
 _DIGITS: Final = 9
 """Number of decimal places to which lengths and robustness are rounded for comparisons."""
 
@@ -94,7 +94,7 @@ class Movables:
         return [name for name in (sorted(present) if movable is None else movable) if name in present]
 
     def names_for(self, progress: Guards) -> list[str]:
-        """Return the movable objects that a progress set depends on, in the order of the settings."""
+        """Return the movable objects on which a progress set depends, in the order of the settings."""
         proposition_numbers = {number for cube in progress.cubes for number, _ in cube}
         return [
             name
@@ -110,15 +110,15 @@ class Movables:
         *,
         refine: bool = False,
     ) -> Candidate:
-        """Return an object with its map for an edge, and with its target or the reason of its rejection.
+        """Return an object with its map for an edge, and with its target or the reason of a rejection.
 
         Args:
-            later: objects that may still have to be moved after this motion.
+            later: objects that may need a motion after this motion.
             refine: whether to refine the target, if the settings allow it.
         """
         tracked, settings = self.sample.objects[name], self.settings
         gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)
-        # a failed motion may have lacked room, so its object keeps room from everything
+        # lack of room may have caused a failed motion, so the object keeps room from everything
         keeps_all_room = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
         room_from = None if keeps_all_room else later
         failed_places = self.attempts.places_of(name)
@@ -164,11 +164,11 @@ class Movables:
         room_from: Collection[str] | None,
         then: Mapping[str, Pose] | None = None,
     ) -> Target:
-        """Return a more robust target near a target, if there is one and the settings allow refinement.
+        """Return the most robust target near a target; the target itself if the settings forbid refinement.
 
         Args:
-            room_from: objects from which room is kept; None for all objects.
-            then: later poses of other objects, which count for the robustness and as obstacles.
+            room_from: objects from which the object keeps room; None for all objects.
+            then: later poses of other objects, which determine the robustness and are obstacles.
         """
         settings, name = self.settings, target.name
         if not settings.refine:
@@ -188,7 +188,7 @@ class Movables:
         room_from: Collection[str] | None,
         then: Mapping[str, Pose] | None = None,
     ) -> Measured:
-        """Return the function that measures an object's maps for an edge, as `refine_target` needs it."""
+        """Return the function that measures an object's maps for an edge, for `refine_target`."""
         settings = self.settings
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
         later_sample = self.sample if then is None else move_objects(self.sample, then)
@@ -217,7 +217,7 @@ class Movables:
         return measure
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
-        """Return whether the last leg of a path, and the turn at its end, are free."""
+        """Return whether the last leg of a path and the turn at the path's end are free."""
         # the progress set ((),) is always true, because only blocked cells matter
         gradient = self.gradient(target.name, ((),), constraints)
         cell_size = gradient.grid.cell_size
@@ -232,11 +232,11 @@ class Movables:
         return bool(can_turn_in(target_grid, gradient, target.turn, self.settings).all())
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
-        """Return the target of a carried object with a path that keeps the constraints, or why there is none.
+        """Return the target with a path that keeps the constraints, or the reason why there is no such path.
 
-        If no constraint concerns the object, the robot may choose the path. On the path, constraints are
-        false by the margin plus half a cell's diagonal. If there is no such path, they are false by the
-        margin or, as a last resort, just false.
+        If no constraint concerns the carried object, the robot may choose the path. On the path, constraints
+        are false by the margin plus half a cell's diagonal. If there is no such path, they are false by the
+        margin. The last resort is a path on which constraints are just false.
         """
         settings, name = self.settings, target.name
         proposition_numbers = sorted({number for cube in constraints for number, _ in cube})
@@ -255,7 +255,7 @@ class Movables:
             path = shortest_path(is_reached & (danger < -distance), grid.cell(*start), goals)
             if path is not None:
                 corners = [grid.centre(*cell) for cell in path.cells[1:-1].tolist()]
-                # a straight path gets a third waypoint, because two would leave the path to the robot
+                # a straight path gets a third waypoint: two waypoints would leave the path to the robot
                 middle = ((start[0] + end[0]) / 2.0, (start[1] + end[1]) / 2.0)
                 return replace(target, waypoints=(start, *(corners or [middle]), end))
         # the reason names the constraints that the shortest path crosses
@@ -275,9 +275,9 @@ class Movables:
     def _danger_on_the_way(
         self, target: Target, constraints: Cubes, proposition_numbers: Sequence[int]
     ) -> tuple[np.ndarray, Grid, MapParts]:
-        """Return the constraints' robustness with the object carried over each cell, (rows, columns).
+        """Return the constraints' greatest robustness with the object above each cell, (rows, columns).
 
-        Also return the grid, and the underlying maps for the last orientation of the object.
+        Also return the grid, and the maps of the object's last orientation.
         """
         settings, tracked = self.settings, self.sample.objects[target.name]
         if tracked.height is not None and settings.lift:
@@ -285,7 +285,7 @@ class Movables:
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
         centre = centre_of(tracked.footprint)
         grid = settings.workspace.grid.reaching(*centre)
-        # the constraints decide here; all objects are supports, so none is an obstacle
+        # only the constraints decide here, so all objects are declared supports, which are no obstacles
         free_workspace = Workspace(grid, supports=frozenset(self.sample.objects))
         formulas = [self.propositions[proposition] for proposition in proposition_numbers]
         positions = {proposition: place for place, proposition in enumerate(proposition_numbers)}
@@ -324,9 +324,9 @@ def _tuple(names: Collection[str] | None) -> tuple[str, ...] | None:
 def with_choice(
     consideration: Consideration, candidates: Sequence[Candidate], settings: Settings
 ) -> Consideration:
-    """Return an edge with its candidates and the best one chosen; pruned if no candidate has a target.
+    """Return an edge with its candidates, the best candidate chosen; pruned if no candidate has a target.
 
-    The best candidate is the first one of `by_cost`; among equal ones, the first candidate.
+    The best candidate is the first candidate of `by_cost`; equal candidates keep their order.
     """
     targets_by_index = by_cost(candidates, settings)
     if not targets_by_index:
@@ -341,7 +341,7 @@ def with_choice(
 def choose_candidate(
     consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
 ) -> Consideration:
-    """Return an edge with one candidate chosen, or none, and with the planned motions."""
+    """Return an edge with the candidate `number` chosen, and with the planned motions; None chooses none."""
     candidates = tuple(
         replace(candidate, is_chosen=index == number)
         for index, candidate in enumerate(consideration.candidates)
@@ -350,7 +350,7 @@ def choose_candidate(
 
 
 def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
-    """Return the targets of the candidates by the candidate's index, the best target first."""
+    """Return the targets by the index of their candidate, the best target first."""
     targets = [
         (number, candidate.target)
         for number, candidate in enumerate(candidates)
@@ -360,7 +360,7 @@ def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Ta
 
 
 def costs_of(target: Target, skill: Skill) -> tuple[float, float]:
-    """Return the cost by which targets are compared, and the cost that decides between equal ones.
+    """Return two costs: targets are compared by the first cost, and equal targets by the second.
 
     Pushes compare path lengths first, placements compare robustness first. Numbers are rounded, because equal
     targets differ in their last digits.
@@ -383,7 +383,7 @@ class PredictedState(NamedTuple):
     """A predicted sample after motions.
 
     Attributes:
-        moved: poses of the moved objects, sorted by name; a turn is the sum of an object's turns.
+        moved: poses of the moved objects, sorted by name; the turn is the sum over an object's motions.
     """
 
     sample: Sample
@@ -405,7 +405,7 @@ class Expectations:
         automaton, regions, settings: automaton, regions and settings of the planner.
         formulas: propositions of the automaton.
         attempts: earlier motions of the run.
-        budget: number of maps that may still be computed.
+        budget: number of maps that the decision may still compute.
     """
 
     automaton: Automaton
@@ -427,12 +427,12 @@ class Expectations:
         return self._symbols[scene.moved]
 
     def values(self, sample: Sample, more: Sequence[Formula] = ()) -> tuple[list[float], list[float]]:
-        """Return bounds of the robustness of all propositions, and of `more` formulas, in a sample."""
+        """Return lower and upper bounds of the robustness of all propositions and of `more` formulas."""
         self.budget.spend(_LOOK)
         return values_in(sample, [*self.formulas, *more], self.regions)
 
     def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
-        """Return the distance of an object in a sample to each of the others."""
+        """Return the distance of an object to each of `others` in a sample, footprint units."""
         self.budget.spend(_LOOK)
         distance_formulas = [distance_between(name, neighbour) for neighbour in others]
         return values_in(sample, distance_formulas, self.regions)[0] if distance_formulas else []
@@ -457,11 +457,11 @@ class Expectations:
         )
 
     def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
-        """Return the constraints as conjunctions of relations, none of which may hold."""
+        """Return the constraints as conjunctions of relations; no conjunction may hold."""
         return [conjunction for cube in constraints for conjunction in demands_of(cube, self.formulas, 0.0)]
 
     def relations_about(self, name: str, constraints: Cubes) -> tuple[list[Formula], Cubes]:
-        """Return relations, and the constraints on an object as cubes over these relations."""
+        """Return the constraints on an object: their relations, and cubes over these relations."""
         return _cubes_of(
             [conjunction for conjunction in self.relations(constraints) if _subjects_of(conjunction, [name])]
         )
@@ -486,9 +486,9 @@ _MOST_PARKED: Final = 2
 _MOST_PLACES: Final = 4
 """Maximum number of places that are tried for a parked object."""
 _LOST: Final = -1
-"""Number instead of a state, if acceptance is or may be lost."""
+"""Result instead of a state, if acceptance is lost or may be lost."""
 _ASTRAY: Final = -2
-"""Number instead of a state, if another edge is taken."""
+"""Result instead of a state, if the motion takes another edge."""
 
 
 class Ordered(NamedTuple):
@@ -496,8 +496,8 @@ class Ordered(NamedTuple):
 
     Attributes:
         is_aside: whether the first motion parks an object.
-        arrangement: number of the arrangement in the order of the search, from 1; 0 for places of the last
-            decision, and for a single motion.
+        arrangement: number of the arrangement in the search, from 1. 0 for the places of the last decision,
+            and for a single motion.
     """
 
     motions: tuple[Target, ...]
@@ -529,10 +529,10 @@ class MotionOrder:
     Attributes:
         begin: scene before the motions.
         aims: transitions that the motions must take: a whole path to acceptance, or one edge.
-        constraints: guards that must not hold before the first of these transitions.
+        constraints: guards that must not hold before the first transition.
         places: target pose of each object.
         robustness: robustness of the progress set with all objects at their places.
-        least: number of maps that the search reserves for the decision.
+        least: number of maps that the search must leave for the rest of the decision.
     """
 
     expected: Expectations
@@ -552,9 +552,9 @@ class MotionOrder:
         self._idle_states = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
 
     def find(self) -> Ordered | None:
-        """Return the first order with the fewest parked objects; None if none is found."""
+        """Return the first order with the fewest parked objects; None if no order is found."""
         for self._max_parked in range(_MOST_PARKED + 1):
-            # a dead end may be passable with more parked objects
+            # with more parked objects, a dead end may have an order
             self._dead_ends.clear()
             self._has_parked = self._max_parked == 0
             sequence = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
@@ -579,7 +579,7 @@ class MotionOrder:
         for name in sorted(remaining_names):
             target_key = scene.moved, state, name
             if target_key not in self._targets:
-                # checked first, because the automaton's next state costs less than the object's path
+                # the next state is checked first, because it costs less than the object's path
                 next_scene = scene.after(name, self._place_of(scene, name))
                 leads_on = self._next_state(next_scene, state, is_first) >= 0
                 self._targets[target_key] = self._target(scene, state, name, is_first) if leads_on else None
@@ -622,7 +622,7 @@ class MotionOrder:
         parked_names: tuple[str, ...],
         is_first: bool,
     ) -> Ordered | None:
-        """Return a motion and the motions of the remaining objects; None if any is impossible."""
+        """Return a motion and the motions of the remaining objects; None if a motion is impossible."""
         if target is None:
             return None
         next_scene = scene.after(target.name, target.pose)
@@ -640,9 +640,9 @@ class MotionOrder:
         )
 
     def _next_state(self, scene: PredictedState, state: int, is_first: bool) -> int:
-        """Return the state after a motion; `_LOST` or `_ASTRAY` if it is not on the path."""
+        """Return the state after a motion; `_LOST` or `_ASTRAY` if the state is not on the path."""
         aim, is_strict = self.aims[0].target, is_first or len(self.aims) == 1
-        # later samples repeat the scene, and may take further transitions
+        # the scene stays the same in later samples, which may take further transitions
         for _ in range(len(self.aims)):
             states = self.expected.states_after(scene, state)
             (next_state,) = states if len(states) == 1 else (_LOST,)
@@ -658,7 +658,7 @@ class MotionOrder:
         return state
 
     def _aims_hold(self, scene: PredictedState, remaining_names: frozenset[str], parked_name: str) -> bool:
-        """Return whether the aims hold in the end if a parked object without its own place stays aside."""
+        """Return whether the aims hold at the end; a parked object without its own place stays aside."""
         if parked_name in self.places:
             return True
         final_sample = move_objects(
@@ -667,7 +667,7 @@ class MotionOrder:
         return all(self.expected.robustness(final_sample, aim.guard) >= 0.0 for aim in self.aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
-        """Return the target pose of an object, with the turn from its orientation in a scene."""
+        """Return the target pose of an object; its turn starts from the orientation in the scene."""
         (x, y, turn), zero = self.places[name], (0.0, 0.0, 0.0)
         turn_so_far = dict(scene.moved).get(name, zero)[2] - dict(self.begin.moved).get(name, zero)[2]
         return x, y, turn - turn_so_far
@@ -678,7 +678,7 @@ class MotionOrder:
         return self.constraints if is_strict else self.expected.traps(state)
 
     def _spend(self, maps: int) -> bool:
-        """Subtract maps from the budget; return whether maps are left for this search."""
+        """Subtract maps from the budget, and return whether this search may continue."""
         self.expected.budget.spend(maps)
         return self.expected.budget.left >= self.least
 
@@ -737,7 +737,7 @@ class MotionOrder:
         parked_names: tuple[str, ...],
         is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
-        """Yield motions that park the objects that block the path or the place of an object."""
+        """Yield pairs (name, target) that park objects which block the path or the place of an object."""
         constraints, settings = self._constraints_at(state, is_first), self.expected.settings
         other_names = [movable for movable in self.expected.movables(scene).names if movable != name]
         other_names = [
@@ -770,7 +770,7 @@ class MotionOrder:
                     self.expected.budget.parking_places += 1
                     next_scene = scene.after(target.name, target.pose)
                     movables = self.expected.movables(scene)
-                    # a constraint may hold at every place of the blocker; then parking does not help
+                    # parking does not help if a constraint still holds with the blocker at its parking place
                     if not is_in_way and blocker in self._bound_by(
                         next_scene, {name: swept_object}, constraints
                     ):
@@ -784,7 +784,7 @@ class MotionOrder:
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
     ) -> TrackedObject | None:
-        """Return an object with the area that it covers on its path, without regard to `others`."""
+        """Return an object with the area of its path, which ignores `others`; None without a path."""
         settings, tracked = self.expected.settings, scene.sample.objects[name]
         pose = self._place_of(scene, name)
         if settings.skill == "place":
@@ -816,7 +816,7 @@ class MotionOrder:
     def _bound_by(
         self, scene: PredictedState, covered: Mapping[str, TrackedObject], constraints: Cubes
     ) -> set[str]:
-        """Return the objects in the constraints that would hold with a moved object on its path."""
+        """Return the objects in the constraints that a moved object would violate on its path."""
         ((name, swept_object),) = covered.items()
         relations, cubes = self.expected.relations_about(name, constraints)
         lower, upper = self.expected.values(with_objects(scene.sample, {name: swept_object}), relations)
@@ -830,7 +830,7 @@ class MotionOrder:
         }
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
-        """Return the neighbours of an object that may have blocked its failed motion."""
+        """Return the neighbours of an object that may have blocked the object's failed motion."""
         if not self.expected.movables(scene).failed_here(name):
             return set()
         near_distance = BESIDE * radius_of(scene.sample.objects[name])
@@ -840,7 +840,7 @@ class MotionOrder:
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
     ) -> tuple[Booleans, PropositionMaps]:
-        """Return in which cells (A, rows, columns) an object is clear and keeps constraints, and its maps."""
+        """Return whether an object is clear and keeps constraints, (A, rows, columns), and its maps."""
         settings = self.expected.settings
         maps = proposition_maps(formulas, self.expected.regions, sample, name, settings.workspace, grid)
         is_kept = danger_of(maps, constraints) < -settings.constraint_margin
@@ -856,10 +856,10 @@ class MotionOrder:
         is_first: bool,
         is_beside: bool,
     ) -> Iterator[Target]:
-        """Yield motions of an object to parking places, the nearest first.
+        """Yield motions of an object to parking places, nearest places first.
 
-        At a parking place no constraint holds, neither now nor with the other objects at their places. If
-        `is_beside`, the object is moved away from the object whose motion failed.
+        At a parking place no constraint holds now, and no constraint holds with the other objects at their
+        places. With `is_beside`, the object is moved away from the object whose motion failed.
         """
         settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
@@ -879,7 +879,7 @@ class MotionOrder:
                 centre_of(tracked.footprint), maps_now.grid, gradient.blocked == FREE
             )
             if name in self.places:
-                # the other objects will be at their places, and must not block the parked object's path
+                # at their places, the other objects must not block the parked object's path
                 reachable_cells &= _reachable_from(
                     self._place_of(scene, name)[:2], maps_now.grid, later_cells
                 )
@@ -905,7 +905,7 @@ class MotionOrder:
         untried_cells = np.ones_like(good_cells)
         for is_at_edge in (False, True) if settings.skill == "push" else (False,):
             if is_at_edge:
-                # in a corridor no place is clear of a path through the middle, so its edges are tried
+                # in a corridor no place is clear of a path through the middle, so its sides are tried
                 if is_beside:
                     return
                 good_cells = roomy_cells = (gradient.blocked == FREE) & later_cells & untried_cells
@@ -937,7 +937,7 @@ def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> B
 
 
 def _cubes_of(conjunctions: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
-    """Return the relations of conjunctions, and the conjunctions as cubes over these relations."""
+    """Return the relations in conjunctions, and the conjunctions as cubes over these relations."""
     formulas = list(dict.fromkeys(demand.formula for conjunction in conjunctions for demand in conjunction))
     return formulas, tuple(
         tuple((formulas.index(demand.formula), demand.wanted) for demand in conjunction)
@@ -946,7 +946,7 @@ def _cubes_of(conjunctions: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula]
 
 
 def _danger(cube: Cube, lower: Sequence[float], upper: Sequence[float]) -> float:
-    """Return the greatest possible robustness of a conjunction, by bounds of its members."""
+    """Return the greatest possible robustness of a conjunction, from bounds of its members."""
     return min((upper[number] if value else -lower[number] for number, value in cube), default=0.0)
 
 

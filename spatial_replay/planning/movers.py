@@ -1,7 +1,7 @@
-"""Prediction of objects that move by themselves, and of how long a motion near them stays safe.
+"""Predictions of objects that move without the robot, and of the time for which a motion near them is safe.
 
 An object is expected to repeat its motion between the newest two samples. The object that the robot moves is
-expected to continue along its path.
+expected to continue along the planned path.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from spatial_replay.trace.trace import Sample, Trace
 AHEAD: Final = 90
 """Minimum number of predicted samples.
 
-With only 30 samples, ten of about 80 simulated runs past a person were violated.
+With only 30 samples, ten of about 80 simulated runs past a person violated the specification.
 """
 MOST_AHEAD: Final = 600
 """Maximum number of predicted samples, for long motions."""
@@ -47,7 +47,7 @@ _MOST_BEGINNINGS: Final = 9
 _CORNER: Final = math.radians(2.0)
 """Least change of direction at which a pushing robot takes hold again, radians."""
 _UNSURE: Final = 2
-"""Maximum deviation of an object from its predicted course, in steps of a sample; it may turn back."""
+"""Maximum deviation of an object, which may turn back, from its predicted course; unit: steps of a sample."""
 _JITTER: Final = 1.0 / 30.0
 """Motion between two samples up to which an object counts as standing, cells."""
 _DIRECTIONS: Final = 16
@@ -92,7 +92,7 @@ def _advance(tracked: TrackedObject, motion: Pose) -> TrackedObject:
 
 
 def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: Skill) -> TrackedObject:
-    """Return the moved object one sample later; it stops at its target unless it strays from its path."""
+    """Return the moved object one sample later; an object on its path stops at its target."""
     turn = 0.0
     if target.turn and target.yaw is not None and tracked.yaw is not None:
         remaining_turn = math.remainder(target.yaw - tracked.yaw, math.tau)
@@ -102,7 +102,7 @@ def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: 
     if motion_length == 0.0:
         return moved_object(tracked, x, y, turn) if turn else tracked
     previous_place = x - motion[0], y - motion[1]
-    # more than half of its motion leads away from the path
+    # more than half of the motion leads away from the path
     is_straying = (
         _beside_way(target.waypoints, (x, y)) - _beside_way(target.waypoints, previous_place)
         > motion_length / 2.0
@@ -111,7 +111,7 @@ def _advance_along(tracked: TrackedObject, motion: Pose, target: Target, skill: 
         return moved_object(tracked, x + motion[0], y + motion[1], turn)
     if skill == "push" or len(target.waypoints) > 2:
         return moved_object(tracked, *_place_on_way(target.waypoints, (x, y), motion_length), turn)
-    # the robot chooses the path, so only its end is known
+    # the robot chooses the path, so only the end of the path is known
     share = min(1.0, math.dist((x, y), target.waypoints[-1]) / motion_length)
     return moved_object(tracked, x + share * motion[0], y + share * motion[1], turn)
 
@@ -128,7 +128,7 @@ def _place_on_way(
 def _way_from(
     waypoints: Sequence[tuple[float, float]], tracked: TrackedObject
 ) -> tuple[tuple[float, float], ...]:
-    """Return the rest of a path, from an object's current place."""
+    """Return the remaining path from an object's current place."""
     place = centre_of(tracked.footprint)
     passed_length, _ = _nearest_on_way(waypoints, place)
     points_ahead, leg_end = [], 0.0
@@ -147,7 +147,7 @@ def _beside_way(waypoints: Sequence[tuple[float, float]], place: tuple[float, fl
 def _nearest_on_way(
     waypoints: Sequence[tuple[float, float]], place: tuple[float, float]
 ) -> tuple[float, tuple[float, float]]:
-    """Return the point of a path nearest to a place, preceded by its distance along the path."""
+    """Return the nearest point of a path to a place, as (length along the path, point)."""
     leg_start, least_distance, nearest_point = 0.0, math.inf, (0.0, place)
     for (u, v), (x, y) in pairwise(waypoints):
         leg_length = math.dist((u, v), (x, y))
@@ -165,7 +165,7 @@ def _nearest_on_way(
 
 
 def _point_at(waypoints: Sequence[tuple[float, float]], length: float) -> tuple[float, float]:
-    """Return the point at a length along a path, or the end of a shorter path."""
+    """Return the point at a length along a path; the end if the path is shorter."""
     for (u, v), (x, y) in pairwise(waypoints):
         leg_length = math.dist((u, v), (x, y))
         if length <= leg_length and leg_length > 0.0:
@@ -179,7 +179,7 @@ class Timing(NamedTuple):
 
     Attributes:
         step: distance that the object moves between two samples.
-        rest: longest time until the object starts to move, or moves again.
+        rest: longest time until the object starts to move, or continues its motion.
         approach: longest time from the beginning of a motion until its object moves.
     """
 
@@ -193,7 +193,7 @@ class MotionTimes:
     """Measured speeds and delays of a robot's motions, which predict the timing of the next motion.
 
     Attributes:
-        approach: longest time for which an object stood before it moved, or moved again, samples.
+        approach: longest time for which an object stood before it started or continued to move, samples.
     """
 
     approach: int = 0
@@ -207,7 +207,7 @@ class MotionTimes:
         self._newest_length, self._standing_samples = 0.0, 0
 
     def observe(self, length: float, least: float) -> None:
-        """Add the distance that the object moved between two samples; a distance up to `least` is a stand."""
+        """Add the distance that the object moved between two samples; up to `least`, the object stood."""
         if length <= least:
             self._newest_length = 0.0
             self._standing_samples += 1
@@ -242,7 +242,7 @@ class Course(NamedTuple):
 
 
 class Prospect(NamedTuple):
-    """Number of samples until acceptance is lost; infinite if it is not lost.
+    """Number of samples until acceptance is lost; infinite if acceptance is not lost.
 
     Attributes:
         perhaps: number of samples if other objects may also stop or turn back.
@@ -254,7 +254,7 @@ class Prospect(NamedTuple):
 
 
 class Evasion(NamedTuple):
-    """A decision on how an object evades others.
+    """A decision on how an object evades other objects.
 
     Attributes:
         aside: target of a motion aside; None if the object stays.
@@ -266,7 +266,7 @@ class Evasion(NamedTuple):
 
 
 class Lookout:
-    """Chooses how an object evades other objects that move by themselves."""
+    """Chooses how an object evades other objects that move without the robot."""
 
     def __init__(
         self,
@@ -300,7 +300,7 @@ class Lookout:
         skill = self._settings.skill
         sample_numbers = _numbers_ahead(waypoints, timing, skill)
         scene_inputs = sample, states, other_motions, name, sample_numbers
-        # the start of the motion is not known, so several start times are tested
+        # the start time of the motion is unknown, so several start times are tested
         place_series = [
             _places(waypoints, timing, share, sample_numbers, skill)
             for share in _beginnings(waypoints, timing, skill)
@@ -317,7 +317,7 @@ class Lookout:
         aside_target: Target | None = None
         if best_prospect.perhaps < math.inf:
             clear_ways = self._clear_ways(sample, name, _ways_aside(start, timing.step))
-            # a motion aside is a new motion, so it begins with the full approach
+            # a motion aside is a new motion, which begins with the full approach
             new_timing = timing._replace(rest=timing.approach)
             place_series = [
                 _places(clear_way, new_timing, 1.0, sample_numbers, skill) for clear_way in clear_ways
@@ -344,7 +344,7 @@ class Lookout:
         aim: Consideration,
         timing: Timing,
     ) -> Target:
-        """Return the target of a push with fewer corners, if other objects move away from such a path.
+        """Return the target of a push with a path of fewer corners, if other objects will leave such a path.
 
         Args:
             motions: motions of all objects between two samples.
@@ -404,15 +404,16 @@ class Lookout:
         sample_numbers: Sequence[int],
         place_series: Sequence[Floats],
     ) -> list[Prospect]:
-        """Return the prospect of each path, which is given as places (N, 2) in the predicted samples.
+        """Return the prospect of each path.
 
         Args:
             motions: motions of the other objects between two samples.
-            numbers: numbers of the predicted samples, counted from now.
+            sample_numbers: numbers of the predicted samples, counted from the newest sample.
+            place_series: places (N, 2) of the object in the predicted samples, for each path.
         """
         if not place_series:
             return []
-        # measured positions count as certain; only predictions of others are uncertain
+        # measured positions count as certain; only predictions of other objects are uncertain
         certain_objects = {
             object_name: replace(tracked, uncertainty=0.0) for object_name, tracked in sample.objects.items()
         }
@@ -425,7 +426,7 @@ class Lookout:
             replace(sample, objects=certain_objects, reported_ns={}), courses, sample_numbers
         )
         leaves = leaf_values(TraceScene(trace, self._regions), self._formulas, {})
-        # the first two rows are bounds without uncertainty, the last two with it
+        # the first two rows are bounds without uncertainty, the last two rows are bounds with uncertainty
         sure_bounds, possible_bounds = (
             (leaves[0], leaves[min(1, len(leaves) - 1)]),
             (leaves[-2 % len(leaves)], leaves[-1]),
@@ -456,7 +457,7 @@ class Lookout:
         for number, (lower, upper) in zip(sample_numbers, bounds_by_sample, strict=True):
             values = zip(lower, upper, strict=True)
             symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
-            # the samples since the previous predicted one are assumed equal to this one
+            # the samples since the previous predicted sample are assumed equal to this sample
             for _ in range(number - previous_number):
                 previous_states, states = states, self._automaton.step_set(states, symbol)
                 if states == previous_states:
@@ -473,7 +474,7 @@ def least_motion(settings: Settings) -> float:
 
 
 def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> tuple[int, ...]:
-    """Return the numbers of the predicted samples until a motion has ended; later ones are sparser."""
+    """Return the numbers of the predicted samples until the end of a motion; later samples are sparser."""
     length = sum(math.dist(begin, end) for begin, end in pairwise(way))
     end_sample = timing.rest + len(_stops(way, skill)) * timing.approach + length / timing.step
     last_sample = math.ceil(min(max(end_sample, AHEAD), MOST_AHEAD))
@@ -489,7 +490,7 @@ def _beginnings(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill
 
 
 def _stops(way: Sequence[tuple[float, float]], skill: Skill) -> list[int]:
-    """Return the indices of the points of a path at which a robot takes hold again: corners of a push."""
+    """Return the indices of the path's points at which a robot takes hold again: the corners of a push."""
     if skill != "push":
         return []
     angles = [math.atan2(y - v, x - u) for (u, v), (x, y) in pairwise(way)]
@@ -504,7 +505,7 @@ def _places(
     sample_numbers: Sequence[int],
     skill: Skill,
 ) -> Floats:
-    """Return the places (N, 2) of an object on a path in predicted samples, for a share of its rests."""
+    """Return the places (N, 2) of an object on a path in predicted samples; each rest is cut to a share."""
     points = np.array(way)
     path_lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     rests = np.zeros(len(way))
@@ -518,7 +519,6 @@ def _places(
 
 
 def _course_ahead(tracked: TrackedObject, motion: Pose, sample_numbers: Sequence[int]) -> Course:
-    """Return the predicted course of an object that moves by itself."""
     sample_steps, length = np.array(sample_numbers, np.float64), math.hypot(*motion[:2])
     places = np.array(centre_of(tracked.footprint)) + sample_steps[:, None] * np.array(motion[:2])
     return Course(places, motion[2], np.minimum(sample_steps, _UNSURE) * length)
@@ -527,7 +527,7 @@ def _course_ahead(tracked: TrackedObject, motion: Pose, sample_numbers: Sequence
 def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: Sequence[int]) -> Trace:
     """Return a trace that repeats a sample, with some objects moved along courses.
 
-    The trace is as long as the longest course. A shorter course, over `numbers`, is repeated.
+    The trace is as long as the longest course. A shorter course, over `sample_numbers`, is repeated.
     """
     start_trace = Trace.from_samples([sample])
     sample_count = max(len(course.places) for course in courses.values())
@@ -566,7 +566,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: 
 
 
 def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[float, float], ...]]:
-    """Return straight paths from a place in all directions, short paths first."""
+    """Return straight paths from a place in all directions, short paths first; `pace` is a sample's step."""
     angles = [math.tau * number / _DIRECTIONS for number in range(_DIRECTIONS)]
     return [
         (

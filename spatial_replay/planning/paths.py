@@ -1,8 +1,8 @@
 """Shortest paths over the free cells of a grid, by jump-point search (Harabor and Grastien, 2011).
 
 A step goes to one of the eight neighbours. A diagonal step needs both adjacent cells free, so that no corner
-is cut. Among paths with the same steps in another order, the search follows only the path with its diagonal
-steps first. It expands only goals and cells where a path may have to turn.
+is cut. Among paths that differ only in the order of their steps, the search follows the path with diagonal
+steps first. It expands only goals, and cells where a path may have to turn.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Path:
     """A path over cells.
 
     Attributes:
-        cells: (K, 2), rows and columns of the start, the turns and the end. Between them the path follows a
-            row, a column or a diagonal.
+        cells: (K, 2), rows and columns of the start, the turns and the end. Between these cells, the path
+            follows a row, a column or a diagonal.
         length: length, cells.
     """
 
@@ -74,7 +74,7 @@ def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
     lengths = np.full(is_free.size, np.inf)
     newest_cells = np.array([(start[0] + 1) * width + start[1] + 1])
     lengths[newest_cells] = 0.0
-    # only cells that became nearer in the last round can bring others nearer
+    # only cells with a shorter length since the last round can shorten other lengths
     while newest_cells.size:
         nearer_cells = []
         for down, right in product((-1, 0, 1), repeat=2):
@@ -91,7 +91,7 @@ def lengths_from(free: Booleans, start: tuple[int, int]) -> Floats:
 
 
 def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
-    """Return the cells (rows, columns) that paths over free cells reach from a free cell."""
+    """Return whether a path over free cells leads from a free cell to each cell, (rows, columns)."""
     reached = np.zeros(free.shape, np.bool_)
     reached[cell] = True
     while True:
@@ -177,7 +177,7 @@ def search(free: Flags, goals: Flags, box: Integers, start_row: int, start_colum
 
 @piece
 def _at_least(row: int, column: int, box: Integers) -> float:
-    """Return a lower bound of the distance to the goals: the distance to their box without obstacles."""
+    """Return a lower bound of the distance to the goals: the distance to the goals' box without obstacles."""
     row_gap = max(box[0] - row, row - box[1], 0)
     column_gap = max(box[2] - column, column - box[3], 0)
     return float(abs(row_gap - column_gap) + ROOT_2 * min(row_gap, column_gap))
@@ -185,7 +185,7 @@ def _at_least(row: int, column: int, box: Integers) -> float:
 
 @piece
 def _directions(free: Flags, row: int, column: int, down: int, right: int, directions: Integers) -> int:
-    """Write the possible next directions after a step into `ways`, and return their number."""
+    """Write the possible next directions after a step into `directions`, and return their number."""
     if down != 0 and right != 0:
         directions[0, 0], directions[0, 1] = down, 0
         directions[1, 0], directions[1, 1] = 0, right
@@ -238,7 +238,7 @@ def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, 
             return steps
         for side in (-1, 1):
             beside_row, beside_column = row + side * right, column + side * down
-            # the side cell is free, but the cell before it is blocked: its shortest path turns here
+            # the side cell is free, and its predecessor is blocked: its shortest path turns here
             if free[beside_row, beside_column] and not free[beside_row - down, beside_column - right]:
                 return steps
 

@@ -1,4 +1,4 @@
-"""The planner (Algorithm 1 of the paper), which takes one edge of the automaton at a time by motions."""
+"""The planner (Algorithm 1 of the paper): motions take the automaton's edges, one edge at a time."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ from spatial_replay.text import named_arguments, plural, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
 
 _LONGEST_WANTED: Final = 60
-"""Maximum length of a proposition in a reason, characters; the name of a spec replaces a longer one."""
+"""Maximum length of a proposition in a reason, characters; a spec's name replaces a longer proposition."""
 
 
 @named_arguments
@@ -105,15 +105,16 @@ class Planner:
         """Begin before the first sample.
 
         Args:
-            settings: settings of the planner. Without them, every object can be picked up and placed anywhere
-                around the objects of the first sample.
+            settings: settings of the planner. Without settings, every object can be picked up and placed
+                anywhere around the objects of the first sample.
             name: name of the spec to plan for; None for the only result of the specification.
             rate_hz: sampling rate, for bounds in seconds.
 
         Raises:
-            NoAutomatonError: past operators, bounds in seconds without a rate, or too large a formula.
+            NoAutomatonError: the formula has past operators, has bounds in seconds without a rate, or is too
+                large.
             UsageError: no such spec, several results without `name`, a template, propositions about earlier
-                samples, or a wrong type of settings.
+                samples, or settings of a wrong type.
         """
         if settings is not None:
             refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
@@ -129,7 +130,8 @@ class Planner:
         self._formulas = [proposition.formula for proposition in self.automaton.propositions]
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
-        # in sentences, a spec names a long proposition that is its only one, unless the spec is `G …`
+        # in sentences, the spec's name replaces a long proposition if the spec has no other proposition.
+        # a spec `G …` never replaces its proposition
         name_counts = Counter(name for names in self._specs for name in names)
         temporal_parts = (part for part in iter_formulas(formula) if isinstance(part, Temporal))
         name_counts += Counter(part.name for part in temporal_parts if part.name and part.operator == "G")
@@ -142,7 +144,7 @@ class Planner:
         ]
         self._named_automaton = self.automaton.with_propositions(named_propositions)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
-        # the states if goals that only empty groups satisfy are still open
+        # the possible states if goals that only empty groups satisfy count as open
         self._tested_states = self._states
         self._empty_groups: list[Group] = []
         # time of the newest observation of each object
@@ -153,7 +155,7 @@ class Planner:
         self._stop_reason = ""
         self._loss: Loss | None = None
         self._prune_reasons: dict[Edge, Reason] = {}
-        # pruned edges that several motions may still take
+        # pruned edges that a sequence of several motions may still take
         self._joint_edges: set[Edge] = set()
         self._attempts = Attempts()
         self._current_step: Step | None = None
@@ -161,7 +163,7 @@ class Planner:
         self._object_motions: dict[str, Pose] = {}
         self._motion_times = MotionTimes()
         self._decision_sample: Sample | None = None
-        # whether the motion must stop because of objects that move by themselves
+        # whether the motion must stop because of objects that move without the robot
         self._is_evaded = False
         # the motion that is delayed until other objects have passed
         self._delayed_target: Target | None = None
@@ -192,7 +194,7 @@ class Planner:
 
     @property
     def motions(self) -> int:
-        """The number of concluded motions; refused motions, during which no sample came, do not count."""
+        """The number of concluded motions; refused motions, which have no sample, do not count."""
         return self._attempts.motions
 
     @property
@@ -209,11 +211,11 @@ class Planner:
     def stop_reason(self) -> str:
         """The reason why a motion must stop now; empty while it may continue.
 
-        A motion must stop if the predicted next sample loses acceptance. In this sample every object repeats
-        its motion between the newest two samples, but the moved object stops at the end of its path. A
-        motion must also stop if a moving object may come too near before its end, and waiting or a motion
-        aside is safer. A robot that checks after each sample ends the motion with
-        `Outcome(False, planner.stop_reason)`.
+        A motion must stop if the predicted next sample loses acceptance. In the prediction, every object
+        repeats its motion between the newest two samples. The object that the robot moves stops at the end of
+        its path. A motion must also stop if another object may come too near before the end of the motion,
+        and waiting or a motion aside is safer. A robot checks the reason after each sample, and ends a motion
+        that must stop with `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 
@@ -262,13 +264,13 @@ class Planner:
             condition = loss_text(self._named_automaton, previous_states, previous_symbol, self._symbol)
             self._loss = Loss(sample.time_ns, condition)
         self._stop_reason = self._why_stop(previous_sample, sample)
-        # a wait ends early if the automaton is not in the state to which time alone should have led
+        # a wait ends early if the automaton is not in the state that the wait expects
         self._expected_states = (
             self._expected_states[1:] if not self._states.isdisjoint(self._expected_states[:1]) else ()
         )
 
     def _test(self, sample: Sample) -> None:
-        """Update `_tested_states`: empty groups' propositions count as open, unless that loses acceptance."""
+        """Update `_tested_states`: empty groups' propositions count as open if acceptance stays possible."""
         empty_groups = [groups_without_members(formula, sample) for formula in self._formulas]
         closed_states = self.automaton.step_set(self._tested_states, self._symbol)
         symbol = [None if empty else value for empty, value in zip(empty_groups, self._symbol, strict=True)]
@@ -285,7 +287,7 @@ class Planner:
         return bool(self._empty_groups) and self._states <= accepting and not self._tested_states <= accepting
 
     def _why_stop(self, previous_sample: Sample | None, sample: Sample) -> str:
-        """Return the reason why the motion must stop after two consecutive samples; "" if it may continue."""
+        """Return the reason why the motion must stop after two consecutive samples, or ""."""
         target = None if self._current_step is None else self._current_step.target
         if previous_sample is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
             return ""
@@ -334,8 +336,9 @@ class Planner:
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).
 
-        The planner prunes edges that no movable object can take now, and tries the next shortest path, until
-        an edge can be taken or no path is left. During a wait it returns the same step.
+        The planner prunes each edge that no movable object can take now, and tries the next shortest path.
+        The search ends with an edge that can be taken, or without a path. During a wait, the same step is
+        returned.
 
         Raises:
             UsageError: no sample was observed yet, or the last step was not concluded.
@@ -390,7 +393,7 @@ class Planner:
             self._yield_count = 0 if outcome.succeeded else self._yield_count
 
     def _yielding(self, step: Step, target: Target) -> Step:
-        """Return the step of a motion, or a step that first evades moving objects."""
+        """Return the step with its motion, or a step that evades moving objects before the motion."""
         if step.aim is None:
             return step
         target = self._lookout.past_others(
@@ -402,7 +405,7 @@ class Planner:
         self._attempts.withdraw(step.aim.edge, target.name)
         self._delayed_target = target
         self._yield_count += 1
-        # without a sample during the last motion aside, the robot did not move; so wait instead
+        # without a sample during the last motion aside, the robot did not move, so the step is a wait
         aside_target = None if self._is_idle else evasion.aside
         self._is_idle = False
         if aside_target is None:
@@ -431,7 +434,7 @@ class Planner:
         if self._states <= self.automaton.accepting:
             if self._tested_states <= self.automaton.accepting:
                 return self._decision("hold", (), "the specification is satisfied: hold")
-            # groups have members now, which do not satisfy the goal yet
+            # empty groups have received members, which do not satisfy the goal yet
             self._states = self._tested_states
         if self._is_blind():
             return self._decision("wait", (), f"not enough is seen: {self._unknown()}")
@@ -476,11 +479,11 @@ class Planner:
                 aim.edge,
                 *equivalent_edges(self.automaton, aim, idle, pruned_edges, self._symbol),
             }
-        # edges that need several motions, or a motion that failed before, come after all other edges
+        # edges that need several motions, or that repeat a failed motion, come after all other edges
         for index, (single_aim, aim_path, pruned_before) in undecided_aims.items():
             decision = lookahead.decide(single_aim, aim_path, pruned_before, together=True)
             if decision.pruned and self._attempts.motions > 0:
-                # a motion may fail by chance, so a failed motion is repeated if there is no other
+                # a motion may fail by chance, so a failed motion is repeated if there is no other motion
                 repeat_lookahead = self._foresight(self._attempts.forgiven())
                 repeat_decision = self._consider(single_aim, aim_path, repeat_lookahead.movables)
                 repeat_decision = repeat_lookahead.decide(
@@ -516,7 +519,7 @@ class Planner:
     def _consider(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
     ) -> Consideration:
-        """Return an edge with its candidates and the best one chosen; pruned if no single motion takes it."""
+        """Return an edge with its candidates; pruned if no single motion takes the edge."""
         later_names = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
             movables.candidate(name, consideration, later_names, refine=True)
@@ -547,7 +550,7 @@ class Planner:
         return replace(self._decision("execute", considered, reason), target=target)
 
     def bans(self, consideration: Consideration, pruned: Iterable[tuple[Edge, Reason]]) -> tuple[Ban, ...]:
-        """Return the shortest bans for the way to an edge.
+        """Return the shortest bans on the way to an edge.
 
         Args:
             pruned: pruned edges, whose guards the bans may also forbid.
@@ -561,7 +564,7 @@ class Planner:
         return bans_of(consideration.constraints.texts, pruned_guards)
 
     def _why(self, aim: Consideration, target: Target) -> str:
-        """Return the reason why an object is moved, and why it is preferred to other objects."""
+        """Return the reason why an object is moved, and why the object is preferred to other objects."""
         name = target.name
         unmet_by_cube = (
             [literal for literal in cube if self._symbol[literal[0]] is not literal[1]]
@@ -610,7 +613,7 @@ class Planner:
         return f"{equality} and {equal_words}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
 
     def _wanted_text(self, number: int, value: bool) -> str:
-        """Return the text of a literal with the names of its specs; only the names for a long text."""
+        """Return the text of a literal with the names of its specs; a long text is left out."""
         text, spec_text = (
             self._named_automaton.propositions[number].literal(value),
             " and ".join(self._specs[number]),
@@ -656,7 +659,8 @@ def _difference_text(comparison: tuple[tuple[str, str, str], float, float]) -> s
 
 
 MOST_YIELDED: Final = 1800
-"""Maximum number of waiting samples and motions aside without a successful motion; then motions do not wait.
+"""Maximum number of waiting samples and motions aside without a successful motion.
 
+After this number, motions no longer wait.
 In a minute at 30 Hz, a person who walks two metres to and fro at 0.1 m/s leaves the path free.
 """

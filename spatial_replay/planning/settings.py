@@ -1,7 +1,7 @@
 """Settings of a planner and its workspace: their text in a log, settings files and options.
 
-The workspace is a grid of positions, orientations, reach and obstacles. Checks collect the faults of all
-values, so that one error reports all of them.
+The workspace is a grid of positions, orientations, reach and obstacles. A check collects the faults of all
+values, so that one error reports all faults.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from spatial_replay.trace.trace import Sample
 # ---------------------------------------------------------------------------------------------- the workspace
 
 MOST_CELLS = 1_000_000
-"""Maximum number of cells over all orientations, whose maps take 1 GB; more cells are a typing error."""
+"""Maximum number of cells over all orientations; maps of this size take 1 GB."""
 
 CELLS_AROUND = 80
 """Number of cells along the longer side of a default workspace."""
@@ -65,7 +65,7 @@ class Grid:
 
     @classmethod
     def over(cls, xmin: float, ymin: float, xmax: float, ymax: float, cell_size: float) -> Grid:
-        """Return the grid over a box; its last cells may extend beyond it.
+        """Return the grid over a box; the last cells may extend beyond the box.
 
         Raises:
             UsageError: an empty box, or invalid numbers.
@@ -77,7 +77,7 @@ class Grid:
             raise UsageError(f"{box} is empty; give xmin, ymin, xmax, ymax")
         if not (is_number(cell_size) and cell_size > 0.0):
             raise UsageError(f"cell_size is {cell_size!r}; give a number above 0")
-        # the tolerance keeps rounding from adding a cell to a box of a whole number of cells
+        # without the tolerance, rounding could add a cell to a box of a whole number of cells
         columns, rows = (math.ceil(length / cell_size - 1e-9) for length in (xmax - xmin, ymax - ymin))
         return cls(xmin, ymin, cell_size, columns, rows)
 
@@ -105,9 +105,9 @@ class Grid:
         return np.asarray(((cells >= 0.0) & (cells < np.array([self.columns, self.rows]))).all(axis=-1))
 
     def reaching(self, x: float, y: float) -> Grid:
-        """Return this grid, extended on up to two sides so that it contains a point.
+        """Return this grid, extended on up to two sides to contain a point.
 
-        A point that is farther away than the length of the grid does not extend it.
+        A point that is farther away than the length of the grid does not extend the grid.
         """
         row, column = self._cell(x, y)
         left, below = max(-column, 0), max(-row, 0)
@@ -137,16 +137,16 @@ class Workspace:
         grid: possible positions of an object's centre.
         yaws: possible orientations of objects, radians; empty to keep orientations. An object of unknown
             orientation is turned by these angles.
-        keeps_yaw: whether an object may also keep its orientation. An object of unknown orientation then
-            always keeps it. Settings with the skill "push" set this.
+        keeps_yaw: whether an object may also keep its orientation. If so, an object of unknown orientation
+            always keeps its orientation. Settings with the skill "push" set this attribute.
         base: position (x, y) of the robot.
         nearest, farthest: range of distances from the base within the robot's reach, footprint units.
         obstacles: static obstacles, in addition to the objects of a sample.
-        supports: names of objects on which others may be placed; they are no obstacles.
+        supports: names of objects on which other objects may be placed; supports are no obstacles.
         clearance: least distance between objects, footprint units.
 
     Raises:
-        UsageError: invalid values; the message lists all of them.
+        UsageError: invalid values; the message lists all invalid values.
     """
 
     grid: Grid
@@ -198,7 +198,7 @@ class Workspace:
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:
-        """Return a workspace around all objects of a sample, with a margin of half their extent on each side.
+        """Return a workspace around all objects of a sample; each margin is half the objects' extent.
 
         Raises:
             UsageError: the sample has no object.
@@ -216,7 +216,7 @@ class Workspace:
         """Return the angles by which an object with an orientation may be turned, (A,), radians."""
         if not self.keeps_yaw:
             return np.array(self.yaws) - (yaw or 0.0) if self.yaws else np.zeros(1)
-        # the shorter direction of each turn
+        # each turn has the shorter direction
         turn_angles = () if yaw is None else (math.remainder(angle - yaw, math.tau) for angle in self.yaws)
         return np.array([0.0, *turn_angles])
 
@@ -250,7 +250,7 @@ def is_number(value: object) -> bool:
 
 
 def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[str]:
-    """Return a fault for each value, by name, that is not a finite number of at least `least`."""
+    """Return a fault for each named value that is not a finite number of at least `least`."""
     expected = "a finite number" if least == -math.inf else f"a finite number of at least {least:g}"
     return [
         f"{name} is {value!r}; give {expected}"
@@ -260,7 +260,7 @@ def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[s
 
 
 def count_faults(values: Mapping[str, Any]) -> list[str]:
-    """Return a fault for each value, by name, that is not a whole number of at least 1."""
+    """Return a fault for each named value that is not a whole number of at least 1."""
     return [
         f"{name} is {value!r}; give a whole number of at least 1"
         for name, value in values.items()
@@ -276,7 +276,7 @@ def kind_faults(name: str, value: object, kind: type, wanted: str) -> list[str]:
 def member_faults(
     name: str, members: Collection[Any], collection: type, member: type, wanted: str
 ) -> list[str]:
-    """Return faults if a value is not a collection, or has members that are not of a type."""
+    """Return faults if `members` is not a collection of the type, or has members of another type."""
     return kind_faults(name, members, collection, wanted) or [
         f"{name} has {value!r}; give {wanted}" for value in members if not isinstance(value, member)
     ]
@@ -288,7 +288,7 @@ Skill: TypeAlias = Literal["push", "place"]
 """Skill of the robot: push an object along a path in the plane, or pick and place it."""
 
 RoomFrom: TypeAlias = Literal["later", "all"]
-"""Objects from which a placed object keeps the preferred room: those that may still be moved, or all."""
+"""Objects from which a placed object keeps room: objects that may need a later motion, or all objects."""
 
 _SKILLS = ("push", "place")
 _ROOM_FROM = ("later", "all")
@@ -304,24 +304,23 @@ class Settings:
         skill: "push" (the path matters) or "place" (only the target matters).
         movable: names of the objects that the robot can move; None for all objects of a sample.
         margin: least robustness of progress at a target, in the unit of the relations, at least 0.
-        constraint_margin: margin by which constraints must be false, in the same unit, at least 0.
-        room: preferred clearance of a placed object, footprint units, at least 0, so that the object and its
-            neighbours can be grasped later. Targets with less room are used if there are no others.
-        room_from: "later" keeps room from objects that may still have to be moved before acceptance, and from
-            all objects if the placed object is one of them; otherwise only robustness counts. "all" always
-            keeps room from all objects, regardless of the robustness that it costs.
-        attempts: number of failed motions of one object, including refused ones, that prune an edge; at
-            least 1.
+        constraint_margin: margin by which constraints must be false, in the relations' unit, at least 0.
+        room: preferred clearance of a placed object, footprint units, at least 0. Room allows later grasps of
+            the object and its neighbours. Without targets of this room, targets with less room are used.
+        room_from: "later" keeps room from objects that may need a later motion. A placed object that may need
+            a later motion itself keeps room from all objects. Otherwise only robustness counts. "all" always
+            keeps room from all objects, even at the cost of robustness.
+        attempts: number of failed motions of one object that prune an edge, at least 1. Refused motions count
+            as failed.
         motions: maximum number of objects that are moved for one edge, at least 1. With 1, the planner takes
             each edge by one motion and does not look ahead, as in the paper.
-        lift: height by which an object is raised while it is carried, footprint units, at least 0. Its path
-            then avoids constraints, and may cross objects that are low enough. None leaves the path to the
-            robot.
+        lift: height by which a carried object is raised, footprint units, at least 0. The path avoids
+            constraints, and may cross low objects. None leaves the path to the robot.
         refine: whether targets are refined near the centre of their cell and, with several orientations,
-            between these. Otherwise targets are centres of cells.
+            between the orientations. Without refinement, targets are centres of cells.
 
     Raises:
-        UsageError: invalid values; the message lists all of them.
+        UsageError: invalid values; the message lists all invalid values.
     """
 
     workspace: Workspace
@@ -358,12 +357,12 @@ class Settings:
         yield from kind_faults("refine", self.refine, bool, "True or False")
 
 
-_PLAIN: Final = tuple(each.name for each in fields(Settings) if each.name != "workspace")
-"""Settings that are written to the text without conversion."""
+_PLAIN: Final = tuple(setting.name for setting in fields(Settings) if setting.name != "workspace")
+"""Settings that the text contains without conversion."""
 
 
 def text_from_settings(settings: Settings) -> str:
-    """Return settings as JSON, from which `settings_from_text` reads the same numbers."""
+    """Return settings as JSON; `settings_from_text` reads exactly equal settings."""
     workspace, grid = settings.workspace, settings.workspace.grid
     return json.dumps(
         {
@@ -417,7 +416,7 @@ def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Se
 
     Args:
         path: path or address of the file.
-        base: settings to change; without them, the file must have `area` and `cell_size`.
+        base: settings to change. Without these, the file must have `area` and `cell_size`.
 
     Raises:
         MissingFileError: there is no such file.
@@ -461,7 +460,7 @@ def parse_setting(text: str) -> Mapping[str, Any]:
     try:
         return parse_settings(f"{key}: {value}", option)
     except UsageError as error:
-        # the only line has no useful number, and the option already names the key
+        # a setting has only one line, and the option already names the key
         message = str(error).replace(f"{option}:1: {key}", option, 1).replace(f"{option}:1", option)
         raise UsageError(message) from None
 

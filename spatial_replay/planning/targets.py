@@ -1,6 +1,6 @@
 """Targets: the best cell of an object's gradient map or, for a push, the nearest good cell within reach.
 
-A target is then refined on finer grids, from the centre of its cell to a better place and turn nearby.
+Refinement on finer grids then moves a target from the centre of its cell to a better place and turn nearby.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _HALVED: Final = 4
 _MOST_GRIDS: Final = 12
 """Maximum number of measured grids for one target."""
 _FARTHEST: Final = 2.0
-"""Maximum distance of a refined target from its old place, along x and along y, cells."""
+"""Maximum distance of a refined target from the unrefined target, along x and along y, cells."""
 _SAME: Final = 0.25
 """Distance up to which two poses count as the same, cells."""
 _SAME_TURN: Final = math.radians(3.0)
@@ -72,12 +72,12 @@ def find_target(
     failed: Collection[tuple[float, float]] = (),
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target for an object, or the reason why there is none.
+    """Return the target for an object, or the reason why there is no target.
 
     Args:
         gradient: map of the progress set.
         tracked: object before the motion.
-        room: (A, rows, columns), distance to the objects from which room is kept.
+        room: (A, rows, columns), distance to the objects from which the target keeps room.
         failed: places (x, y) where earlier motions failed.
         failures: targets of failed motions in the current scene.
     """
@@ -100,11 +100,11 @@ def good_cells(
     failed: Collection[tuple[float, float]] = (),
     failures: Sequence[Target] = (),
 ) -> Booleans:
-    """Return the cells that will do as a target, (A, rows, columns); arguments as in `find_target`."""
+    """Return whether each cell is suitable as a target, (A, rows, columns); arguments as in `find_target`."""
     is_met = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     is_good: Booleans = is_met & ~avoided_cells(gradient, settings, failed)
     if settings.skill == "place" and failures:
-        # cells at least a finger's width from failed targets; without any, cells with other poses than these
+        # cells at least a finger's width from failed targets; without such cells, all poses that did not fail
         for radius in (_spread(settings), _SAME * _cell(settings)):
             is_untried = is_good & ~tried_poses(gradient, failures, radius)
             if is_untried.any():
@@ -113,7 +113,7 @@ def good_cells(
 
 
 def tried_cells(candidate: Candidate, settings: Settings) -> Booleans:
-    """Return the cells that would do but for failed motions of a candidate, (A, rows, columns)."""
+    """Return whether only failed motions of a candidate make a cell unsuitable, (A, rows, columns)."""
     gradient = candidate.map
     is_good = good_cells(gradient, settings, candidate.failed, candidate.failures)
     return np.asarray((gradient.blocked == FREE) & (gradient.robustness >= settings.margin) & ~is_good)
@@ -123,10 +123,10 @@ def least_room(good: Booleans, room: Floats, settings: Settings, failures: Seque
     """Return the room that a placed object keeps; -inf if no cell has the preferred room.
 
     Args:
-        good: cells that will do.
+        good: (A, rows, columns), whether each cell is suitable as a target.
         room, failures: as in `find_target`.
     """
-    # after failures, the cells with the most room count if no cell has the preferred room
+    # after failures, cells with the most room are required if no cell has the preferred room
     most_room = float(room[good].max(initial=-math.inf))
     preferred = min(settings.room, most_room) if failures else settings.room
     return preferred if most_room >= preferred else -math.inf
@@ -139,7 +139,7 @@ def target_in(
     pose: tuple[float, float, float],
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target for an object at a pose (x, y, turn) of a map, or the reason why it is impossible."""
+    """Return the target at a pose (x, y, turn) of an object's map, or the reason why it is impossible."""
     cell = gradient.cell_of(*pose)
     if gradient.blocked[cell] != FREE:
         return REASONS[gradient.blocked[cell]]
@@ -157,7 +157,7 @@ def nearest_target(
     settings: Settings,
     failures: Sequence[Target] = (),
 ) -> Target | str:
-    """Return the target in the nearest of `good` cells (A, rows, columns), or why there is none."""
+    """Return the target in the nearest of `good` cells (A, rows, columns), or the reason for no target."""
     if not good.any():
         return "there is no place for it"
     if settings.skill == "push":
@@ -202,7 +202,7 @@ def _nearest_cell(
         return "no free path leads to a good place" + _but_for(failures)
     _, best_layer, path = min(routes, key=lambda route: route[0])
     cells = [(row, column) for row, column in (*entry_path.cells.tolist(), *path.cells[1:].tolist())]
-    # an object off the centre of its cell need not go to this centre first
+    # an object off the centre of its cell need not start at this centre
     first_corner = 0
     if cells[0] == cell and len(cells) > 1:
         first_corner = int(is_clear_leg(gradient, (start, gradient.grid.centre(*cells[1])), settings))
@@ -219,8 +219,8 @@ class Ways(NamedTuple):
 
     Attributes:
         lengths: (rows, columns), length of the shortest way to each cell; inf without a way.
-        shortest: length of the shortest way to a cell that will do.
-        end: middle of the nearest of these cells to the target.
+        shortest: length of the shortest way to a suitable cell.
+        end: centre of the suitable cell at this length that is nearest to the target.
     """
 
     lengths: Floats
@@ -229,7 +229,7 @@ class Ways(NamedTuple):
 
 
 def ways_of(candidate: Candidate, target: Target, settings: Settings) -> Ways | None:
-    """Return the ways that `find_target` compares for a push; None if it finds no way."""
+    """Return the ways that `find_target` compares for a push; None if there is no way."""
     gradient, failures = candidate.map, candidate.failures
     grid = gradient.grid
     tracked = gradient.made_of.now.about.sample.objects[candidate.name]
@@ -286,7 +286,7 @@ def _without_corners(
 
 
 def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
-    """Return the goals (rows, columns) in which an object can be turned to the orientation of a layer."""
+    """Return whether an object can be turned to a layer's orientation in each goal cell, (rows, columns)."""
     # only the box around the goals is measured, instead of the whole grid
     is_turnable = np.zeros(goals.shape, np.bool_)
     if goals.any():
@@ -307,7 +307,7 @@ def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Sett
 def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settings) -> Booleans:
     """Return whether a map's object can turn on the spot in each cell of a grid, (rows, columns).
 
-    At several orientations during the turn, no obstacle may touch it and no constraint may hold.
+    At several orientations during the turn, no obstacle may touch the object and no constraint may hold.
     """
     step_count = math.ceil(abs(turn) / _SWEPT)
     subject = gradient.made_of.now.about
@@ -326,10 +326,10 @@ def _but_for(failures: Sequence[Target]) -> str:
 
 
 def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], settings: Settings) -> bool:
-    """Return whether a map's object stays clear on a straight leg, also between the centres of cells."""
+    """Return whether a map's object stays clear on a straight leg, including points between cell centres."""
     grid, workspace = gradient.grid, settings.workspace
     points = list(points_along(leg, grid.cell_size / _PLACES_IN_CELL))
-    # at any point of a cell the clearance is at most half a diagonal less than at the centre
+    # anywhere in a cell, the clearance is at most half a diagonal less than at the centre
     least_clearance = workspace.clearance + grid.cell_size / math.sqrt(2.0)
     if all(gradient.clearance[0][grid.cell(*point)] > least_clearance for point in points):
         return True
@@ -340,18 +340,17 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
             (), subject.regions, subject.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
         ).clearance[0, 0, 0]
         > workspace.clearance
-        # the first point is where the object is already
+        # the first point is the object's current place
         for x, y in points[1:]
     )
 
 
 def _spot(x: float, y: float, size: float) -> Grid:
-    """Return a grid of one cell around a point."""
     return Grid(x - size / 2, y - size / 2, size, 1, 1)
 
 
 def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
-    """Return the cells (rows, columns) near an object that are in about the direction of a failed push."""
+    """Return the cells (rows, columns) near an object that are roughly in the direction of a failed push."""
     failed_cells = np.zeros(grid.shape, np.bool_)
     centre, radius = centre_of(tracked.footprint), radius_of(tracked)
     offsets = (grid.centres() - np.array(centre)).reshape(*grid.shape, 2)
@@ -368,7 +367,7 @@ def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Ta
 
 
 def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject) -> bool:
-    """Return whether a push begins in about the direction of a failed push."""
+    """Return whether a push begins roughly in the direction of a failed push."""
     radius = radius_of(tracked)
     direction = _beginning(target, radius)
     angles = (math.remainder(direction - _beginning(failure, radius), math.tau) for failure in failures)
@@ -376,7 +375,7 @@ def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject
 
 
 def _beginning(target: Target, distance: float) -> float:
-    """Return the first direction of a path: the angle to its first point at a distance, or to its end."""
+    """Return the first direction of a path: the angle to the point at a distance, or to the end."""
     start, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
     x, y = next((point for point in points if math.dist(point, start) >= distance), target.waypoints[-1])
     return math.atan2(y - start[1], x - start[0])
@@ -387,8 +386,9 @@ def _path_into_reach(
 ) -> Path | None:
     """Return the path to the nearest free cell.
 
-    A path may cross cells out of reach only if it starts in one. It may cross constrained cells only if it
-    starts in one, but no occupied cells. From an occupied cell it first jumps to the nearest passable cell.
+    A path may cross cells out of reach only if it starts out of reach. It may cross constrained cells only if
+    its first cell is not passable. It never crosses occupied cells: from an occupied cell, it starts at the
+    nearest passable cell.
     """
     is_free = gradient.blocked[0] == FREE
     is_reached = settings.workspace.within_reach(gradient.grid)[cell]
@@ -401,7 +401,6 @@ def _path_into_reach(
 
 
 def _nearest(cells: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
-    """Return the nearest of `cells` to a cell."""
     indices = np.argwhere(cells)
     row, column = indices[int(np.argmin(((indices - np.array(cell)) ** 2).sum(axis=1)))].tolist()
     return row, column
@@ -438,7 +437,7 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
 
 
 def _why_too_large(gradient: GradientMap) -> str:
-    """Return a sentence on a region or object that is too small for a map's object; "" if there is none."""
+    """Return a sentence on a region or object that is too small to enclose a map's object, or ""."""
     subject = gradient.made_of.then.about
     formulas = [
         subject.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
@@ -462,7 +461,7 @@ _Rounded: TypeAlias = tuple[Floats, float]
 
 
 def _outlines_of(term: Term, subject: MapSubject) -> list[_Rounded]:
-    """Return the outlines of an object or region; none for other terms."""
+    """Return the outlines of an object or region; no outlines for other terms."""
     name = getattr(term, "name", "")
     if isinstance(term, TrackedName) and name in subject.sample.objects:
         return [(part.vertices, part.radius) for part in subject.sample.objects[name].footprint.parts]
@@ -472,7 +471,7 @@ def _outlines_of(term: Term, subject: MapSubject) -> list[_Rounded]:
 
 
 def _extent(outlines: Sequence[_Rounded], turn: float) -> Floats:
-    """Return the width along x and y of outlines that are turned by an angle."""
+    """Return the widths (2,) of outlines along x and y, after a turn of the outlines."""
     cosine, sine = math.cos(turn), math.sin(turn)
     rotation = np.array([[cosine, sine], [-sine, cosine]])
     turned_outlines = [(vertices @ rotation, radius) for vertices, radius in outlines]
@@ -494,8 +493,8 @@ def refine_target(
     """Return the most robust target near a target, or the target itself.
 
     This is a compass search: each step takes the best of 5 x 5 places around the newest place, in up to three
-    turns. If no place is better, the spacing is halved. Only free places count. If the target has the
-    preferred room, only places with this room count.
+    turns. If no place is better, the spacing is halved. Only free places are allowed. If the target has the
+    preferred room, only places with the preferred room are allowed.
 
     Args:
         tracked: object before the motion.
@@ -507,7 +506,7 @@ def refine_target(
     pose, best_robustness, required_room = target.pose, target.robustness, -math.inf
     avoided_radius = _spread(settings)
     if is_repeated(target, failures, settings):
-        # any other place that is good enough is better
+        # every other place with the required margin is better
         best_robustness = settings.margin - 2.0 * _BETTER
     if _is_near(target, failures, avoided_radius):
         avoided_radius = _SAME * _cell(settings)
@@ -521,7 +520,7 @@ def refine_target(
             else ()
         )
         gradient, room = measure(Grid(*corner, spacing, 5, 5), yaws)
-        # other places need the preferred room only if the target itself has it
+        # other places need the preferred room only if the target itself has the preferred room
         if grid_number == 0:
             middle = len(gradient.turns) // 2, 2, 2
             required_room = settings.room if room[middle] >= settings.room else -math.inf
@@ -556,7 +555,7 @@ def tried_poses(gradient: GradientMap, failures: Sequence[Target], radius: float
 
 
 def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) -> bool:
-    """Return whether a target equals a failed target within a fraction of a cell."""
+    """Return whether a target equals a failed target, within a fraction of a cell."""
     return _is_near(target, failures, _SAME * _cell(settings))
 
 
@@ -580,7 +579,7 @@ def _cell(settings: Settings) -> float:
 def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, settings: Settings) -> Booleans:
     """Return whether each pose is within the permitted distance of a target, (A, rows, columns)."""
     offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
-    # with a tolerance, because places of grids are rounded
+    # the tolerance is for rounding of the grids' places
     is_near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
     is_turn_allowed = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (
         1.0 + 1e-9
@@ -589,7 +588,7 @@ def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, setting
 
 
 def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> float:
-    """Return the maximum turn of an object in a refinement: half the angle to the next orientation, or 0.
+    """Return the maximum turn of an object in a refinement: half the least angle between orientations, or 0.
 
     A pushed object that keeps its orientation is not turned.
     """
@@ -616,14 +615,14 @@ def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
 
 
 class RoomCost(NamedTuple):
-    """Cost of the room around a target: the robustness of a target with less room, and its room."""
+    """Cost of the room around a target: a more robust target's robustness, and its smaller room."""
 
     robustness: float
     room: float
 
 
 def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:
-    """Return the cost of the room around a target; None if less room allows no more robustness."""
+    """Return the cost of the room around a target; None if no target with less room is more robust."""
     gradient = candidate.map
     if settings.skill != "place" or settings.room <= 0.0:
         return None

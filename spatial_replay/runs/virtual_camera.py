@@ -157,7 +157,6 @@ def _draw(
     translation: Floats,
     depth: Floats | None,
 ) -> None:
-    """Draw the visible part of a plate into an image."""
     cell_count = tile.shape[0]
     # the tile has a margin of one cell around the black square
     half_edge = plate.size / 2 * cell_count / (cell_count - 2)
