@@ -95,7 +95,7 @@ def maps_of(step: Step) -> list[TurnedMap]:
     return [
         TurnedMap(candidate, turn)
         for edge in step.considered
-        for candidate in sorted(edge.candidates, key=lambda each: each.is_chosen)
+        for candidate in sorted(edge.candidates, key=lambda member: member.is_chosen)
         for turn in sorted(range(len(candidate.map.turns)), key=lambda turn: _is_aim(candidate, turn))
     ]
 
@@ -124,16 +124,18 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers, ways: Ways |
     if ways is not None and _is_aim(turned.candidate, turned.turn):
         fields["way"] = _singles(ways.lengths)
     # the schema foxglove.Grid packs all fields of a cell together
-    cells = np.empty(values.shape, [(name, array.dtype.str) for name, array in fields.items()])
-    for name, array in fields.items():
-        cells[name] = array
-    size = cells.dtype.itemsize
+    packed_cells = np.empty(
+        values.shape, [(name, field_values.dtype.str) for name, field_values in fields.items()]
+    )
+    for name, field_values in fields.items():
+        packed_cells[name] = field_values
+    cell_bytes = packed_cells.dtype.itemsize
     message = GridMessage(
         frame_id=FRAME,
         column_count=grid.columns,
-        row_stride=size * grid.columns,
-        cell_stride=size,
-        data=cells.tobytes(),
+        row_stride=cell_bytes * grid.columns,
+        cell_stride=cell_bytes,
+        data=packed_cells.tobytes(),
     )
     message.timestamp.FromNanoseconds(time_ns)
     message.pose.position.x, message.pose.position.y = grid.xmin, grid.ymin
@@ -141,9 +143,9 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers, ways: Ways |
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = grid.cell_size
     offset = 0
-    for name, array in fields.items():
-        message.fields.add(name=name, offset=offset, type=_FIELD_TYPES[array.dtype.str])
-        offset += array.dtype.itemsize
+    for name, field_values in fields.items():
+        message.fields.add(name=name, offset=offset, type=_FIELD_TYPES[field_values.dtype.str])
+        offset += field_values.dtype.itemsize
     return message
 
 
@@ -154,9 +156,9 @@ def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndar
     yield "blocked_by", (layers.blocked_by[turn] + 1).astype("<u2")
     yield "clearance", _singles(gradient.clearance[turn])
     yield "room", _singles(gradient.made_of.now.room(room_from)[turn])
-    varies = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
-    numbers = sorted(range(len(varies)), key=lambda number: not varies[number])[:MOST_LAYERS]
-    for number in sorted(numbers):
+    is_varying = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
+    conjunct_numbers = sorted(range(len(is_varying)), key=lambda number: not is_varying[number])[:MOST_LAYERS]
+    for number in sorted(conjunct_numbers):
         # a leading number, so that no conjunct has the name of another field
         name = f"{number + 1}: {layers.conjuncts[number]}"
         yield name, _singles(layers.robustness[number, turn])
@@ -169,16 +171,18 @@ def _singles(values: np.ndarray) -> np.ndarray:
 
 def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
     """Return each field of a map's message, (rows, columns); none if the sizes in the message do not fit."""
-    columns, cell, row = message.column_count, message.cell_stride, message.row_stride
-    rows = len(message.data) // row if row else 0
-    if not rows or not columns or cell * columns > row:
+    columns, cell_bytes, row_bytes = message.column_count, message.cell_stride, message.row_stride
+    rows = len(message.data) // row_bytes if row_bytes else 0
+    if not rows or not columns or cell_bytes * columns > row_bytes:
         return {}
     # a field without a type is read as a number
-    types = {PackedElementField.UNKNOWN: "<f4"} | {kind: name for name, kind in _FIELD_TYPES.items()}
+    type_names = {PackedElementField.UNKNOWN: "<f4"} | {kind: name for name, kind in _FIELD_TYPES.items()}
     return {
-        field.name: np.ndarray((rows, columns), types[field.type], message.data, field.offset, (row, cell))
+        field.name: np.ndarray(
+            (rows, columns), type_names[field.type], message.data, field.offset, (row_bytes, cell_bytes)
+        )
         for field in message.fields
-        if field.type in types and field.offset + np.dtype(types[field.type]).itemsize <= cell
+        if field.type in type_names and field.offset + np.dtype(type_names[field.type]).itemsize <= cell_bytes
     }
 
 
@@ -197,14 +201,14 @@ def explain(
         ways: ways that its target was chosen among.
     """
     target = candidate.target
-    free = layers.limiting[layers.blocked_by < 0]
-    counts = np.bincount(free[free >= 0], minlength=len(layers.conjuncts)).tolist()
-    place = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
-    for number, text in enumerate(layers.conjuncts):
-        at_target = None if place is None else float(layers.robustness[number][place])
-        words = demand_of(text, bans, is_required=layers.required[number])
+    free_limits = layers.limiting[layers.blocked_by < 0]
+    limit_counts = np.bincount(free_limits[free_limits >= 0], minlength=len(layers.conjuncts)).tolist()
+    target_cell = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
+    for index, text in enumerate(layers.conjuncts):
+        at_target = None if target_cell is None else float(layers.robustness[index][target_cell])
+        words = demand_of(text, bans, is_required=layers.required[index])
         message.conjuncts.append(
-            PlanConjunct(text=text, limits=counts[number], at_target=at_target, words=words)
+            PlanConjunct(text=text, limits=limit_counts[index], at_target=at_target, words=words)
         )
     for cause in layers.causes:
         kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")
@@ -221,36 +225,34 @@ def explain(
         message.least_way = ways.shortest
         message.rule = _push_rule(ways, target, candidate.map.grid.cell_size)
     elif settings.skill == "place":
-        least = _least_room(candidate, settings)
-        if least > 0.0:
-            message.least_room = least
-        message.rule = _place_rule(least, settings.room)
+        required_room = _least_room(candidate, settings)
+        if required_room > 0.0:
+            message.least_room = required_room
+        message.rule = _place_rule(required_room, settings.room)
 
 
-def _push_rule(ways: Ways, target: Target, size: float) -> str:
+def _push_rule(ways: Ways, target: Target, cell_size: float) -> str:
     """Return how the target of a push is chosen among places that will do, in cells of a size."""
     x, y = ways.end
     rule = f"of places that will do, ({x:.4g}, {y:.4g}) has the shortest way over cells, {ways.shortest:.4g}"
-    if math.dist(ways.end, (target.x, target.y)) < 1e-6 * size:
+    if math.dist(ways.end, (target.x, target.y)) < 1e-6 * cell_size:
         return rule
-    return f"{rule}; the target is a more robust place within 2 cells ({2.0 * size:.4g}) of it"
+    return f"{rule}; the target is a more robust place within 2 cells ({2.0 * cell_size:.4g}) of it"
 
 
-def _place_rule(least: float, wanted: float) -> str:
+def _place_rule(required_room: float, preferred_room: float) -> str:
     """Return how the target of a placement is chosen among places that will do."""
-    if least > 0.0:
-        return (
-            f"of places with room {least:.4g} around them the most robust is taken, of equal ones the nearest"
-        )
-    lacks = f"no place has the preferred room of {wanted:.4g}; " if wanted > 0.0 else ""
-    return f"{lacks}the most robust place is taken, of equal ones the nearest"
+    if required_room > 0.0:
+        return f"of places with room {required_room:.4g} around them the most robust is taken, of equal ones the nearest"
+    lack_text = f"no place has the preferred room of {preferred_room:.4g}; " if preferred_room > 0.0 else ""
+    return f"{lack_text}the most robust place is taken, of equal ones the nearest"
 
 
 def _least_room(candidate: Candidate, settings: Settings) -> float:
     """Return the room that the target of a placement keeps; -inf if no place has the preferred room."""
-    good = good_cells(candidate.map, settings, candidate.failed, candidate.failures)
+    is_good = good_cells(candidate.map, settings, candidate.failed, candidate.failures)
     room = candidate.map.made_of.now.room(candidate.room_from)
-    return least_room(good, room, settings, candidate.failures)
+    return least_room(is_good, room, settings, candidate.failures)
 
 
 # -------------------------------------------------------------------------------------------------- decisions
@@ -297,14 +299,14 @@ class BlackBox:
             timings: also log the duration of each decision; logs of equal runs then differ.
         """
         self.planner, self.planning_s = planner, 0.0
-        self._write, self._times = write, timings
-        self._written = dict.fromkeys(_CHANNELS, 0)
+        self._write, self._has_timings = write, timings
+        self._message_counts = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
-        self._decision = PlanDecision()
-        self._tracked: TrackedObject | None = None
-        self._travelled: list[tuple[float, float]] = []
-        self._frame: MapFrame | None = None
+        self._last_message = PlanDecision()
+        self._start_object: TrackedObject | None = None
+        self._travelled_points: list[tuple[float, float]] = []
+        self._map_frame: MapFrame | None = None
 
     def observe(self, sample: Sample) -> None:
         """Observe the next sample.
@@ -312,13 +314,13 @@ class BlackBox:
         Raises:
             TraceError: the sample's time is not after the previous sample's time.
         """
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         self.planner.observe(sample)
         self._sample = sample
         tracked = self._moving_object()
         if tracked is not None:
-            self._travelled.append(centre_of(tracked.footprint))
-        self.planning_s += time.perf_counter() - began
+            self._travelled_points.append(centre_of(tracked.footprint))
+        self.planning_s += time.perf_counter() - start_s
 
     def next_step(self) -> Step:
         """Return the planner's next step, and write it unless the previous wait continues.
@@ -328,17 +330,19 @@ class BlackBox:
         Raises:
             UsageError: no sample was observed yet, or the last step was not concluded.
         """
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         step = self.planner.next_step()
-        took_s = time.perf_counter() - began
+        duration_s = time.perf_counter() - start_s
         if step is self._step:
             return step
-        ended = self._ended_wait(step.time_ns)
+        last_wait = self._ended_wait(step.time_ns)
         self._step = step
-        self._tracked = self._moving_object()
-        self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
+        self._start_object = self._moving_object()
+        self._travelled_points = (
+            [] if self._start_object is None else [centre_of(self._start_object.footprint)]
+        )
         layers, ways = _layers_of(step, self.planner), _ways_of(step, self.planner)
-        self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers, ways)
+        self._last_message = explained_decision(step, self.planner, self._message_counts[_MAPS], layers, ways)
         turned_maps = maps_of(step)
         maps = [
             map_message(
@@ -346,16 +350,18 @@ class BlackBox:
             )
             for turned_map in turned_maps
         ]
-        path = path_message(step.target, self._tracked, step.time_ns)
+        path = path_message(step.target, self._start_object, step.time_ns)
         if turned_maps:
             gradient, turn = turned_maps[-1].candidate.map, turned_maps[-1].turn
             settings = self.planner.settings
             obstacles = settings.workspace.named_obstacles
-            self._frame = map_frame(gradient, turn, settings.margin, obstacles)
-        drawing = map_drawing(self._frame, step.target, self._tracked, step.time_ns)
-        timings = [[_timing(step, took_s)]] if self._times else []
-        messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], [drawing], *timings)
-        self.planning_s += time.perf_counter() - began
+            self._map_frame = map_frame(gradient, turn, settings.margin, obstacles)
+        drawing = map_drawing(self._map_frame, step.target, self._start_object, step.time_ns)
+        timings = [[_timing(step, duration_s)]] if self._has_timings else []
+        messages = self._messages(
+            step.time_ns, [*last_wait, self._last_message], maps, [path], [drawing], *timings
+        )
+        self.planning_s += time.perf_counter() - start_s
         self._write(messages)
         return step
 
@@ -369,7 +375,7 @@ class BlackBox:
         if self._step is None or self._sample is None:
             raise UsageError("no step is being executed; decide on one first")
         step, end_ns = self._step, self._sample.time_ns
-        path = path_message(step.target, self._tracked, end_ns, self._travelled)
+        path = path_message(step.target, self._start_object, end_ns, self._travelled_points)
         self._step = None
         self._write(self._messages(end_ns, [self._with_outcome(outcome, end_ns)], [], [path]))
 
@@ -387,10 +393,10 @@ class BlackBox:
             reason=outcome.reason,
             at=outcome.at or "",
             states=self.planner.states,
-            travelled=[coordinate for point in self._travelled for coordinate in point],
+            travelled=[coordinate for point in self._travelled_points for coordinate in point],
         )
-        self._decision.outcome.CopyFrom(message)
-        return self._decision
+        self._last_message.outcome.CopyFrom(message)
+        return self._last_message
 
     def _moving_object(self) -> TrackedObject | None:
         """Return the object that the last step moves, as in the newest sample."""
@@ -398,23 +404,23 @@ class BlackBox:
             return None
         return self._sample.objects.get(self._step.target.name)
 
-    def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
+    def _messages(self, time_ns: int, *channel_messages: Sequence[Message]) -> Messages:
         """Return messages of each channel, with consecutive numbers."""
         streams = []
         # the last channel, for timings, is often absent
-        for channel, messages in zip(_CHANNELS, of_channels, strict=False):
-            first = self._written[channel]
-            self._written[channel] += len(messages)
+        for channel, messages in zip(_CHANNELS, channel_messages, strict=False):
+            first_number = self._message_counts[channel]
+            self._message_counts[channel] += len(messages)
             # deterministic, because a log is verified by comparing bytes
             payloads = [message.SerializeToString(deterministic=True) for message in messages]
             times_ns = np.full(len(payloads), time_ns, np.int64)
-            streams.append(messages_of(channel, times_ns, payloads, first))
+            streams.append(messages_of(channel, times_ns, payloads, first_number))
         return merge(streams)
 
 
-def _timing(step: Step, took_s: float) -> Log:
+def _timing(step: Step, duration_s: float) -> Log:
     """Return a sentence on the duration of a decision, for a topic that no certificate covers."""
-    text = f"decision {step.number} took {took_s * 1e3:.1f} ms"
+    text = f"decision {step.number} took {duration_s * 1e3:.1f} ms"
     message = Log(level=Log.INFO, message=text, name="planner")
     message.timestamp.FromNanoseconds(step.time_ns)
     return message
@@ -498,42 +504,46 @@ def explained_decision(
     ways = _ways_of(step, planner) if ways is None else ways
     message = decision_message(step, planner.automaton.name, first_map)
     message.margin = planner.settings.margin
-    for edge, of_edge in zip(step.considered, message.considered, strict=True):
+    for edge, edge_message in zip(step.considered, message.considered, strict=True):
         bans = planner.bans(edge, step.pruned)
-        of_edge.wanted[:] = wanted_of(edge.progress.texts, bans)
-        of_edge.rules[:] = rules_of(bans)
-        for candidate, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, candidate, layers[candidate], planner.settings, bans, ways.get(candidate))
+        edge_message.wanted[:] = wanted_of(edge.progress.texts, bans)
+        edge_message.rules[:] = rules_of(bans)
+        for candidate, candidate_message in zip(edge.candidates, edge_message.candidates, strict=True):
+            explain(
+                candidate_message, candidate, layers[candidate], planner.settings, bans, ways.get(candidate)
+            )
     return message
 
 
 def decision_message(step: Step, specification: str = "", first_map: int = 0) -> PlanDecision:
     """Return a decision as a message without an outcome, and without the layers of its maps."""
-    numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
-    pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
+    map_numbers = {turned_map: number for number, turned_map in enumerate(maps_of(step), first_map)}
+    pruned_edges = (
+        PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned
+    )
     return PlanDecision(
         time_ns=step.time_ns,
         number=step.number,
         specification=specification,
         kind=PlanDecision.Kind.Value(f"KIND_{step.kind.upper().replace(' ', '_')}"),
         states=step.states,
-        considered=[_edge(consideration, numbers) for consideration in step.considered],
+        considered=[_edge(consideration, map_numbers) for consideration in step.considered],
         target=None if step.target is None else target_message(step.target),
-        pruned=pruned,
+        pruned=pruned_edges,
         reason=step.reason,
         lost=None if step.lost is None else PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text),
         search=PlanSearch(**step.search._asdict()),
     )
 
 
-def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> PlanEdge:
+def _edge(consideration: Consideration, map_numbers: Mapping[TurnedMap, int]) -> PlanEdge:
     return PlanEdge(
         path=consideration.path,
         source=consideration.edge[0],
         target=consideration.edge[1],
         progress=_guards(consideration.progress),
         constraints=_guards(consideration.constraints),
-        candidates=[_candidate(candidate, numbers) for candidate in consideration.candidates],
+        candidates=[_candidate(candidate, map_numbers) for candidate in consideration.candidates],
         pruned=str(consideration.pruned or ""),
         motions=map(target_message, consideration.motions),
         joint=consideration.is_joint,
@@ -549,7 +559,7 @@ def _guards(guards: Guards) -> list[PlanGuard]:
     ]
 
 
-def _candidate(candidate: Candidate, numbers: Mapping[TurnedMap, int]) -> PlanCandidate:
+def _candidate(candidate: Candidate, map_numbers: Mapping[TurnedMap, int]) -> PlanCandidate:
     return PlanCandidate(
         object=candidate.name,
         best=candidate.map.best(),
@@ -558,8 +568,8 @@ def _candidate(candidate: Candidate, numbers: Mapping[TurnedMap, int]) -> PlanCa
         rejected=candidate.rejected,
         chosen=candidate.is_chosen,
         maps=[
-            PlanMap(number=numbers[TurnedMap(candidate, place)], turn=turn)
-            for place, turn in enumerate(candidate.map.turns.tolist())
+            PlanMap(number=map_numbers[TurnedMap(candidate, index)], turn=turn)
+            for index, turn in enumerate(candidate.map.turns.tolist())
         ],
     )
 
@@ -582,23 +592,25 @@ def target_message(target: Target) -> PlanTarget:
 
 def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
     """Yield lines on all decisions of a log."""
-    *before, last = decisions
-    motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
-    is_cut = last.HasField("target") and not last.HasField("outcome")
+    *earlier_decisions, last_decision = decisions
+    motion_count = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
+    is_cut = last_decision.HasField("target") and not last_decision.HasField("outcome")
     yield (
-        f"{name}: {plural(len(decisions), 'decision')} for {last.specification!r}, "
-        f"{plural(motions, 'motion')}{' and one cut short' if is_cut else ''}"
+        f"{name}: {plural(len(decisions), 'decision')} for {last_decision.specification!r}, "
+        f"{plural(motion_count, 'motion')}{' and one cut short' if is_cut else ''}"
     )
-    for decision in before:
+    for decision in earlier_decisions:
         yield from decision_lines(decision)
-    yield from decision_lines(last)
+    yield from decision_lines(last_decision)
     if is_cut:
         yield "  the log ends during this motion"
-    edges: dict[str, list[str]] = {}
-    for edge in last.pruned:
-        edges.setdefault(Reason.from_text(edge.reason).kind, []).append(f"{edge.source} -> {edge.target}")
-    for kind, names in edges.items():
-        yield f"given up: {', '.join(names)}: {kind}"
+    edges_by_kind: dict[str, list[str]] = {}
+    for edge in last_decision.pruned:
+        edges_by_kind.setdefault(Reason.from_text(edge.reason).kind, []).append(
+            f"{edge.source} -> {edge.target}"
+        )
+    for kind, edge_names in edges_by_kind.items():
+        yield f"given up: {', '.join(edge_names)}: {kind}"
 
 
 def decision_lines(decision: PlanDecision) -> Iterator[str]:
@@ -609,13 +621,13 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  {effort_text(decision)}"
     if decision.HasField("target"):
         yield f"  {_target_text(decision.target)}{joint_suffix(decision.considered[-1])}"
-    said: dict[tuple[str, ...], str] = {}
+    first_edges: dict[tuple[str, ...], str] = {}
     aim = aim_of(decision)
     for edge in decision.considered:
-        yield from _edge_lines(edge, said, is_aim=edge is aim)
+        yield from _edge_lines(edge, first_edges, is_aim=edge is aim)
     if decision.HasField("lost"):
-        why = f": {decision.lost.text}" if decision.lost.text else ""
-        yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
+        cause_text = f": {decision.lost.text}" if decision.lost.text else ""
+        yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{cause_text}"
     if decision.HasField("outcome"):
         yield f"  {_outcome_text(decision)}"
 
@@ -624,17 +636,17 @@ def brief_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield at most five lines on one decision."""
     yield f"{_heading(decision)}: {decision.reason}"
     if decision.considered:
-        *before, edge = decision.considered
+        *earlier_edges, edge = decision.considered
         yield f"  wanted   {'; '.join([_either(edge.wanted), *map(plain, edge.rules)])}"
         for candidate in edge.candidates:
             if candidate.chosen:
                 yield f"  there    {_place_facts(candidate, edge, decision.margin)}"
-        rivals = [
-            *(f"path {_path(pruned)}: {Reason.from_text(pruned.pruned).kind}" for pruned in before),
+        rival_texts = [
+            *(f"path {_path(pruned)}: {Reason.from_text(pruned.pruned).kind}" for pruned in earlier_edges),
             *_rival_texts([candidate for candidate in edge.candidates if not candidate.chosen]),
         ]
-        if rivals:
-            yield f"  instead  {'; '.join(rivals)}"
+        if rival_texts:
+            yield f"  instead  {'; '.join(rival_texts)}"
     if decision.HasField("outcome"):
         yield f"  {_outcome_text(decision)}"
 
@@ -661,45 +673,49 @@ def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str
     target = candidate.target
     # a negation is often one of several alternatives, and then limits nothing
     relations = [conjunct for conjunct in candidate.conjuncts if not conjunct.text.startswith("not (")]
-    tight = sorted(
+    tight_conjuncts = sorted(
         (conjunct for conjunct in relations if conjunct.at_target > 0.0),
         key=lambda conjunct: conjunct.at_target,
     )
     facts = [f"robustness {target.robustness:.4g}{joint_suffix(edge)} ({margin:.4g} needed)"]
-    if tight:
-        second = "".join(f", then {conjunct.text} ({conjunct.at_target:.4g})" for conjunct in tight[1:2])
-        facts.append(f"tightest: {tight[0].text}{second}")
+    if tight_conjuncts:
+        second_text = "".join(
+            f", then {conjunct.text} ({conjunct.at_target:.4g})" for conjunct in tight_conjuncts[1:2]
+        )
+        facts.append(f"tightest: {tight_conjuncts[0].text}{second_text}")
     facts += [f"path length {_length(target):.4g}", room_sentence(candidate), candidate.rule]
     return "; ".join(filter(None, facts))
 
 
 def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
     """Yield the reasons why other objects are not moved; objects with the same reason share a text."""
-    names: dict[str, list[str]] = {}
+    names_by_reason: dict[str, list[str]] = {}
     for candidate in candidates:
         if candidate.rejected:
             limits = limiting_conjuncts(candidate)[:1]
-            because = "".join(f", mostly limited by {plain(demand_words(conjunct))}" for conjunct in limits)
-            names.setdefault(f"{candidate.rejected}{because}", []).append(candidate.object)
+            limit_text = "".join(
+                f", mostly limited by {plain(demand_words(conjunct))}" for conjunct in limits
+            )
+            names_by_reason.setdefault(f"{candidate.rejected}{limit_text}", []).append(candidate.object)
         else:
             yield f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
-    yield from (f"{', '.join(objects)}: {reason}" for reason, objects in names.items())
+    yield from (f"{', '.join(objects)}: {reason}" for reason, objects in names_by_reason.items())
 
 
 def effort_text(decision: PlanDecision) -> str:
     """Return the number of the attempt at the edge of a decision, and the search effort."""
     search, edge = decision.search, decision.considered[-1] if decision.considered else None
-    attempt = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
-    counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
-    searched = [f"{search.maps:.4g} maps", *(plural(*count) for count in counts if count[0])]
-    return ", ".join([*filter(None, [attempt]), *searched])
+    attempt_text = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
+    effort_counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
+    effort_texts = [f"{search.maps:.4g} maps", *(plural(*count) for count in effort_counts if count[0])]
+    return ", ".join([*filter(None, [attempt_text]), *effort_texts])
 
 
 def _outcome_text(decision: PlanDecision) -> str:
     outcome = decision.outcome
-    how = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
-    after = ", ".join(map(str, outcome.states))
-    return f"{how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
+    result_text = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
+    states_text = ", ".join(map(str, outcome.states))
+    return f"{result_text} at {time_text(outcome.end_ns)}: {outcome.reason}; state {states_text}"
 
 
 def joint_suffix(edge: PlanEdge) -> str:
@@ -707,23 +723,23 @@ def joint_suffix(edge: PlanEdge) -> str:
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 
 
-def _edge_lines(edge: PlanEdge, blocks: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
+def _edge_lines(edge: PlanEdge, first_edges: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
     """Yield lines on an edge; `blocks` has the lines of previous edges, which are not repeated."""
-    path = _path(edge) + (edge.order and f"; {edge.order}")
-    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
+    route = _path(edge) + (edge.order and f"; {edge.order}")
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {route}"
     yield f"    wanted      {_either(edge.wanted)}"
     for number, rule in enumerate(edge.rules):
         yield f"    {'' if number else 'on the way':<12}{plain(rule)}"
     for candidate in edge.candidates:
-        rows = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
+        lines = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
         # compared without the numbers of maps, which differ even if the rest is equal
         edge_name = f"{edge.source} -> {edge.target}"
-        first_edge = blocks.setdefault((candidate.object, candidate.rejected, *rows), edge_name)
+        first_edge = first_edges.setdefault((candidate.object, candidate.rejected, *lines), edge_name)
         if candidate.rejected and first_edge != edge_name:
             yield f"    {candidate.object}{_maps(candidate)}: rejected as for {first_edge}"
             continue
         yield f"    {_candidate_text(candidate)}"
-        yield from rows
+        yield from lines
     if len(edge.motions) > 1:
         yield f"    planned     {', then '.join(place_text(motion) for motion in edge.motions)}"
     if edge.pruned:
@@ -738,16 +754,16 @@ def _candidate_text(candidate: PlanCandidate) -> str:
     name = f"{candidate.object}{_maps(candidate)}"
     if candidate.rejected:
         return f"{name}: rejected, {candidate.rejected}"
-    mark = "chosen" if candidate.chosen else "possible"
-    return f"{name}: {mark}, {best_robustness(candidate):.4g} at best; {_target_text(candidate.target)}"
+    role = "chosen" if candidate.chosen else "possible"
+    return f"{name}: {role}, {best_robustness(candidate):.4g} at best; {_target_text(candidate.target)}"
 
 
 def _maps(candidate: PlanCandidate) -> str:
     """Return the numbers of a candidate's maps on the topic of gradient maps."""
-    numbers = sorted(turned_map.number for turned_map in candidate.maps)
-    if len(numbers) < 2:
-        return "".join(f" (map {number})" for number in numbers)
-    return f" (maps {numbers[0]} to {numbers[-1]})"
+    map_numbers = sorted(turned_map.number for turned_map in candidate.maps)
+    if len(map_numbers) < 2:
+        return "".join(f" (map {number})" for number in map_numbers)
+    return f" (maps {map_numbers[0]} to {map_numbers[-1]})"
 
 
 def _length(target: PlanTarget) -> float:
@@ -756,9 +772,9 @@ def _length(target: PlanTarget) -> float:
 
 
 def _target_text(target: PlanTarget) -> str:
-    turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
+    turn_text = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
     return (
-        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {_length(target):.4g}, "
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turn_text}, path length {_length(target):.4g}, "
         f"robustness {target.robustness:.4g}"
     )
 
@@ -770,10 +786,10 @@ def place_text(target: PlanTarget) -> str:
 
 def _some(texts: Sequence[str]) -> str:
     """Return alternatives; of many, the first ones and the number of the others."""
-    ends = list(accumulate(map(len, texts)))
-    count = max(1, sum(end <= _LONGEST for end in ends))
-    more = f" or {len(texts) - count} more" if count < len(texts) else ""
-    return (f"({texts[0]})" if more and count == 1 else either(texts[:count])) + more
+    text_ends = list(accumulate(map(len, texts)))
+    listed_count = max(1, sum(end <= _LONGEST for end in text_ends))
+    rest_text = f" or {len(texts) - listed_count} more" if listed_count < len(texts) else ""
+    return (f"({texts[0]})" if rest_text and listed_count == 1 else either(texts[:listed_count])) + rest_text
 
 
 def limiting_conjuncts(candidate: PlanCandidate) -> list[PlanConjunct]:
@@ -784,8 +800,8 @@ def limiting_conjuncts(candidate: PlanCandidate) -> list[PlanConjunct]:
 
 def best_robustness(candidate: PlanCandidate) -> float:
     """Return the greatest robustness at the centre of a free cell or at the target, which may lie between."""
-    target = candidate.target.robustness if candidate.HasField("target") else -math.inf
-    return max(candidate.best, target)
+    target_robustness = candidate.target.robustness if candidate.HasField("target") else -math.inf
+    return max(candidate.best, target_robustness)
 
 
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
@@ -830,15 +846,15 @@ def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban
         margin: by which constraints have to be false.
     """
     if kind == PlanCause.KIND_CONSTRAINT:
-        distance = f" with a margin of {margin:.4g}" if margin else ""
-        return f"on the way, {ban_of(text, bans).rule}{distance}"
-    texts = {
+        margin_text = f" with a margin of {margin:.4g}" if margin else ""
+        return f"on the way, {ban_of(text, bans).rule}{margin_text}"
+    text_by_kind = {
         PlanCause.KIND_OBJECT: f"{text} stands there",
         PlanCause.KIND_OBSTACLE: "an obstacle of the workspace stands there",
         PlanCause.KIND_REACH: "the robot does not reach it",
         PlanCause.KIND_FAILED: "a motion to a place near it failed",
     }
-    return texts.get(kind, "something that has to hold is unknown there")
+    return text_by_kind.get(kind, "something that has to hold is unknown there")
 
 
 def kind_text(decision: PlanDecision) -> str:
@@ -848,8 +864,8 @@ def kind_text(decision: PlanDecision) -> str:
 
 def aim_of(decision: PlanDecision) -> PlanEdge | None:
     """Return the aim of a decision, or None; see `Step.aim`."""
-    last = decision.considered[-1] if decision.considered else None
-    return None if last is None or last.pruned else last
+    last_edge = decision.considered[-1] if decision.considered else None
+    return None if last_edge is None or last_edge.pruned else last_edge
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
@@ -868,11 +884,11 @@ def _write_numbers(row: dict[str, Any], message: Message) -> None:
         if field.type == field.TYPE_FIXED64:
             row[field.name] = value
         elif field.type == field.TYPE_DOUBLE:
-            many = isinstance(json_value, list)
-            row[field.name] = [json_number(number) for number in value] if many else json_number(value)
+            is_list = isinstance(json_value, list)
+            row[field.name] = [json_number(number) for number in value] if is_list else json_number(value)
         elif field.type == field.TYPE_MESSAGE:
-            parts = (
+            part_pairs = (
                 zip(json_value, value, strict=True) if isinstance(json_value, list) else [(json_value, value)]
             )
-            for part, of_part in parts:
-                _write_numbers(part, of_part)
+            for json_part, message_part in part_pairs:
+                _write_numbers(json_part, message_part)

@@ -123,8 +123,8 @@ def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
     decisions: list[PlanDecision] = []
     faults: list[str] = []
     if isinstance(source, McapSource):
-        for payloads, lost in source.iter_payloads(PLAN_DECISION):
-            faults += lost
+        for payloads, payload_faults in source.iter_payloads(PLAN_DECISION):
+            faults += payload_faults
             for payload in payloads:
                 try:
                     decisions.append(decision_from_payload(payload))
@@ -142,19 +142,19 @@ def planner_of(source: Source) -> Planner:
         UsageError: the log holds no plan.
         LogError: the settings or the specification of the plan cannot be read.
     """
-    about = _plan_of(source)
-    texts = {attachment.name: attachment.data for attachment in source.attachments()}
-    name = RECORDED_PREFIX + about.get("file", "")
-    if name not in texts:
-        raise LogError(f"{source.name} has lost {name!r}, the specification that was planned for")
+    plan_metadata = _plan_of(source)
+    attachment_data = {attachment.name: attachment.data for attachment in source.attachments()}
+    file_name = RECORDED_PREFIX + plan_metadata.get("file", "")
+    if file_name not in attachment_data:
+        raise LogError(f"{source.name} has lost {file_name!r}, the specification that was planned for")
     specification = parse_specification(
-        texts[name].decode("utf-8", "replace"), filename=about.get("file", "<text>")
+        attachment_data[file_name].decode("utf-8", "replace"), filename=plan_metadata.get("file", "<text>")
     )
     return Planner(
         specification,
-        settings_from_text(about.get("settings", "")),
-        name=about.get("specification"),
-        rate_hz=_rate_of(about),
+        settings_from_text(plan_metadata.get("settings", "")),
+        name=plan_metadata.get("specification"),
+        rate_hz=_rate_of(plan_metadata),
     )
 
 
@@ -163,26 +163,26 @@ def obstacles_of(source: Source) -> Mapping[str, Footprint]:
 
     They are empty without a plan, or with settings that cannot be read.
     """
-    about = dict(source.metadata()).get(PLAN_METADATA, {})
+    plan_metadata = dict(source.metadata()).get(PLAN_METADATA, {})
     try:
-        return settings_from_text(about.get("settings", "")).workspace.named_obstacles
+        return settings_from_text(plan_metadata.get("settings", "")).workspace.named_obstacles
     except LogError:
         return {}
 
 
-def _rate_of(about: Mapping[str, str]) -> float | None:
-    text = about.get("rate_hz")
+def _rate_of(plan_metadata: Mapping[str, str]) -> float | None:
+    rate_text = plan_metadata.get("rate_hz")
     try:
-        return None if text is None else float(text)
+        return None if rate_text is None else float(rate_text)
     except ValueError:
-        raise LogError(f"the plan's rate_hz is {text!r:.40}, which is not a number") from None
+        raise LogError(f"the plan's rate_hz is {rate_text!r:.40}, which is not a number") from None
 
 
 def _plan_of(source: Source) -> Mapping[str, str]:
-    about = dict(source.metadata()).get(PLAN_METADATA)
-    if about is None:
+    plan_metadata = dict(source.metadata()).get(PLAN_METADATA)
+    if plan_metadata is None:
         raise _without_decisions(source)
-    return about
+    return plan_metadata
 
 
 def rerun_of(source: Source) -> Rerun:
@@ -273,24 +273,24 @@ def why_not_there(
     if number not in steps:
         raise UsageError(f"there is no decision {number}; the log has {min(steps)} to {max(steps)}")
     step = steps[number].step
-    edges = [
+    edge_candidates = [
         (edge, candidate)
         for edge in reversed(step.considered)
         for candidate in edge.candidates
         if candidate.name == name
     ]
-    if not edges:
-        names = {candidate.name for edge in step.considered for candidate in edge.candidates}
-        considered = ", ".join(sorted(names)) or "nothing"
-        raise UsageError(f"decision {number} did not consider {name!r}; it considered: {considered}")
-    edge, candidate = edges[0]
+    if not edge_candidates:
+        candidate_names = {candidate.name for edge in step.considered for candidate in edge.candidates}
+        names_text = ", ".join(sorted(candidate_names)) or "nothing"
+        raise UsageError(f"decision {number} did not consider {name!r}; it considered: {names_text}")
+    edge, candidate = edge_candidates[0]
     gradient, target = candidate.map, candidate.target
     grid = gradient.grid
     if not grid.contains(np.array(place)):
-        low, high = grid.centre(0, 0), grid.centre(grid.rows - 1, grid.columns - 1)
+        first_centre, last_centre = grid.centre(0, 0), grid.centre(grid.rows - 1, grid.columns - 1)
         raise UsageError(
             f"({place[0]:g}, {place[1]:g}) is outside the map of {name}; the middles of its cells are from "
-            f"({low[0]:.4g}, {low[1]:.4g}) to ({high[0]:.4g}, {high[1]:.4g})"
+            f"({first_centre[0]:.4g}, {first_centre[1]:.4g}) to ({last_centre[0]:.4g}, {last_centre[1]:.4g})"
         )
     cell = gradient.cell_of(*place, 0.0 if target is None else target.turn)
     planner = planner_of(open_source(log))
@@ -303,18 +303,20 @@ def why_not_there(
     layers = layers_of(candidate, settings)
     bans = planner.bans(edge, step.pruned)
     for layer in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
-        value = float(layers.robustness[(layer, *cell)])
-        judgement = "not met" if value < 0.0 else "met"
-        note = f", but {settings.margin:.4g} needed" if 0.0 <= value < settings.margin else ""
+        robustness = float(layers.robustness[(layer, *cell)])
+        judgement = "not met" if robustness < 0.0 else "met"
+        margin_note = f", but {settings.margin:.4g} needed" if 0.0 <= robustness < settings.margin else ""
         demand = demand_of(layers.conjuncts[layer], bans, is_required=layers.required[layer])
-        yield f"  {value:>9.4g}  {plain(demand)}: {judgement}{note}"
+        yield f"  {robustness:>9.4g}  {plain(demand)}: {judgement}{margin_note}"
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, bans, settings))
     if target is not None:
         judgement = "chosen" if candidate.is_chosen else "possible"
         yield f"  {judgement} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
-        of_edge = steps[number].message.considered[step.considered.index(edge)]
-        rules = [message.rule for message in of_edge.candidates if message.object == name and message.rule]
+        edge_message = steps[number].message.considered[step.considered.index(edge)]
+        rules = [
+            message.rule for message in edge_message.candidates if message.object == name and message.rule
+        ]
         yield from (f"  rule: {rule}" for rule in rules)
 
 
@@ -333,19 +335,22 @@ def _blocking_texts(
         if danger >= 0.0:
             yield f"blocked: on the way, {rule}: short by {danger:.4g}"
         else:
-            needed = settings.constraint_margin
-            yield f"blocked: on the way, {rule}: met by {-danger:.4g}, {needed:.4g} needed"
+            margin = settings.constraint_margin
+            yield f"blocked: on the way, {rule}: met by {-danger:.4g}, {margin:.4g} needed"
     maps = gradient.made_of.now
-    apart = maps.distances[(slice(None), *cell)]
-    if apart.size and apart.min() <= settings.workspace.clearance:
-        number = int(maps.nearest()[cell])
-        nearest, name = float(apart[number]), maps.obstacles[number] or "an obstacle of the workspace"
-        yield f"blocked: {name} stands there: " + (
-            f"they overlap by {-nearest:.4g}" if nearest < 0.0 else f"{nearest:.4g} is left between them"
+    distances = maps.distances[(slice(None), *cell)]
+    if distances.size and distances.min() <= settings.workspace.clearance:
+        nearest_index = int(maps.nearest()[cell])
+        distance, name = (
+            float(distances[nearest_index]),
+            maps.obstacles[nearest_index] or "an obstacle of the workspace",
         )
-    others = {"reach": "the robot does not reach it", "failed": "a motion failed near it"}
-    if kind in others:
-        yield f"blocked: {others[kind]}"
+        yield f"blocked: {name} stands there: " + (
+            f"they overlap by {-distance:.4g}" if distance < 0.0 else f"{distance:.4g} is left between them"
+        )
+    other_causes = {"reach": "the robot does not reach it", "failed": "a motion failed near it"}
+    if kind in other_causes:
+        yield f"blocked: {other_causes[kind]}"
     elif kind == "unknown":
         yield "blocked: a relation there is unknown"
 
@@ -381,20 +386,23 @@ class Moment(NamedTuple):
 def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
     """Iterate over samples, each with the planner's messages until the next sample."""
     moment = Moment(None, [])
-    waiting: list[PlannerMessage] = []
+    pending_messages: list[PlannerMessage] = []
     for block in blocks:
-        waiting += planner_messages(block.messages)
-        count = 0
+        pending_messages += planner_messages(block.messages)
+        message_count = 0
         for sample in block.trace.samples():
             # a message at the time of a sample belongs to this sample
-            while count < len(waiting) and waiting[count].time_ns < sample.time_ns:
-                moment.messages.append(waiting[count])
-                count += 1
+            while (
+                message_count < len(pending_messages)
+                and pending_messages[message_count].time_ns < sample.time_ns
+            ):
+                moment.messages.append(pending_messages[message_count])
+                message_count += 1
             if moment.sample is not None or moment.messages:
                 yield moment
             moment = Moment(sample, [])
-        del waiting[:count]
-    moment.messages.extend(waiting)
+        del pending_messages[:message_count]
+    moment.messages.extend(pending_messages)
     if moment.sample is not None or moment.messages:
         yield moment
 
@@ -417,15 +425,15 @@ class Rerun:
 
     def __init__(self, planner: Planner) -> None:
         """Begin before the first sample."""
-        self._written: list[Messages] = []
-        self.box = BlackBox(planner, self._written.append)
+        self._pending_messages: list[Messages] = []
+        self.box = BlackBox(planner, self._pending_messages.append)
         self.last: Step | None = None
         self.is_moving = False
 
     def take_messages(self) -> Messages:
         """Return and forget the messages since the last call."""
-        messages = merge(self._written)
-        self._written.clear()
+        messages = merge(self._pending_messages)
+        self._pending_messages.clear()
         return messages
 
     def repeat(self, recorded: PlanDecision) -> None:
@@ -451,10 +459,12 @@ class Rerun:
 
 
 def _outcome(decision: PlanDecision) -> Outcome:
-    at = decision.outcome.at
-    stage = next((name for name in get_args(Stage) if name == at), None)
-    if at and stage is None:
-        raise LogError(f"the outcome of decision {decision.number} is at {at!r:.40}, not pick, way or place")
+    stage_name = decision.outcome.at
+    stage = next((name for name in get_args(Stage) if name == stage_name), None)
+    if stage_name and stage is None:
+        raise LogError(
+            f"the outcome of decision {decision.number} is at {stage_name!r:.40}, not pick, way or place"
+        )
     return Outcome(decision.outcome.succeeded, decision.outcome.reason, stage)
 
 
@@ -493,22 +503,22 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
     """
     extent, comparison = _run_extent(source), _Comparison(rerun_of(source))
     faults: list[str] = []
-    samples = 0
+    sample_count = 0
     for sample, recorded in iter_moments(_iter_blocks(source, faults, advance)):
         if sample is not None:
             comparison.rerun.box.observe(sample)
-            samples += 1
+            sample_count += 1
         # all messages have the sample's time, unless the log has lost samples
-        for time_ns, messages in groupby(recorded, key=lambda each: each.time_ns):
+        for time_ns, messages in groupby(recorded, key=lambda message: message.time_ns):
             comparison.compare(time_ns, list(messages))
     # a damaged log also lacks samples, so only an undamaged log is checked for a begin within the run
-    is_part = extent.is_copy if extent.samples is None else samples < extent.samples
+    is_part = extent.is_copy if extent.samples is None else sample_count < extent.samples
     if not faults and is_part and (extent.is_cut or comparison.began_within):
         raise UsageError(
             f"{source.name} begins within the run, and decisions depend on all samples before; verify the "
             "log that it was made from, or name that one: --source SOURCE"
         )
-    is_whole = samples == extent.samples and not extent.was_interrupted
+    is_whole = sample_count == extent.samples and not extent.was_interrupted
     if not faults and not comparison.differences and is_whole:
         comparison.differences += _missing(comparison.rerun)
     return Recomputed(comparison.decisions, comparison.maps, tuple(comparison.differences), tuple(faults))
@@ -553,10 +563,13 @@ class _Comparison:
                     self.differences.append(f"at {_seconds(time_ns)}: {error}")
                     return
         for topic in PLANNER_TOPICS:
-            old, new = (
+            old_payloads, new_payloads = (
                 [m.payload for m in messages if m.topic == topic] for messages in (recorded, recomputed)
             )
-            self.differences += (f"at {_seconds(time_ns)}: {what}" for what in _differences(topic, old, new))
+            self.differences += (
+                f"at {_seconds(time_ns)}: {difference}"
+                for difference in _differences(topic, old_payloads, new_payloads)
+            )
 
     def _recompute(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
         has_outcome = recorded.HasField("outcome")
@@ -570,18 +583,18 @@ class _Comparison:
 
 def _missing(rerun: Rerun) -> Iterator[str]:
     """Yield a sentence if a complete log lacks a decision or an outcome."""
-    last, planner = rerun.last, rerun.box.planner
-    if last is None:
+    last_step, planner = rerun.last, rerun.box.planner
+    if last_step is None:
         yield "the log has no decision, and a planned run has at least one"
         return
-    which = f"decision {last.number} at {_seconds(last.time_ns)}"
+    decision_text = f"decision {last_step.number} at {_seconds(last_step.time_ns)}"
     if rerun.is_moving:
-        yield f"the log has no outcome of {which}"
+        yield f"the log has no outcome of {decision_text}"
         return
-    is_satisfied = last.kind == "hold" and (planner.is_accepting or planner.is_doubtful)
-    waits = last.kind == "wait" and planner.next_step() is last
-    if not (is_satisfied or waits or last.kind == "no path"):
-        yield f"the log has no decision after {which}, which did not end the run"
+    is_satisfied = last_step.kind == "hold" and (planner.is_accepting or planner.is_doubtful)
+    is_waiting = last_step.kind == "wait" and planner.next_step() is last_step
+    if not (is_satisfied or is_waiting or last_step.kind == "no path"):
+        yield f"the log has no decision after {decision_text}, which did not end the run"
 
 
 def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> Iterator[str]:
@@ -595,8 +608,8 @@ def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> 
 def _differing_fields(recorded: bytes, recomputed: bytes) -> str:
     old, new = map(decision_from_payload, (recorded, recomputed))
     names = (field.name for field in PlanDecision.DESCRIPTOR.fields)
-    fields = [name for name in names if getattr(old, name) != getattr(new, name)]
-    return f" in {', '.join(fields)} of decision {old.number}" if fields else ""
+    differing_names = [name for name in names if getattr(old, name) != getattr(new, name)]
+    return f" in {', '.join(differing_names)} of decision {old.number}" if differing_names else ""
 
 
 def _seconds(time_ns: int) -> str:
@@ -621,9 +634,9 @@ class _RunExtent(NamedTuple):
 
 def _run_extent(source: Source) -> _RunExtent:
     metadata = dict(source.metadata())
-    ending, about = metadata.get(ENDING, {}), metadata.get(METADATA, {})
-    is_copy = about.get("written_by") == "replay"
-    options = _value(about, "options", {}) if is_copy else {}
+    ending, log_metadata = metadata.get(ENDING, {}), metadata.get(METADATA, {})
+    is_copy = log_metadata.get("written_by") == "replay"
+    options = _value(log_metadata, "options", {}) if is_copy else {}
     samples = _value(ending, "samples", None)
     if not isinstance(options, dict) or not isinstance(samples, int | None):
         raise LogError(f"the metadata of {source.name} has {samples!r} samples and options {options!r}")
@@ -689,23 +702,23 @@ class Replanned(Printed):
         if self.same:
             yield f"{_first(self.same, self.decisions)} the same, byte for byte, with all maps"
         if self.alike > self.same:
-            number = self.alike - self.same
-            also = "then " if self.same else ""
-            verb = "does" if number == 1 else "do"
-            yield f"{also}{plural(number, 'decision')} {verb} the same, with other maps or reasons"
+            alike_count = self.alike - self.same
+            prefix = "then " if self.same else ""
+            verb = "does" if alike_count == 1 else "do"
+            yield f"{prefix}{plural(alike_count, 'decision')} {verb} the same, with other maps or reasons"
         if self.redone is None:
             return
-        at = time_text(self.redone.sample.time_ns)
-        new = self.redone.message
+        sample_time = time_text(self.redone.sample.time_ns)
+        new_message = self.redone.message
         if self.recorded is None:
-            yield f"at {at}, where the log has no decision, the wait is over:"
+            yield f"at {sample_time}, where the log has no decision, the wait is over:"
         else:
-            old = self.recorded.message
-            yield f"decision {old.number} at {at} differs"
-            yield f"  recorded  {old.reason}"
-        yield f"  redone    {new.reason}"
-        if new.HasField("lost") and new.lost.text:
-            yield f"            at {time_text(new.lost.time_ns)}: {new.lost.text}"
+            old_message = self.recorded.message
+            yield f"decision {old_message.number} at {sample_time} differs"
+            yield f"  recorded  {old_message.reason}"
+        yield f"  redone    {new_message.reason}"
+        if new_message.HasField("lost") and new_message.lost.text:
+            yield f"            at {time_text(new_message.lost.time_ns)}: {new_message.lost.text}"
         yield from _maps_side_by_side(self, (width - 13) // 2)
 
     @property
@@ -728,13 +741,13 @@ class Replanned(Printed):
         return self.redone is not None
 
 
-def _first(count: int, of: int) -> str:
-    if count == of:
-        return "all decisions are" if of > 1 else "the decision is"
-    return f"the first {plural(count, 'decision')} are" if count > 1 else "the first decision is"
+def _first(equal_count: int, decision_count: int) -> str:
+    if equal_count == decision_count:
+        return "all decisions are" if decision_count > 1 else "the decision is"
+    return f"the first {plural(equal_count, 'decision')} are" if equal_count > 1 else "the first decision is"
 
 
-def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
+def _maps_side_by_side(redone: Replanned, column_width: int) -> Iterator[str]:
     """Yield lines on the maps of each object for the last edges, in two columns.
 
     Args:
@@ -748,21 +761,25 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
         for message in messages
     ]
     for name in dict.fromkeys((*sides[0], *sides[1])):
-        yield f"{f'map of {name}':<13}{'recorded':<{column}}redone"
-        rows = [_map_rows(side.get(name)) for side in sides]
-        for key in dict.fromkeys((*rows[0], *rows[1])):
-            ours, theirs = ([cut(text, column - 1) for text in row.get(key, ())] for row in rows)
-            for place in range(max(len(ours), len(theirs))):
-                left, right = (texts[place] if place < len(texts) else "" for texts in (ours, theirs))
-                yield f"  {key if not place else '':<11}{left:<{column}}{right}".rstrip()
+        yield f"{f'map of {name}':<13}{'recorded':<{column_width}}redone"
+        rows_by_side = [_map_rows(side.get(name)) for side in sides]
+        for key in dict.fromkeys((*rows_by_side[0], *rows_by_side[1])):
+            left_texts, right_texts = (
+                [cut(text, column_width - 1) for text in row.get(key, ())] for row in rows_by_side
+            )
+            for line in range(max(len(left_texts), len(right_texts))):
+                left, right = (
+                    texts[line] if line < len(texts) else "" for texts in (left_texts, right_texts)
+                )
+                yield f"  {key if not line else '':<11}{left:<{column_width}}{right}".rstrip()
 
 
 def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
     if candidate is None:
         return {}
     robustness = best_robustness(candidate)
-    best = "nowhere free" if math.isinf(robustness) else f"{robustness:.4g}"
-    rows = {"best": [best]}
+    best_text = "nowhere free" if math.isinf(robustness) else f"{robustness:.4g}"
+    rows = {"best": [best_text]}
     if candidate.HasField("target"):
         target = candidate.target
         rows["target"] = [f"({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"]
@@ -798,41 +815,47 @@ def redo_decisions(
         LogError: the settings or the specification of the plan cannot be read, or the recorded decisions do
             not follow from the samples.
     """
-    old = planner_of(source)
-    settings = changed_settings(old.settings, changes)
+    old_planner = planner_of(source)
+    settings = changed_settings(old_planner.settings, changes)
     if name is None and specification is None:
-        name = old.automaton.name
+        name = old_planner.automaton.name
     planner = Planner(
-        old.specification if specification is None else specification,
+        old_planner.specification if specification is None else specification,
         settings,
         name=name,
-        rate_hz=old.rate_hz,
+        rate_hz=old_planner.rate_hz,
     )
-    changed = (*_specification_changes(old, planner), *changes_text(old.settings, settings))
+    change_texts = (
+        *_specification_changes(old_planner, planner),
+        *changes_text(old_planner.settings, settings),
+    )
     faults: list[str] = []
 
-    redoing = _Redoing(source, planner, bool(changed))
+    redoing = _Redoing(source, planner, bool(change_texts))
     for sample, messages in iter_moments(_iter_blocks(source, faults, advance)):
         redoing.take(sample, messages)
-    if redoing.redone is not None and not changed and not faults:
+    if redoing.redone is not None and not change_texts and not faults:
         raise LogError(
             f"the decisions in {source.name} do not follow from its samples; "
             "`spatial-replay verify --decisions` shows what differs"
         )
     counts = redoing.decisions, redoing.same, redoing.alike
-    both = redoing.recorded, redoing.redone
-    return Replanned(source.name, changed, *counts, *both, merge(redoing.messages), tuple(faults))
+    steps = redoing.recorded, redoing.redone
+    return Replanned(source.name, change_texts, *counts, *steps, merge(redoing.messages), tuple(faults))
 
 
-def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
-    texts = [format_specification(planner.specification) for planner in (old, new)]
-    names = [f"{planner.specification.filename}, {planner.automaton.name}" for planner in (old, new)]
-    if texts[0] != texts[1] or old.automaton.name != new.automaton.name:
-        yield f"specification {names[0]} -> {names[1]}"
-    before, after = (planner.specification.constants for planner in (old, new))
-    for name in before:
-        if name in after and before[name].value != after[name].value:
-            yield f"const {name} {before[name].value:g} -> {after[name].value:g}"
+def _specification_changes(old_planner: Planner, new_planner: Planner) -> Iterator[str]:
+    texts = [format_specification(planner.specification) for planner in (old_planner, new_planner)]
+    spec_names = [
+        f"{planner.specification.filename}, {planner.automaton.name}"
+        for planner in (old_planner, new_planner)
+    ]
+    if texts[0] != texts[1] or old_planner.automaton.name != new_planner.automaton.name:
+        yield f"specification {spec_names[0]} -> {spec_names[1]}"
+    old_constants, new_constants = (planner.specification.constants for planner in (old_planner, new_planner))
+    for name in old_constants:
+        if name in new_constants and old_constants[name].value != new_constants[name].value:
+            yield f"const {name} {old_constants[name].value:g} -> {new_constants[name].value:g}"
 
 
 class _Redoing:
@@ -840,8 +863,8 @@ class _Redoing:
 
     def __init__(self, source: Source, planner: Planner, is_changed: bool) -> None:
         self._source, self._is_changed = source, is_changed
-        self._old = rerun_of(source)
-        self._new = Rerun(planner)
+        self._old_run = rerun_of(source)
+        self._new_run = Rerun(planner)
         self.decisions = self.same = self.alike = 0
         self.recorded: LoggedStep | None = None
         self.redone: LoggedStep | None = None
@@ -856,14 +879,14 @@ class _Redoing:
         self.decisions += len(new_decisions)
         if self.redone is not None or sample is None:
             return
-        self._old.box.observe(sample)
-        self._new.box.observe(sample)
-        waiting = self._new.last is not None and self._new.last.kind == "wait"
-        if self._is_changed and waiting and not new_decisions:
+        self._old_run.box.observe(sample)
+        self._new_run.box.observe(sample)
+        is_waiting = self._new_run.last is not None and self._new_run.last.kind == "wait"
+        if self._is_changed and is_waiting and not new_decisions:
             # a decision of the new planner at this sample precedes the next recorded decision
-            step = self._new.box.next_step()
-            if step is not self._new.last:
-                self._differ(sample, None, step, self._new.take_messages())
+            step = self._new_run.box.next_step()
+            if step is not self._new_run.last:
+                self._differ(sample, None, step, self._new_run.take_messages())
             return
         for decision in decisions:
             if not self._repeat(sample, decision, recorded):
@@ -871,23 +894,23 @@ class _Redoing:
 
     def _repeat(self, sample: Sample, decision: PlanDecision, recorded: list[PlannerMessage]) -> bool:
         """Repeat a decision or its outcome with both planners; return whether their motions are equal."""
-        before = self._new.last
-        self._old.repeat(decision)
-        self._old.take_messages()
-        self._new.repeat(decision)
-        messages, old, new = self._new.take_messages(), self._old.last, self._new.last
-        if old is None or new is None:
+        previous_step = self._new_run.last
+        self._old_run.repeat(decision)
+        self._old_run.take_messages()
+        self._new_run.repeat(decision)
+        messages, old_step, new_step = self._new_run.take_messages(), self._old_run.last, self._new_run.last
+        if old_step is None or new_step is None:
             return True
         if decision.HasField("outcome"):
             self.messages.append(_on_redone_topics(messages))
             return True
-        refuse_other(self._source, old, decision)
-        if new is before or not _does_the_same(old, new):
-            first = min(
+        refuse_other(self._source, old_step, decision)
+        if new_step is previous_step or not _does_the_same(old_step, new_step):
+            first_map = min(
                 (m.number for e in decision.considered for c in e.candidates for m in c.maps), default=0
             )
-            explained = explained_decision(old, self._old.box.planner, first)
-            self._differ(sample, LoggedStep(old, explained, sample), new, messages)
+            explained_message = explained_decision(old_step, self._old_run.box.planner, first_map)
+            self._differ(sample, LoggedStep(old_step, explained_message, sample), new_step, messages)
             return False
         self.messages.append(_on_redone_topics(messages))
         if self.same == self.alike and _has_all(recorded, messages):
@@ -897,7 +920,7 @@ class _Redoing:
 
     def _differ(self, sample: Sample, recorded: LoggedStep | None, step: Step, messages: Messages) -> None:
         self.recorded = recorded
-        self.redone = LoggedStep(step, explained_decision(step, self._new.box.planner), sample)
+        self.redone = LoggedStep(step, explained_decision(step, self._new_run.box.planner), sample)
         self.messages.append(_on_redone_topics(messages))
 
 
@@ -929,12 +952,12 @@ class ReplannedSource(SourceOf):
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
-        start, _ = window_of(self.beside.log_time_ns, start_ns or 0, np.iinfo(np.int64).max)
+        first_message, _ = window_of(self.beside.log_time_ns, start_ns or 0, np.iinfo(np.int64).max)
         for block in self.source.iter_blocks(start_ns, end_ns):
             if not len(block.trace):
                 yield block
                 continue
-            _, end = window_of(self.beside.log_time_ns, 0, int(block.trace.times_ns[-1]) + 1)
-            replanned = select(self.beside, np.arange(start, max(start, end)))
-            start = max(start, end)
+            _, end_message = window_of(self.beside.log_time_ns, 0, int(block.trace.times_ns[-1]) + 1)
+            replanned = select(self.beside, np.arange(first_message, max(first_message, end_message)))
+            first_message = max(first_message, end_message)
             yield replace(block, messages=merge([block.messages, replanned]))
