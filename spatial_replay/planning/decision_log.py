@@ -76,7 +76,7 @@ _FIELD_TYPES: Final[Mapping[str, PackedElementField.NumericType.ValueType]] = Ma
         "|u1": PackedElementField.UINT8,
     }
 )
-"""Type of a cell's field for each type of numpy."""
+"""Type of a cell's field for each NumPy type."""
 
 
 class TurnedMap(NamedTuple):
@@ -89,8 +89,8 @@ class TurnedMap(NamedTuple):
 def maps_of(step: Step) -> list[TurnedMap]:
     """Return all maps of a step, by edge, in the order of the log.
 
-    The map of the chosen object in its target orientation is the last one, because a viewer shows the last
-    message of a topic.
+    The last map is the chosen object's map in its target orientation, because a viewer shows the last message
+    of a topic.
     """
     return [
         TurnedMap(candidate, turn)
@@ -101,21 +101,21 @@ def maps_of(step: Step) -> list[TurnedMap]:
 
 
 def _is_aim(candidate: Candidate, turn: int) -> bool:
-    """Return whether `turn` is the map's orientation nearest to the target's, which may lie between two."""
+    """Return whether `turn` is the map's orientation that is nearest to the target's orientation."""
     target = candidate.target
     return target is not None and candidate.map.cell_of(target.x, target.y, target.turn)[0] == turn
 
 
 def map_digest(gradient: GradientMap) -> bytes:
-    """Return the SHA-256 of a map's values: little-endian float64 by turn, row and column, NaN if blocked."""
+    """Return the SHA-256 of a map's values: little-endian float64 by turn, row and column; NaN if blocked."""
     return hashlib.sha256(np.ascontiguousarray(gradient.values, "<f8").tobytes()).digest()
 
 
 def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers, ways: Ways | None = None) -> GridMessage:
-    """Return a map as a message that is drawn below the scene; blocked cells are NaN, and transparent.
+    """Return a map as a message; viewers draw it below the scene. Blocked cells are NaN and transparent.
 
     Args:
-        ways: ways that a push to the map's target was chosen among.
+        ways: ways among which the push to the map's target was chosen.
     """
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
@@ -165,12 +165,12 @@ def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndar
 
 
 def _singles(values: np.ndarray) -> np.ndarray:
-    """Return single-precision numbers, with NaN for numbers that are not finite, as viewers need them."""
+    """Return single-precision numbers for viewers, which need NaN instead of infinite numbers."""
     return np.where(np.isfinite(values), values, np.nan).astype("<f4")
 
 
 def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
-    """Return each field of a map's message, (rows, columns); none if the sizes in the message do not fit."""
+    """Return each field of a map's message, (rows, columns); empty if the sizes in the message do not fit."""
     columns, cell_bytes, row_bytes = message.column_count, message.cell_stride, message.row_stride
     rows = len(message.data) // row_bytes if row_bytes else 0
     if not rows or not columns or cell_bytes * columns > row_bytes:
@@ -197,8 +197,8 @@ def explain(
     """Add to a candidate the relations of its map, the causes of blocked cells, and the rule of its target.
 
     Args:
-        bans: the constraint set of its edge.
-        ways: ways that its target was chosen among.
+        bans: constraint set of the candidate's edge.
+        ways: ways among which the candidate's target was chosen.
     """
     target = candidate.target
     free_limits = layers.limiting[layers.blocked_by < 0]
@@ -232,7 +232,7 @@ def explain(
 
 
 def _push_rule(ways: Ways, target: Target, cell_size: float) -> str:
-    """Return how the target of a push is chosen among places that will do, in cells of a size."""
+    """Return the rule by which the target of a push is chosen among suitable places."""
     x, y = ways.end
     rule = f"of places that will do, ({x:.4g}, {y:.4g}) has the shortest way over cells, {ways.shortest:.4g}"
     if math.dist(ways.end, (target.x, target.y)) < 1e-6 * cell_size:
@@ -241,9 +241,10 @@ def _push_rule(ways: Ways, target: Target, cell_size: float) -> str:
 
 
 def _place_rule(required_room: float, preferred_room: float) -> str:
-    """Return how the target of a placement is chosen among places that will do."""
+    """Return the rule by which the target of a placement is chosen among suitable places."""
     if required_room > 0.0:
-        return f"of places with room {required_room:.4g} around them the most robust is taken, of equal ones the nearest"
+        places = f"of places with room {required_room:.4g} around them"
+        return f"{places} the most robust is taken, of equal ones the nearest"
     lack_text = f"no place has the preferred room of {preferred_room:.4g}; " if preferred_room > 0.0 else ""
     return f"{lack_text}the most robust place is taken, of equal ones the nearest"
 
@@ -264,7 +265,7 @@ MOST_LISTED: Final = 3
 """Maximum number of listed conjuncts of a map, and of listed causes."""
 
 _LONGEST: Final = 400
-"""Maximum length of alternatives in the text, characters; JSON has all."""
+"""Maximum length of alternatives in a text, characters; JSON has all alternatives."""
 
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
@@ -277,8 +278,8 @@ _CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _DRAWINGS, _TIMINGS)
 class BlackBox:
     """A planner whose decisions are written as messages.
 
-    Samples, decisions and outcomes must go through it in their order. Equal samples and outcomes give equal
-    bytes, so that a log can be verified by recomputing it.
+    It must receive all samples, decisions and outcomes in their order. Equal samples and outcomes give equal
+    bytes, so that a log can be verified by recomputing its decisions.
 
     Attributes:
         planner: the planner.
@@ -296,7 +297,7 @@ class BlackBox:
 
         Args:
             write: called with the messages of each decision, and of each outcome.
-            timings: also log the duration of each decision; logs of equal runs then differ.
+            timings: also log the duration of each decision. With durations, logs of equal runs differ.
         """
         self.planner, self.planning_s = planner, 0.0
         self._write, self._has_timings = write, timings
@@ -323,7 +324,7 @@ class BlackBox:
         self.planning_s += time.perf_counter() - start_s
 
     def next_step(self) -> Step:
-        """Return the planner's next step, and write it unless the previous wait continues.
+        """Return the planner's next step, and write the step unless the previous wait continues.
 
         The outcome of a wait is written with the next decision.
 
@@ -366,7 +367,7 @@ class BlackBox:
         return step
 
     def conclude(self, outcome: Outcome) -> None:
-        """Record the outcome of the last step, and write it.
+        """Record the outcome of the last step, and write the outcome.
 
         Raises:
             UsageError: no step is being executed.
@@ -380,7 +381,7 @@ class BlackBox:
         self._write(self._messages(end_ns, [self._with_outcome(outcome, end_ns)], [], [path]))
 
     def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
-        """Return the last decision with its outcome if it was a wait, else nothing."""
+        """Return the last decision with its outcome, if the decision was a wait; else an empty list."""
         if self._step is None or self._step.kind != "wait":
             return []
         return [self._with_outcome(wait_outcome(self._step, self.planner.states), end_ns)]
@@ -399,19 +400,19 @@ class BlackBox:
         return self._last_message
 
     def _moving_object(self) -> TrackedObject | None:
-        """Return the object that the last step moves, as in the newest sample."""
+        """Return the object that the last step moves, from the newest sample."""
         if self._step is None or self._step.target is None or self._sample is None:
             return None
         return self._sample.objects.get(self._step.target.name)
 
     def _messages(self, time_ns: int, *channel_messages: Sequence[Message]) -> Messages:
-        """Return messages of each channel, with consecutive numbers."""
+        """Return the messages of all channels, with consecutive numbers in each channel."""
         streams = []
         # the last channel, for timings, is often absent
         for channel, messages in zip(_CHANNELS, channel_messages, strict=False):
             first_number = self._message_counts[channel]
             self._message_counts[channel] += len(messages)
-            # deterministic, because a log is verified by comparing bytes
+            # deterministic, because a verification compares bytes
             payloads = [message.SerializeToString(deterministic=True) for message in messages]
             times_ns = np.full(len(payloads), time_ns, np.int64)
             streams.append(messages_of(channel, times_ns, payloads, first_number))
@@ -419,7 +420,7 @@ class BlackBox:
 
 
 def _timing(step: Step, duration_s: float) -> Log:
-    """Return a sentence on the duration of a decision, for a topic that no certificate covers."""
+    """Return a message on the duration of a decision; its topic is not part of the log's certificate."""
     text = f"decision {step.number} took {duration_s * 1e3:.1f} ms"
     message = Log(level=Log.INFO, message=text, name="planner")
     message.timestamp.FromNanoseconds(step.time_ns)
@@ -427,7 +428,7 @@ def _timing(step: Step, duration_s: float) -> Log:
 
 
 def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:
-    """Return the metadata that a log needs to recompute its decisions.
+    """Return the metadata from which the decisions of a log can be recomputed.
 
     Args:
         filename: name of the specification's file in the log.
@@ -456,7 +457,7 @@ def decision_from_payload(payload: bytes) -> PlanDecision:
 def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, ...]:
     """Return the latest message of each decision, sorted by number.
 
-    A decision is written again with its outcome.
+    A log has each decision a second time, with its outcome.
     """
     by_number = {decision.number: decision for decision in decisions}
     return tuple(by_number[number] for number in sorted(by_number))
@@ -474,7 +475,7 @@ def layers_of(candidate: Candidate, settings: Settings) -> MapLayers:
 
 
 def _ways_of(step: Step, planner: Planner) -> dict[Candidate, Ways]:
-    """Return the ways among which the target of a push was chosen, for the chosen candidate."""
+    """Return the ways among which the chosen candidate's push was chosen; empty without a push."""
     if planner.settings.skill != "push":
         return {}
     return {
@@ -497,8 +498,8 @@ def explained_decision(
     Args:
         planner: planner that made the decision.
         first_map: number of the step's first map in the log.
-        layers: layers of the maps, if they are already computed.
-        ways: ways of the chosen candidate, if they are already computed.
+        layers: layers of the maps; None to compute the layers.
+        ways: ways of the chosen candidate; None to compute the ways.
     """
     layers = layers or _layers_of(step, planner)
     ways = _ways_of(step, planner) if ways is None else ways
@@ -671,7 +672,7 @@ def _heading(decision: PlanDecision) -> str:
 def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str:
     """Return the robustness of a target, the relations that limit it, and the length of its path."""
     target = candidate.target
-    # a negation is often one of several alternatives, and then limits nothing
+    # negations are left out: a negation is often one of several alternatives, which limits nothing
     relations = [conjunct for conjunct in candidate.conjuncts if not conjunct.text.startswith("not (")]
     tight_conjuncts = sorted(
         (conjunct for conjunct in relations if conjunct.at_target > 0.0),
@@ -703,7 +704,7 @@ def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
 
 
 def effort_text(decision: PlanDecision) -> str:
-    """Return the number of the attempt at the edge of a decision, and the search effort."""
+    """Return the number of the attempt at a decision's edge, and the search effort, in words."""
     search, edge = decision.search, decision.considered[-1] if decision.considered else None
     attempt_text = f"attempt {edge.failed + 1}" if edge is not None and decision.HasField("target") else ""
     effort_counts = (search.arrangements, "arrangement"), (search.parking_places, "parking place")
@@ -719,12 +720,16 @@ def _outcome_text(decision: PlanDecision) -> str:
 
 
 def joint_suffix(edge: PlanEdge) -> str:
-    """Return the addition that a robustness is valid after all motions of an edge; "" for a single motion."""
+    """Return " once all 3 motions are done" for a robustness after all motions; "" for a single motion."""
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 
 
 def _edge_lines(edge: PlanEdge, first_edges: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
-    """Yield lines on an edge; `blocks` has the lines of previous edges, which are not repeated."""
+    """Yield lines on an edge; lines of a candidate that equal an earlier edge's lines are not repeated.
+
+    Args:
+        first_edges: first edge with the lines of a candidate; new lines are added.
+    """
     route = _path(edge) + (edge.order and f"; {edge.order}")
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {route}"
     yield f"    wanted      {_either(edge.wanted)}"
@@ -732,7 +737,7 @@ def _edge_lines(edge: PlanEdge, first_edges: dict[tuple[str, ...], str], *, is_a
         yield f"    {'' if number else 'on the way':<12}{plain(rule)}"
     for candidate in edge.candidates:
         lines = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
-        # compared without the numbers of maps, which differ even if the rest is equal
+        # the comparison excludes the numbers of maps, which always differ
         edge_name = f"{edge.source} -> {edge.target}"
         first_edge = first_edges.setdefault((candidate.object, candidate.rejected, *lines), edge_name)
         if candidate.rejected and first_edge != edge_name:
@@ -785,7 +790,7 @@ def place_text(target: PlanTarget) -> str:
 
 
 def _some(texts: Sequence[str]) -> str:
-    """Return alternatives; of many, the first ones and the number of the others."""
+    """Return alternatives; from `_LONGEST` characters on, the number of further alternatives."""
     text_ends = list(accumulate(map(len, texts)))
     listed_count = max(1, sum(end <= _LONGEST for end in text_ends))
     rest_text = f" or {len(texts) - listed_count} more" if listed_count < len(texts) else ""
@@ -799,7 +804,7 @@ def limiting_conjuncts(candidate: PlanCandidate) -> list[PlanConjunct]:
 
 
 def best_robustness(candidate: PlanCandidate) -> float:
-    """Return the greatest robustness at the centre of a free cell or at the target, which may lie between."""
+    """Return the greatest robustness at the centre of a free cell, or at the (refined) target."""
     target_robustness = candidate.target.robustness if candidate.HasField("target") else -math.inf
     return max(candidate.best, target_robustness)
 
@@ -838,12 +843,12 @@ def room_sentence(candidate: PlanCandidate) -> str:
 
 
 def cause_sentence(kind: PlanCause.Kind.ValueType, text: str, bans: Sequence[Ban], margin: float) -> str:
-    """Return why an object must not be in a cell, with formulas between backquotes.
+    """Return the reason why an object must not be in a cell, with formulas between backquotes.
 
     Args:
-        text: the guard that would hold, or the object that stands there.
-        bans: the constraint set that the guard is of.
-        margin: by which constraints have to be false.
+        text: guard that would hold, or name of the object in the cell.
+        bans: constraint set of the guard.
+        margin: margin by which constraints must be false.
     """
     if kind == PlanCause.KIND_CONSTRAINT:
         margin_text = f" with a margin of {margin:.4g}" if margin else ""
@@ -863,7 +868,7 @@ def kind_text(decision: PlanDecision) -> str:
 
 
 def aim_of(decision: PlanDecision) -> PlanEdge | None:
-    """Return the aim of a decision, or None; see `Step.aim`."""
+    """Return the aim of a decision, as in `Step.aim`; None without an aim."""
     last_edge = decision.considered[-1] if decision.considered else None
     return None if last_edge is None or last_edge.pruned else last_edge
 
@@ -878,7 +883,7 @@ def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
 
 
 def _write_numbers(row: dict[str, Any], message: Message) -> None:
-    """Rewrite numbers that protobuf writes differently: 64-bit integers as text, infinity as "Infinity"."""
+    """Rewrite numbers for JSON: protobuf writes 64-bit integers as text, and infinity as "Infinity"."""
     for field, value in message.ListFields():
         json_value = row[field.name]
         if field.type == field.TYPE_FIXED64:

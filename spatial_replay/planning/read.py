@@ -136,7 +136,7 @@ def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
 
 
 def planner_of(source: Source) -> Planner:
-    """Return the planner of a log in its state before the first sample.
+    """Return the planner of a log, in the planner's state before the first sample.
 
     Raises:
         UsageError: the log holds no plan.
@@ -159,9 +159,9 @@ def planner_of(source: Source) -> Planner:
 
 
 def obstacles_of(source: Source) -> Mapping[str, Footprint]:
-    """Return the named obstacles of the workspace that a log was planned for.
+    """Return the named obstacles of the workspace for which a log was planned.
 
-    They are empty without a plan, or with settings that cannot be read.
+    The result is empty without a plan, or with settings that cannot be read.
     """
     plan_metadata = dict(source.metadata()).get(PLAN_METADATA, {})
     try:
@@ -211,7 +211,7 @@ class LoggedStep(Printed, Displayed):
 
     Attributes:
         step: decision with all maps on which it depends.
-        message: message of the decision in the log, with its outcome if it has one.
+        message: message of the decision in the log, with the outcome if there is one.
         sample: newest sample at the decision.
     """
 
@@ -225,11 +225,11 @@ class LoggedStep(Printed, Displayed):
 
 
 def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
-    """Read every step of a planned run, in order, each recomputed from the samples before it.
+    """Read every step of a planned run, in order; each step is recomputed from the earlier samples.
 
     Raises:
         UsageError: the log holds no plan.
-        MissingFileError, LogError: the log cannot be read, or a decision differs from the recomputed one.
+        MissingFileError, LogError: the log cannot be read, or a decision differs from its recomputation.
     """
     source = open_source(log)
     rerun = rerun_of(source)
@@ -262,11 +262,11 @@ def why_not_there(
 ) -> Iterator[str]:
     """Yield the reasons why a decision does not bring an object to a place: each demand, and obstacles.
 
-    Values are for the centre of the place's cell, in the orientation of the target if there is one.
+    Values are for the centre of the place's cell, in the target's orientation; without a target, for turn 0.
 
     Raises:
         UsageError: the log has no plan or no such decision, the decision did not consider the object, or the
-            place is outside its map.
+            place is outside the object's map.
         MissingFileError, LogError: the log cannot be read.
     """
     steps = {logged.step.number: logged for logged in read_steps(log)}
@@ -377,7 +377,7 @@ class PlannerMessage(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """A sample, None before the first one, and the planner's messages between it and the next sample."""
+    """A sample and the planner's messages until the next sample; before the first sample, `sample` is None."""
 
     sample: Sample | None
     messages: list[PlannerMessage]
@@ -391,7 +391,7 @@ def iter_moments(blocks: Iterable[Block]) -> Iterator[Moment]:
         pending_messages += planner_messages(block.messages)
         message_count = 0
         for sample in block.trace.samples():
-            # a message at the time of a sample belongs to this sample
+            # a message at the time of a sample belongs to the sample
             while (
                 message_count < len(pending_messages)
                 and pending_messages[message_count].time_ns < sample.time_ns
@@ -420,7 +420,7 @@ class Rerun:
     Attributes:
         box: planner with its messages; samples go to its `observe`.
         last: newest repeated decision.
-        is_moving: whether the motion of this decision is not concluded yet.
+        is_moving: whether the newest decision's motion is not concluded yet.
     """
 
     def __init__(self, planner: Planner) -> None:
@@ -437,10 +437,10 @@ class Rerun:
         return messages
 
     def repeat(self, recorded: PlanDecision) -> None:
-        """Repeat a recorded decision, or conclude it with its recorded outcome.
+        """Repeat a recorded decision, or conclude the decision with its recorded outcome.
 
         Raises:
-            LogError: the outcome of the previous decision is missing, or the decision of an outcome.
+            LogError: the previous decision has no outcome, or an outcome has no decision.
             UsageError: no sample was observed yet.
         """
         if not recorded.HasField("outcome"):
@@ -450,7 +450,7 @@ class Rerun:
                 )
             self.last = self.box.next_step()
             self.is_moving = self.last.kind == "execute"
-        # the next decision writes the outcome of a wait, so repeating that decision repeats the outcome
+        # the next decision writes the outcome of a wait, so its repetition also repeats the outcome
         elif recorded.kind != PlanDecision.KIND_WAIT:
             if not self.is_moving:
                 raise LogError(f"the log has the outcome of decision {recorded.number}, and not the decision")
@@ -491,7 +491,7 @@ class Recomputed:
 def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda samples: None) -> Recomputed:
     """Recompute every decision of a planned run from its samples, and compare all messages byte for byte.
 
-    Outcomes come from the controller, so they are taken from the log. A complete log without a decision, or
+    Outcomes come from the controller, so the log gives the outcomes. A complete log without a decision, or
     without a decision after a motion, also counts as different.
 
     Args:
@@ -511,7 +511,7 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
         # all messages have the sample's time, unless the log has lost samples
         for time_ns, messages in groupby(recorded, key=lambda message: message.time_ns):
             comparison.compare(time_ns, list(messages))
-    # a damaged log also lacks samples, so only an undamaged log is checked for a begin within the run
+    # a damaged log lacks samples, too, so only undamaged logs are checked for a begin within the run
     is_part = extent.is_copy if extent.samples is None else sample_count < extent.samples
     if not faults and is_part and (extent.is_cut or comparison.began_within):
         raise UsageError(
@@ -538,7 +538,7 @@ class _Comparison:
         rerun: repeated run.
         began_within: whether the log lacks the first decisions.
         decisions, maps: numbers of recomputed decisions and maps.
-        differences: differences at the first time at which messages differ; later messages are not compared.
+        differences: differences at the first time with different messages; later messages are not compared.
     """
 
     def __init__(self, rerun: Rerun) -> None:
@@ -548,7 +548,7 @@ class _Comparison:
         self.differences: list[str] = []
 
     def compare(self, time_ns: int, recorded: list[PlannerMessage]) -> None:
-        """Compare the messages of one time, after the newest sample was observed."""
+        """Compare the messages of one time; the newest sample must be observed."""
         # after a different decision the planner's state differs, so all later messages would differ
         if self.differences:
             return
@@ -617,13 +617,13 @@ def _seconds(time_ns: int) -> str:
 
 
 class _RunExtent(NamedTuple):
-    """The part of a run that a log has, by its metadata.
+    """The part of a run that a log has, according to the log's metadata.
 
     Attributes:
-        samples: number of samples of the run; None if its log has no end.
-        was_interrupted: whether the run was ended from outside.
+        samples: number of samples of the run; None for a log without an end.
+        was_interrupted: whether the run was interrupted.
         is_copy: whether a replay wrote the log.
-        is_cut: whether this replay began after the source's first sample.
+        is_cut: whether the replay began after the source's first sample.
     """
 
     samples: int | None
@@ -667,17 +667,18 @@ _REDONE: Final = MappingProxyType(
 class Replanned(Printed):
     """Decisions of a planner on the samples of a log, with another specification or other settings.
 
-    They end with the first decision with another motion: later samples follow from the recorded motion.
+    The first decision with another motion ends the result, because later samples follow from the recorded
+    motion.
 
     Attributes:
         name: name of the log.
         changes: sentences on the changes; empty if nothing was changed.
         decisions: number of decisions in the log.
         same: number of first decisions that are equal byte for byte, with all their maps.
-        alike: number of first decisions with the same motion, including the equal ones.
-        recorded, redone: first decision with another motion; None if there is none. `recorded` is also None
-            if the log has no decision at that sample.
-        messages: messages of the redone decisions, including the first different one.
+        alike: number of first decisions with an equal motion, including equal decisions.
+        recorded, redone: first decision with another motion; None without such a decision. `recorded` is also
+            None if the log has no decision at this sample.
+        messages: messages of the redone decisions, including the first different decision.
         faults: sentences on parts of the log that could not be read.
     """
 
@@ -751,7 +752,7 @@ def _maps_side_by_side(redone: Replanned, column_width: int) -> Iterator[str]:
     """Yield lines on the maps of each object for the last edges, in two columns.
 
     Args:
-        column: width of a column, characters.
+        column_width: width of a column, characters.
     """
     if redone.recorded is None or redone.redone is None:
         return
@@ -800,13 +801,13 @@ def redo_decisions(
 ) -> Replanned:
     """Decide again on the samples of a planned run, with another specification or other settings.
 
-    Outcomes come from the log while both planners have the same motions. While both planners wait, the new
-    one decides at every sample, as in `plan`.
+    Outcomes come from the log while both planners have equal motions. While both planners wait, the new
+    planner decides at every sample, as in `plan`.
 
     Args:
-        specification: specification to plan for instead of the recorded one.
+        specification: specification to plan for instead of the recorded specification.
         changes: changes of the recorded settings, by the keys of settings files.
-        name: name of the spec to plan for, if there are several.
+        name: name of the spec to plan for; needed if another specification has several results.
         advance: called with the number of samples of each block.
 
     Raises:
@@ -925,13 +926,13 @@ class _Redoing:
 
 
 def _does_the_same(old: Step, new: Step) -> bool:
-    """Return whether two decisions have the same motion; the robustness of their targets may differ."""
+    """Return whether two decisions have equal motions; the robustness of their targets may differ."""
     targets = [step.target and replace(step.target, robustness=0.0) for step in (old, new)]
     return old.kind == new.kind and targets[0] == targets[1]
 
 
 def _has_all(recorded: list[PlannerMessage], redone: Messages) -> bool:
-    """Return whether all messages are in the log, byte for byte."""
+    """Return whether the log has all redone messages, byte for byte."""
     payloads = {(message.topic, message.payload) for message in recorded}
     return all((message.topic, message.payload) in payloads for message in planner_messages(redone))
 
