@@ -326,7 +326,7 @@ class Automaton(Displayed):
         self, goal_states: Collection[int], without: Collection[tuple[int, int]] = ()
     ) -> dict[int, int]:
         """Map each state that can reach a goal state to the least number of samples that this takes."""
-        # few transitions are avoided, so the remaining transitions of their sources are followed one by one
+        # transitions to avoid are few; the other transitions of their sources are followed one by one
         avoided_targets: dict[int, set[int]] = {}
         for source, target in without:
             if source in self.states:

@@ -527,7 +527,8 @@ def _course_ahead(tracked: TrackedObject, motion: Pose, sample_numbers: Sequence
 def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: Sequence[int]) -> Trace:
     """Return a trace that repeats a sample, with some objects moved along courses.
 
-    The trace is as long as the longest course. A shorter course, over `sample_numbers`, is repeated.
+    The trace is as long as the longest course. A shorter course, one place for each of `sample_numbers`, is
+    repeated.
     """
     start_trace = Trace.from_samples([sample])
     sample_count = max(len(course.places) for course in courses.values())

@@ -213,9 +213,9 @@ class Planner:
 
         A motion must stop if the predicted next sample loses acceptance. In the prediction, every object
         repeats its motion between the newest two samples. The object that the robot moves stops at the end of
-        its path. A motion must also stop if another object may come too near before the end of the motion,
-        and waiting or a motion aside is safer. A robot checks the reason after each sample, and ends a motion
-        that must stop with `Outcome(False, planner.stop_reason)`.
+        its path. A motion must also stop if waiting or a motion aside is safer, because another object may
+        come too near. A robot checks the reason after each sample, and ends a motion that must stop with
+        `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 

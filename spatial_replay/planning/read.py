@@ -377,7 +377,7 @@ class PlannerMessage(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """A sample and the planner's messages until the next sample; before the first sample, `sample` is None."""
+    """A sample with the planner's messages until the next sample; `sample` is None before the first one."""
 
     sample: Sample | None
     messages: list[PlannerMessage]

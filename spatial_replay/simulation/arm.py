@@ -45,7 +45,7 @@ _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
 """Force of the fingers, N."""
 _PINCHED = 0.004
-"""Excess of the fingers' actual distance over the commanded distance that shows a held body, metres."""
+"""A held body keeps the fingers at least this much wider apart than commanded, metres."""
 _MIDDLE, _FURTHEST = 0.78, 2.75
 """Tool yaw range relative to the direction from the base: its centre and its half width, radians."""
 _NEAREST, _FARTHEST = 0.27, 0.77
@@ -173,7 +173,7 @@ class Arm:
 def _shares(*durations_s: float) -> list[float]:
     """Return the completed share of a motion after each tick: a cubic, slow at both ends.
 
-    The motion takes the longest of the durations, or more.
+    The motion takes 1.5 times the longest duration, because it is slower than its maximum speed.
     """
     # the maximum speed of the cubic, in the middle, is 1.5 times its mean speed
     tick_count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
@@ -532,7 +532,7 @@ _LOW = FINGERTIP + 0.006
 _AWAY = 0.01
 """Distance behind a body at which the fingers come down, metres."""
 _MARGIN = 0.001
-"""Remaining distance at which a stroke ends; also the required clearance behind a body; metres."""
+"""Distance from the goal at which a stroke ends, and least clearance behind a pushed body, metres."""
 _PUSH_FAST, _PUSH_SLOW = 0.1, 0.015
 """Speed of a push at the beginning and at the end, m/s."""
 _CLOSE = 0.004

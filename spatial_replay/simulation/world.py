@@ -107,7 +107,7 @@ def height(shape: Shape, pose: Pose) -> tuple[float, float]:
 
 
 def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
-    """Return a rectangle around a point, metres, whose length is along `yaw`."""
+    """Return a rectangle around a point, with its length along `yaw`; all lengths are in metres."""
     a, b, cosine, sine = length / 2, width / 2, math.cos(yaw), math.sin(yaw)
     corners = ((a, b), (-a, b), (-a, -b), (a, -b))
     return Footprint.polygon([(x + u * cosine - v * sine, y + u * sine + v * cosine) for u, v in corners])
