@@ -60,7 +60,7 @@ def document_from_replay(
 
 
 def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | None) -> dict[str, Any]:
-    value: dict[str, Any] = {
+    document: dict[str, Any] = {
         **json_fields(result, *RESULT_COLUMNS),
         "requirement": result.spec.id,
         "title": result.spec.title,
@@ -79,17 +79,18 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         ],
     }
     if result.has_series:
-        value["series"] = {
+        document["series"] = {
             "time_ns": result.times_ns.tolist(),
             **{
-                key: _numbers(result.series[:, k]) for k, key in enumerate(("value", "now", "lower", "upper"))
+                quantity: _numbers(result.series[:, row])
+                for row, quantity in enumerate(("value", "now", "lower", "upper"))
             },
         }
         if result.leaves is not None and signal:
-            value["series"]["signal"] = _numbers(result.full_signal())
+            document["series"]["signal"] = _numbers(result.full_signal())
         if result.leaves is not None and window_ns is not None:
-            value["series"]["window"] = _numbers(result.window_signal(window_ns))
-    return value
+            document["series"]["window"] = _numbers(result.window_signal(window_ns))
+    return document
 
 
 def _of_node(node: NodeResult) -> dict[str, Any]:
@@ -116,10 +117,10 @@ def _untested_part(part: UntestedPart, first_ns: int) -> dict[str, Any]:
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
     """Return the witness of a node's verdict. Its sentences count time from `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
-    value: dict[str, Any] = {
+    document: dict[str, Any] = {
         **json_fields(witness, "node", "verdict", "lower", "upper", "time_ns", "obstacle"),
         "name": witness.path[0].name,
-        "path": [json_fields(step, "node", "time_ns") for step in witness.path],
+        "path": [json_fields(path_step, "node", "time_ns") for path_step in witness.path],
         "atom": None,
         "threshold": None,
         "missed": None,
@@ -135,35 +136,35 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
     if witness.missed is not None:
-        value["missed"] = _missed_response(witness, witness.missed)
+        document["missed"] = _missed_response(witness, witness.missed)
     if deciding is not None:
-        value["atom"] = _atom(deciding)
+        document["atom"] = _atom(deciding)
     if threshold is not None:
-        value["threshold"] = _threshold(threshold)
-    return value
+        document["threshold"] = _threshold(threshold)
+    return document
 
 
 def _missed_response(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
     """Return a missed response, with the closest atom if another atom decides."""
-    atom, time_ns = witness.closest or (None, None)
+    closest_atom, closest_ns = witness.closest or (None, None)
     threshold = witness.closest_threshold
     return {
         **json_fields(missed, "condition", "response", "time_ns"),
-        "closest": None if atom is None else {"time_ns": time_ns, "atom": _atom(atom)},
+        "closest": None if closest_atom is None else {"time_ns": closest_ns, "atom": _atom(closest_atom)},
         "threshold": None if threshold is None else _threshold(threshold),
     }
 
 
 def _threshold(threshold: Threshold) -> dict[str, Any]:
-    named = {"constant": threshold.constant or None, "replacement": threshold.replacement or None}
-    return {**json_fields(threshold), **named}
+    constants = {"constant": threshold.constant or None, "replacement": threshold.replacement or None}
+    return {**json_fields(threshold), **constants}
 
 
 def _atom(deciding: DecidingAtom) -> dict[str, Any]:
     return {
         **json_fields(deciding, "text", "objects", "value", "lower", "upper", "unknown"),
         "relation": deciding.atom.relation,
-        "measured": [_measurement(number) for number in deciding.measured],
+        "measured": [_measurement(measurement) for measurement in deciding.measured],
     }
 
 
@@ -195,9 +196,9 @@ def _measurement(measured: Measured) -> dict[str, Any]:
     }
 
 
-def _numbers(rows: Floats) -> list[list[float | str | None]]:
+def _numbers(node_rows: Floats) -> list[list[float | str | None]]:
     """Return one list of numbers for each node."""
-    return [[json_number(number) for number in row] for row in rows.tolist()]
+    return [[json_number(number) for number in row] for row in node_rows.tolist()]
 
 
 def idle_document(template: UntestedPart) -> dict[str, Any]:
@@ -257,9 +258,9 @@ def explain_results(
             f"no result is about object {object!r}; objects with a result of their own: {objects}"
         )
     explanations = [
-        explain_node(result, identifier, first_ns=replayed.first_ns, goes_on=goes_on)
+        explain_node(result, node_id, first_ns=replayed.first_ns, goes_on=goes_on)
         for result in results
-        for identifier in _find_nodes(result, node)
+        for node_id in _find_nodes(result, node)
     ]
     if not explanations:
         names = {named_node.name for result in results for _, _, named_node in iter_nodes(result.formula)}
@@ -273,22 +274,22 @@ def _find_nodes(result: SpecResult, name: str | None) -> Iterator[int]:
     if name is None or name in (*names_of(result.name, spec_id), *names_of(result.title, spec_id)):
         yield 0
         return
-    for identifier, _, named_node in iter_nodes(result.formula):
-        spec = result.evidence.instance.named.get(named_node.name or "")
-        if named_node.name and name in names_of(named_node.name, None if spec is None else spec.id):
-            yield identifier
+    for node_id, _, node in iter_nodes(result.formula):
+        named_spec = result.evidence.instance.named.get(node.name or "")
+        if node.name and name in names_of(node.name, None if named_spec is None else named_spec.id):
+            yield node_id
             return
 
 
 def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdict | None:
     """Return the verdict that `explain_results` explains; None without such a node."""
-    for identifier in _find_nodes(result, node):
-        is_open = _is_open(result, identifier, goes_on=goes_on)
-        return Verdict.PENDING if is_open else result.nodes[identifier].verdict
+    for node_id in _find_nodes(result, node):
+        is_pending = _is_pending(result, node_id, goes_on=goes_on)
+        return Verdict.PENDING if is_pending else result.nodes[node_id].verdict
     return None
 
 
-def _is_open(result: SpecResult, node: int, *, goes_on: bool) -> bool:
+def _is_pending(result: SpecResult, node: int, *, goes_on: bool) -> bool:
     """Return whether the verdict of a node is pending: later samples decide it."""
     _, _, lower, upper = result.series[node]
     return goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
@@ -298,42 +299,45 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     """Explain the verdict of one node of a result; see `explain_results`."""
     if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
-    about = result.nodes[node]
-    is_open = _is_open(result, node, goes_on=goes_on)
+    node_result = result.nodes[node]
+    is_pending = _is_pending(result, node, goes_on=goes_on)
     # a goal that later samples may still reach is no cause
     causes = [cause for cause in result.causes_of(node) if not goes_on or cause.settled_ns is not None]
-    if is_open:
+    if is_pending:
         witness = result.witness(node)
         sentences = sentences_of(witness, first_ns=first_ns, is_open=True)
     else:
-        worst = result.worst_of(node, causes)
-        witness = result.witness(node) if worst is None else worst
+        worst_witness = result.worst_of(node, causes)
+        witness = result.witness(node) if worst_witness is None else worst_witness
         sentences = result.sentences_about(node, causes, first_ns, goes_on=goes_on)
-    is_whole = node == 0 and not is_open
-    sentences += counted_from(result.remarks, first_ns) if is_whole else ()
-    if words := units_text(units_of(nodes_of(result.formula)[node])):
-        sentences += (Sentence(words),)
-    verdict = Verdict.PENDING if is_open else about.verdict
-    decided = witness_document(witness, first_ns)
+    is_result = node == 0 and not is_pending
+    sentences += counted_from(result.remarks, first_ns) if is_result else ()
+    if units_sentence := units_text(units_of(nodes_of(result.formula)[node])):
+        sentences += (Sentence(units_sentence),)
+    verdict = Verdict.PENDING if is_pending else node_result.verdict
+    witness_fields = witness_document(witness, first_ns)
     document = {
         "specification": result.name,
         "object": result.object,
         "zero_ns": first_ns,
         "node": node,
-        **_of_node(about),
+        **_of_node(node_result),
         "verdict": str(verdict),
-        "since_ns": None if is_open else result.certain_ns(node),
-        "may_change": is_open,
-        **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},
-        "worst": decided,
-        "causes": [] if is_open else [_cause(cause, first_ns) for cause in causes],
+        "since_ns": None if is_pending else result.certain_ns(node),
+        "may_change": is_pending,
+        **{
+            field: witness_fields[field]
+            for field in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")
+        },
+        "worst": witness_fields,
+        "causes": [] if is_pending else [_cause(cause, first_ns) for cause in causes],
         "violations": [
             _invariant(invariant)
-            for invariant in (() if is_open else result.violated_invariants_of(node, goes_on=goes_on))
+            for invariant in (() if is_pending else result.violated_invariants_of(node, goes_on=goes_on))
         ],
-        "tested": result.tested if is_whole else None,
-        "untested": [_untested_part(part, first_ns) for part in result.untested] if is_whole else [],
-        "vacuous": [_untested_part(part, first_ns) for part in result.vacuous] if is_whole else [],
+        "tested": result.tested if is_result else None,
+        "untested": [_untested_part(part, first_ns) for part in result.untested] if is_result else [],
+        "vacuous": [_untested_part(part, first_ns) for part in result.vacuous] if is_result else [],
         "explanation": list(sentences),
     }
     return Explanation(verdict, witness.time_ns, sentences, document)

@@ -251,27 +251,27 @@ class LogAccount:
         Raises:
             SpecificationError: a name is missing, and names are strict.
         """
-        missing = selection.missing_names(self._names)
+        missing_names = selection.missing_names(self._names)
         dropped = dropped_samples(selection.source)
-        left, doubts = self._departures_by_time(first_ns), self.doubts(first_ns)
-        name, options = selection.source.name, selection.options
+        all_departures, doubts = self._departures_by_time(first_ns), self.doubts(first_ns)
+        log_name, options = selection.source.name, selection.options
         return Replayed(
-            log=name,
+            log=log_name,
             samples=self.samples,
             first_ns=first_ns,
             start_ns=self._times_ns[0],
             end_ns=self._times_ns[-1],
             faults=counted_from(self._faults, first_ns),
             remarks=(
-                *(doubt.remark(name) for doubt in doubts),
+                *(doubt.remark(log_name) for doubt in doubts),
                 *counted_from(self._remarks, first_ns),
                 *dropped.remarks,
                 *self._empty_ends(selection.window, first_ns),
-                *(departure.message for departure in left),
+                *(departure.message for departure in all_departures),
                 *self._stillness.remarks(),
                 *counted_from(self._heights.remarks(), first_ns),
             ),
-            missing=missing,
+            missing=missing_names,
             dropped=dropped,
             unreadable=self._unreadable,
             results=tuple(results),
@@ -283,31 +283,34 @@ class LogAccount:
             ),
             certificate=certificate,
             semantics=options.semantics,
-            left=left,
+            left=all_departures,
             doubts=doubts,
         )
 
     def _departures_by_time(self, first_ns: int) -> tuple[Departure, ...]:
         """Return the distinct departures of objects in all specifications, sorted by time."""
-        by_start = {
+        departure_by_start = {
             (departure.start_ns, departure.name): departure
             for departures in self._departures
             for departure in departures.departures
         }
         return tuple(
             replace(departure, message=counted_from([departure.message], first_ns)[0])
-            for _, departure in sorted(by_start.items())
+            for _, departure in sorted(departure_by_start.items())
         )
 
     def _empty_ends(self, window: Window, first_ns: int) -> Iterator[Sentence]:
         """Yield remarks on ends of the window without samples: the log pauses, or has ended."""
-        begin_ns, last_ns = self._times_ns[0], self._times_ns[-1]
-        usual_ns = (last_ns - begin_ns) / max(self.samples - 1, 1)
-        asked_ns = max(window.start_ns, first_ns) if window.start_ns else begin_ns
-        for start_ns, end_ns in ((asked_ns, begin_ns), (last_ns, window.end_ns)):
-            if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
-                begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
-                yield Sentence("the window has no sample from ", begin, " to ", end)
+        first_sample_ns, last_sample_ns = self._times_ns[0], self._times_ns[-1]
+        mean_step_ns = (last_sample_ns - first_sample_ns) / max(self.samples - 1, 1)
+        window_start_ns = max(window.start_ns, first_ns) if window.start_ns else first_sample_ns
+        for gap_start_ns, gap_end_ns in (
+            (window_start_ns, first_sample_ns),
+            (last_sample_ns, window.end_ns),
+        ):
+            if 0 < LONG_PAUSE * mean_step_ns < gap_end_ns - gap_start_ns and gap_end_ns != FOREVER:
+                gap_start, gap_end = Instant(gap_start_ns, first_ns), Instant(gap_end_ns, first_ns)
+                yield Sentence("the window has no sample from ", gap_start, " to ", gap_end)
 
 
 class Replay:
@@ -397,23 +400,23 @@ class Replay:
         # the next block is evaluated while messages of this one are made, if a core is free for that
         for block, trace, stretches in read_ahead(self._evaluate(messages=needs_messages)):
             self._traces.add(trace)
-            inside = self._selection.inside(trace)
+            window_samples = self._selection.inside(trace)
             messages = Messages()
             if needs_messages:
                 messages = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
-            self._account.add(block, inside)
+            self._account.add(block, window_samples)
             if not layer:
                 self._topics.update(channel.topic for channel in messages.channels.values())
                 self._images |= image_topics(messages.channels.values())
-            self._keep(inside, messages, stretches)
+            self._keep(window_samples, messages, stretches)
             if self._zero_ns is None:
                 self._zero_ns = log_zero_ns(self._source, self._selection.window, self._ends)
                 begin(self._zero_ns)
             if write is not None:
                 self._evaluation.annotator.count_from(self._zero_ns)
-                self._annotate(write, inside, stretches, Messages() if layer else messages)
-            advance(len(inside))
+                self._annotate(write, window_samples, stretches, Messages() if layer else messages)
+            advance(len(window_samples))
         replayed = self._results()
         if write is not None:
             annotator, finals = self._evaluation.annotator, self._evaluation.finals
@@ -421,17 +424,25 @@ class Replay:
         return replayed
 
     def _annotate(
-        self, write: Callable[[Messages], None], trace: Trace, stretches: Sequence[SeriesBlock], own: Messages
+        self,
+        write: Callable[[Messages], None],
+        trace: Trace,
+        stretches: Sequence[SeriesBlock],
+        own_messages: Messages,
     ) -> None:
         """Write the messages of a block in parts, because messages of many results are large."""
-        most = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
-        begins = range(0, max(len(trace), 1), most)
+        part_length = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
+        part_begins = range(0, max(len(trace), 1), part_length)
         # the log's own messages may lie before the first sample or after the last one
-        starts_ns = [-FOREVER, *(int(trace.times_ns[begin]) for begin in begins[1:]), FOREVER]
-        for begin, (start_ns, end_ns) in zip(begins, pairwise(starts_ns), strict=True):
-            part = trace.slice(begin, min(begin + most, len(trace)))
-            derived = self._evaluation.annotator.messages(*with_stretches(part, stretches))
-            messages = merge([*derived, own.within(start_ns, end_ns)])
+        part_starts_ns = [
+            -FOREVER,
+            *(int(trace.times_ns[begin]) for begin in part_begins[1:]),
+            FOREVER,
+        ]
+        for begin, (start_ns, end_ns) in zip(part_begins, pairwise(part_starts_ns), strict=True):
+            part_samples = trace.slice(begin, min(begin + part_length, len(trace)))
+            derived_messages = self._evaluation.annotator.messages(*with_stretches(part_samples, stretches))
+            messages = merge([*derived_messages, own_messages.within(start_ns, end_ns)])
             self._start_ns = min(self._start_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS)
             write(messages)
 
@@ -454,17 +465,17 @@ class Replay:
         ]
         scene = replace(self._evaluation.annotator.scene, written_ns=None, shown=(), last={})
         annotator = self._evaluation.new_annotator(scene, self._selection.options.arrow, show)
-        waiting = deque(times_ns)
+        next_times_ns = deque(times_ns)
         for trace in self._traces.read():
-            rest = self._selection.inside(trace)
-            while waiting and len(rest) and waiting[0] <= int(rest.times_ns[-1]):
-                at = int(np.searchsorted(rest.times_ns, waiting.popleft()))
-                annotator.pass_over(*with_stretches(rest.slice(0, at), stretches))
-                annotator.draw(*with_stretches(rest.slice(at, at + 1), stretches))
-                rest = rest.slice(at + 1, len(rest))
-            if not waiting:
+            samples = self._selection.inside(trace)
+            while next_times_ns and len(samples) and next_times_ns[0] <= int(samples.times_ns[-1]):
+                sample_index = int(np.searchsorted(samples.times_ns, next_times_ns.popleft()))
+                annotator.pass_over(*with_stretches(samples.slice(0, sample_index), stretches))
+                annotator.draw(*with_stretches(samples.slice(sample_index, sample_index + 1), stretches))
+                samples = samples.slice(sample_index + 1, len(samples))
+            if not next_times_ns:
                 return
-            annotator.pass_over(*with_stretches(rest, stretches))
+            annotator.pass_over(*with_stretches(samples, stretches))
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
@@ -480,12 +491,12 @@ class Replay:
 
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
-        planned = planned_for(self._source, self.files)
+        planner_file = planned_for(self._source, self.files)
         return self._evaluation.layout(
             self._topics,
             self._source.axes,
             self._images,
-            planned,
+            planner_file,
             self._shown_start(),
             planned_result(self._source),
         )
@@ -508,13 +519,13 @@ class Replay:
         if self._hashes is not None:
             self._hashes.add_samples(trace, messages)
             self._hashes.add_results(stretches)
-        for index, stretch in enumerate(stretches):
+        for result_index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
-                blocks = self._kept[index]
-                blocks.append(self._kept_part(stretch))
+                kept_blocks = self._kept[result_index]
+                kept_blocks.append(self._kept_part(stretch))
                 # joined arrays lie in temporary files: 0.25 instead of 0.64 GB for a million samples
-                while len(blocks) > 1 and len(blocks[-2].times_ns) <= len(blocks[-1].times_ns):
-                    blocks[-2:] = [join_blocks(blocks[-2:])]
+                while len(kept_blocks) > 1 and len(kept_blocks[-2].times_ns) <= len(kept_blocks[-1].times_ns):
+                    kept_blocks[-2:] = [join_blocks(kept_blocks[-2:])]
 
     def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
         """Return a stretch with only those arrays that are kept."""
@@ -581,13 +592,13 @@ class _KeptTraces:
 def dropped_samples(source: Source) -> Dropped:
     """Return the dropped samples of a recorder, and its interruption, from a log's metadata."""
     ending = dict(source.metadata()).get(ENDING, {})
-    texts = [ending.get(name, "0") for name in ("samples", "dropped")]
+    count_texts = [ending.get(name, "0") for name in ("samples", "dropped")]
     # the metadata of a log may be any text; 18 digits fit into 64 bits
-    written_count, count = (
+    written_count, dropped_count = (
         int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else 0
-        for text in texts
+        for text in count_texts
     )
-    return Dropped(count, written_count + count, ending.get("interrupted") == "true")
+    return Dropped(dropped_count, written_count + dropped_count, ending.get("interrupted") == "true")
 
 
 def replayed_specs(
@@ -647,15 +658,15 @@ def planned_result(source: Source) -> str:
 
 def planned_for(source: Source, files: Sequence[Specification]) -> str:
     """Return the name of the planner's specification file if none of these has its meaning; else ""."""
-    name = plan_of(source).get("file", "")
-    recorded = {
+    file_name = plan_of(source).get("file", "")
+    text_by_name = {
         attachment.name: attachment.data.decode("utf-8", "replace") for attachment in source.attachments()
     }
-    text = recorded.get(RECORDED_PREFIX + name)
+    plan_text = text_by_name.get(RECORDED_PREFIX + file_name)
     with suppress(SpecificationError):
-        evaluated = [format_specification(file) for file in files]
-        if text is not None and format_specification(parse_specification(text)) not in evaluated:
-            return name
+        file_texts = [format_specification(file) for file in files]
+        if plan_text is not None and format_specification(parse_specification(plan_text)) not in file_texts:
+            return file_name
     return ""
 
 
@@ -717,7 +728,7 @@ def run_replay(
         replayed = replay.run(sink.write_messages, layer=layer, begin=begin, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
-        texts = {
+        verdict_texts = {
             result.title: verdict_text(
                 result.verdict,
                 (result.robustness, result.lower, result.upper),
@@ -725,9 +736,9 @@ def run_replay(
                 result.tested,
                 is_doubtful=bool(result.doubts),
             )
-            for result in (replayed.results[place] for place in worst_first(replayed.results))
+            for result in (replayed.results[index] for index in worst_first(replayed.results))
         }
-        sink.add_metadata(VERDICTS, texts)
+        sink.add_metadata(VERDICTS, verdict_texts)
         if replayed.doubts:
             sink.add_metadata(DOUBTS, metadata_from_doubts(replayed.doubts))
         sink.add_metadata(CERTIFICATE, replayed.certificate)
@@ -751,10 +762,10 @@ def load_files(
         UsageError: no specification is named or in the log, or no specification has one of the constants.
         SpecificationError: a specification has errors.
     """
-    named: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
-    if not named:
+    specifications: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
+    if not specifications:
         raise UsageError(f"{source.name} holds no specification of its own; give one with --spec FILE")
-    return load_specifications(named, constants=constants)
+    return load_specifications(specifications, constants=constants)
 
 
 def recorded_texts(source: Source) -> list[SpecificationText]:
@@ -780,23 +791,25 @@ def _begin(
     sink: Sink, source: Source, replay: Replay, options: ReplayOptions, zero_ns: int, *, layer: bool
 ) -> None:
     """Write the metadata and the attachments, which come before the first message."""
-    before = dict(source.metadata()).get(METADATA, {})
-    is_replayed = before.get("written_by") == "replay"
-    about = {
+    source_record = dict(source.metadata()).get(METADATA, {})
+    is_replayed = source_record.get("written_by") == "replay"
+    record = {
         "version": __version__,
         "written_by": "replay",
         "semantics": options.semantics,
         # a replay of a replay names the first source, so that both logs are equal
-        "source": before.get("source", source.name) if is_replayed else source.name,
+        "source": source_record.get("source", source.name) if is_replayed else source.name,
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
         ZERO: str(zero_ns),
     }
-    about |= source.axes.metadata()
-    recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
-    if not is_replayed and "options" in before:
-        recorded["recorded_options"] = before["options"]
-    sink.add_metadata(METADATA, {**about, **recorded})
+    record |= source.axes.metadata()
+    source_entries = {
+        entry: value for entry, value in source_record.items() if entry not in record and entry != "source"
+    }
+    if not is_replayed and "options" in source_record:
+        source_entries["recorded_options"] = source_record["options"]
+    sink.add_metadata(METADATA, {**record, **source_entries})
     sink.add_metadata(AUTOMATA, {automaton.name: automaton.summary for automaton in replay.automata})
     if not layer:
         _copy_metadata(sink, source)
@@ -806,9 +819,9 @@ def _begin(
 
 def _copy_metadata(sink: Sink, source: Source) -> None:
     """Copy the source's metadata and attachments, except those that a replay replaces."""
-    for name, data in source.metadata():
+    for name, record in source.metadata():
         if name not in (METADATA, AUTOMATA, VERDICTS, DOUBTS, CERTIFICATE):
-            sink.add_metadata(name, data)
+            sink.add_metadata(name, record)
     for attachment in source.attachments():
         if not attachment.name.startswith(_REPLACED) and attachment.name != LAYOUT:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
@@ -816,19 +829,19 @@ def _copy_metadata(sink: Sink, source: Source) -> None:
 
 def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) -> dict[str, object]:
     """Return the options that differ from the defaults, as `verification` reads them back."""
-    whole = Window()
-    recorded = dict(source.options)
-    recorded |= {
-        name: getattr(options.window, name)
-        for name in ("start_ns", "end_ns", "every")
-        if getattr(options.window, name) != getattr(whole, name)
+    default_window = Window()
+    recorded_options = dict(source.options)
+    recorded_options |= {
+        option: getattr(options.window, option)
+        for option in ("start_ns", "end_ns", "every")
+        if getattr(options.window, option) != getattr(default_window, option)
     }
     if options.each:
-        recorded["each"] = dict(sorted(options.each.items()))
+        recorded_options["each"] = dict(sorted(options.each.items()))
     if options.arrow:
-        recorded["arrow"] = options.arrow
+        recorded_options["arrow"] = options.arrow
     if layer:
-        recorded["layer"] = True
+        recorded_options["layer"] = True
     elif options.keep not in (None, KEEP_ALL):
-        recorded["keep"] = list(options.keep or ())
-    return recorded
+        recorded_options["keep"] = list(options.keep or ())
+    return recorded_options

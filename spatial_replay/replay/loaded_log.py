@@ -100,9 +100,9 @@ class OwnMessages:
         times_ns = self._selection.inside(block.trace).times_ns
         self._span(times_ns)
         if len(times_ns):
-            first_ns, end_ns = self._samples_ns
+            span_start_ns, span_end_ns = self._samples_ns
             # the end is tested, because a log may begin at 0
-            self._samples_ns = (first_ns if end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
+            self._samples_ns = (span_start_ns if span_end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
         self._count(messages)
         # a log without messages is played from memory; others are read again
         if self._counts:
@@ -117,19 +117,19 @@ class OwnMessages:
             LogError: the log can no longer be read.
         """
         selection = self._selection
-        first = 0
+        first_sample = 0
         for block in self._iter_blocks(max(start_ns, selection.window.start_ns)):
-            yield selection.own_messages(block, first)
-            first += len(selection.inside(block.trace))
+            yield selection.own_messages(block, first_sample)
+            first_sample += len(selection.inside(block.trace))
 
     def few_before(self, time_ns: int) -> Messages:
         """Return the last message before a time of each topic with few messages."""
-        before = [
+        earlier_messages = [
             select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
-            for pieces in self._few.values()
-            for messages in pieces
+            for channel_pieces in self._few.values()
+            for messages in channel_pieces
         ]
-        return latest_messages(merge(before), time_ns)
+        return latest_messages(merge(earlier_messages), time_ns)
 
     def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
         """Read the log from a time on. A log of samples only is read from memory, in small pieces."""
@@ -141,9 +141,9 @@ class OwnMessages:
         if len(self._samples) > 1:
             self._samples = [Trace.concatenate(self._samples)]
         for trace in self._samples:
-            begin = int(np.searchsorted(trace.times_ns, start_ns))
-            for at in range(begin, len(trace), _PIECE):
-                yield Block(trace.slice(at, at + _PIECE))
+            first_index = int(np.searchsorted(trace.times_ns, start_ns))
+            for piece_begin in range(first_index, len(trace), _PIECE):
+                yield Block(trace.slice(piece_begin, piece_begin + _PIECE))
 
     def _span(self, times_ns: Integers) -> None:
         if len(times_ns):
@@ -153,12 +153,12 @@ class OwnMessages:
 
     def _count(self, messages: Messages) -> None:
         """Count messages in the window. Topics with many messages are removed from memory."""
-        for channel, rows in messages.by_channel():
+        for channel, message_rows in messages.by_channel():
             if channel not in self._counts:
                 self._few[channel] = []
-            self._counts[channel] = self._counts.get(channel, 0) + len(rows)
+            self._counts[channel] = self._counts.get(channel, 0) + len(message_rows)
             if channel in self._few:
-                channel_messages = select(messages, rows)
+                channel_messages = select(messages, message_rows)
                 self._few[channel].append(channel_messages)
                 self._bytes += _size(channel_messages)
                 if self._counts[channel] > _FEW or self._bytes > _FEW_BYTES:
@@ -181,23 +181,23 @@ class MessageCursor:
             LogError: the log can no longer be read.
         """
         while not self._is_over and not _reaches(self._waiting, end_ns):
-            piece = next(self._pieces, None)
-            if piece is None:
+            next_messages = next(self._pieces, None)
+            if next_messages is None:
                 self._is_over = True
             else:
-                rest = select(self._waiting, np.arange(self._taken, len(self._waiting)))
-                self._waiting, self._taken = merge([rest, piece]), 0
-        begin = self._taken
-        self._taken = max(begin, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
-        return select(self._waiting, np.arange(begin, self._taken))
+                remaining_messages = select(self._waiting, np.arange(self._taken, len(self._waiting)))
+                self._waiting, self._taken = merge([remaining_messages, next_messages]), 0
+        first_row = self._taken
+        self._taken = max(first_row, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
+        return select(self._waiting, np.arange(first_row, self._taken))
 
 
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
     """Return the messages of each channel from a time on; if it has none, its last message before."""
     # the first index of a channel in reversed order is its last message
-    _, last = np.unique(messages.channel[::-1], return_index=True)
+    _, reversed_rows = np.unique(messages.channel[::-1], return_index=True)
     is_shown = messages.log_time_ns >= time_ns
-    is_shown[len(messages) - 1 - last] = True
+    is_shown[len(messages) - 1 - reversed_rows] = True
     return select(messages, np.flatnonzero(is_shown))
 
 
@@ -282,8 +282,8 @@ class LoadedLog:
         traces: list[Trace] = []
         remarks: list[str] = []
         doubts: list[Doubt] = []
-        ends = selection.run_ends()
-        for block, trace in read_ahead(selection.read_blocks(ends=ends)):
+        run_ends = selection.run_ends()
+        for block, trace in read_ahead(selection.read_blocks(ends=run_ends)):
             traces.append(trace)
             remarks += block.remarks
             doubts += block.doubts
@@ -297,9 +297,9 @@ class LoadedLog:
         self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
         self.plan = plan_of(source)
-        self.first_ns = log_zero_ns(source, options.window, ends)
+        self.first_ns = log_zero_ns(source, options.window, run_ends)
         self.doubts = distinct_doubts(doubts, self.first_ns)
-        self._needs, self._has_spans = ends.needs, ends.has_spans
+        self._needs, self._has_spans = run_ends.needs, run_ends.has_spans
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
@@ -313,8 +313,8 @@ class LoadedLog:
             UsageError: an option does not fit the specifications.
             SpecificationError: a name is missing, and names are strict.
         """
-        looks_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
-        if looks_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
+        looks_back_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
+        if looks_back_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
             options = replace(self.options, keep=self._keep)
             return LoadedLog(self._source, files, options, saved=self._saved)
         # a shallow copy shares the samples and their cached measurements
@@ -347,11 +347,11 @@ class LoadedLog:
         return self._saved is not None and self._saved.was_written(*self._places[name])
 
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
-        edits = [dict[str, float | str]() for _ in self._files]
+        values_by_file = [dict[str, float | str]() for _ in self._files]
         for name, value in values.items():
-            index, constant_name = self._place(name, value)
-            edits[index][constant_name] = value
-        return edits
+            file_index, constant_name = self._place(name, value)
+            values_by_file[file_index][constant_name] = value
+        return values_by_file
 
     def edit(self, values: Mapping[str, float | str]) -> EditedFiles:
         """Return the specifications with other values for some constants. Only changed files are parsed.
@@ -364,15 +364,18 @@ class LoadedLog:
             UsageError: a constant is missing, or a value is of another kind.
             SpecificationError: a specification is invalid with these values.
         """
-        edits = self._by_file(values)
-        edited = [_edit_file(file, edit) for file, edit in zip(self._files, edits, strict=True)]
-        stored = [
-            logged
-            if file is file_as_written
-            else with_numbers(_storable(file, file_as_written, logged), self.trace.units)
-            for file, file_as_written, logged in zip(edited, self._files, self._kept, strict=True)
+        values_by_file = self._by_file(values)
+        files = [
+            _edit_file(file, file_values)
+            for file, file_values in zip(self._files, values_by_file, strict=True)
         ]
-        return EditedFiles(self, tuple(stored), MappingProxyType(dict(values)), self._constants(edited))
+        stored_files = [
+            logged_file
+            if file is file_as_written
+            else with_numbers(_storable(file, file_as_written, logged_file), self.trace.units)
+            for file, file_as_written, logged_file in zip(files, self._files, self._kept, strict=True)
+        ]
+        return EditedFiles(self, tuple(stored_files), MappingProxyType(dict(values)), self._constants(files))
 
     def evaluate(self, values: Mapping[str, float | str] | EditedFiles | None = None) -> Evaluated:
         """Evaluate the specifications over all samples, with other values for some constants.
@@ -385,23 +388,23 @@ class LoadedLog:
                 memory.
             SpecificationError: a specification is invalid with these values.
         """
-        edited = values if isinstance(values, EditedFiles) else self.edit(values or {})
+        edited_files = values if isinstance(values, EditedFiles) else self.edit(values or {})
         # `every` was applied when the samples were read
         options = replace(self.options, window=replace(self.options.window, every=1))
-        selection = Selection(MemorySource(self.trace, self.name), edited.files, options)
-        instances = [selection.instances(file) for file in edited.files]
+        selection = Selection(MemorySource(self.trace, self.name), edited_files.files, options)
+        instances = [selection.instances(file) for file in edited_files.files]
         evaluation = AnnotatedEvaluation(
-            edited.files, instances, options.semantics, self._attachments, units=self.trace.units
+            edited_files.files, instances, options.semantics, self._attachments, units=self.trace.units
         )
         self._check_size(evaluation)
-        blocks = evaluation.extend(self.trace)
-        return Evaluated(self, edited, selection, evaluation, tuple(blocks))
+        stretches = evaluation.extend(self.trace)
+        return Evaluated(self, edited_files, selection, evaluation, tuple(stretches))
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
         return MappingProxyType(
             {
-                name: files[file].constants[constant_name]
-                for name, (file, constant_name) in self._places.items()
+                name: files[file_index].constants[constant_name]
+                for name, (file_index, constant_name) in self._places.items()
             }
         )
 
@@ -416,18 +419,20 @@ class LoadedLog:
             raise UsageError(f"there is no constant {name!r} to change; {hint}")
         constant = self.constants[name]
         if isinstance(value, str) != (constant.duration_ns is not None):
-            kind = "a number" if constant.duration_ns is None else "a duration, given as a text such as '2s'"
+            expected_kind = (
+                "a number" if constant.duration_ns is None else "a duration, given as a text such as '2s'"
+            )
             raise UsageError(
-                f"{name} cannot be {value!r}: it is {kind} ({constant_text(constant)} as written)"
+                f"{name} cannot be {value!r}: it is {expected_kind} ({constant_text(constant)} as written)"
             )
         return self._places[name]
 
     def _check_size(self, evaluation: AnnotatedEvaluation) -> None:
-        nodes = sum(1 for tree in evaluation.trees for _ in iter_nodes(tree.formula))
-        numbers = 4 * nodes * len(self.inside)
-        if numbers > MOST_NUMBERS:
+        node_count = sum(1 for tree in evaluation.trees for _ in iter_nodes(tree.formula))
+        number_count = 4 * node_count * len(self.inside)
+        if number_count > MOST_NUMBERS:
             raise UsageError(
-                f"{nodes} nodes at {len(self.inside)} samples are {numbers} numbers, more than the "
+                f"{node_count} nodes at {len(self.inside)} samples are {number_count} numbers, more than the "
                 f"{MOST_NUMBERS} that are held at once; narrow the window with --from and --to, or keep "
                 "every Nth sample with --every"
             )
@@ -509,17 +514,17 @@ class Evaluated:
     @property
     def summary(self) -> str:
         """The verdicts of the results, the worst first, and the constants that differ from the text."""
-        results = [self.replayed.results[place] for place in worst_first(self.replayed.results)]
-        text = "; ".join(map(_result_text, results[:_MOST_NAMED])) or "the template matched no objects"
-        if len(results) > _MOST_NAMED:
-            text += f"; and {len(results) - _MOST_NAMED} more, none worse"
+        sorted_results = [self.replayed.results[index] for index in worst_first(self.replayed.results)]
+        text = "; ".join(map(_result_text, sorted_results[:_MOST_NAMED])) or "the template matched no objects"
+        if len(sorted_results) > _MOST_NAMED:
+            text += f"; and {len(sorted_results) - _MOST_NAMED} more, none worse"
         written_constants = self.loaded.constants
-        changed = [
+        changed_texts = [
             f"{name} = {constant_text(constant)}"
             for name, constant in self.edited.constants.items()
             if constant != written_constants[name]
         ]
-        return text + (f" ({listing(changed, _MOST_NAMED)})" if changed else "")
+        return text + (f" ({listing(changed_texts, _MOST_NAMED)})" if changed_texts else "")
 
     @cached_property
     def layout(self) -> Attachment:
@@ -527,10 +532,10 @@ class Evaluated:
         topics = {channel.topic for channel in self.loaded.own.channels}
         extent = SceneBounds.of(self.loaded.inside, map_area(self.loaded.plan))
         contents = self.evaluation.contents(extent, topics)
-        order = worst_first(self.replayed.results)
-        zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
+        result_order = worst_first(self.replayed.results)
+        text_zero = TextZero(self.loaded.first_ns, int(self.loaded.inside.times_ns[0]), "this playback")
         contents = contents._replace(
-            order=order, zero=zero, planned=self.loaded.plan.get("specification", "")
+            order=result_order, zero=text_zero, planned=self.loaded.plan.get("specification", "")
         )
         return layout_attachment(contents, live=True)
 
@@ -558,10 +563,13 @@ def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
     """Return the file number and the name of each constant. Names in two files get their file's stem."""
-    names = [name for file in files for name in file.constants]
+    all_names = [name for file in files for name in file.constants]
     return {
-        f"{PurePath(file.filename).stem}.{name}" if names.count(name) > 1 else name: (index, name)
-        for index, file in enumerate(files)
+        f"{PurePath(file.filename).stem}.{name}" if all_names.count(name) > 1 else name: (
+            file_index,
+            name,
+        )
+        for file_index, file in enumerate(files)
         for name in file.constants
     }
 
@@ -584,9 +592,9 @@ def _storable(edited: Specification, written: Specification, stored: Specificati
     if stored.source == written.source:
         return replace(edited, filename=stored.filename)
     with suppress(SpecificationError):
-        read_back = parse_specification(format_specification(edited), filename=edited.filename)
-        if read_back == edited:
-            return replace(read_back, filename=stored.filename)
+        canonical_file = parse_specification(format_specification(edited), filename=edited.filename)
+        if canonical_file == edited:
+            return replace(canonical_file, filename=stored.filename)
     return replace(edited, filename=stored.filename)
 
 
@@ -641,9 +649,13 @@ class Playback:
     def channels(self) -> tuple[Channel, ...]:
         """All channels that may have messages."""
         log_messages = self.evaluated.loaded.own
-        first = MessageCursor(log_messages, self.start_ns).take_before(self.start_ns + 1)
-        derived = Messages(channels=dict(enumerate(self.evaluated.evaluation.channels)))
-        return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *log_messages.channels)))
+        first_messages = MessageCursor(log_messages, self.start_ns).take_before(self.start_ns + 1)
+        derived_messages = Messages(channels=dict(enumerate(self.evaluated.evaluation.channels)))
+        return tuple(
+            dict.fromkeys(
+                (*join([derived_messages, first_messages]).channels.values(), *log_messages.channels)
+            )
+        )
 
     def seek(self, time_ns: int) -> Messages:
         """Go to a time, and return the messages that a viewer shows at it.
@@ -656,7 +668,7 @@ class Playback:
         """
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        sample = max(self._next - 1, 0)
+        sample_index = max(self._next - 1, 0)
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
             self._regions = regions
@@ -664,12 +676,14 @@ class Playback:
         scene = replace(self._annotator.scene, written_ns=None, last={}, extent=self._start.extent)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
-        before = merge(self._annotator.pass_over(*self.evaluated.part(0, sample), _MOST_CHANGES))
-        self.past = before.of_topics((STANDING,))
-        events = _last(before.of_topics((EVENTS, EVENT_LOG, RECENT_EVENTS)))
-        derived = self._annotator.messages(*self.evaluated.part(sample, self._next))
-        shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[sample]))])
-        return join([shown_there, _last(self._end())])
+        earlier_messages = merge(
+            self._annotator.pass_over(*self.evaluated.part(0, sample_index), _MOST_CHANGES)
+        )
+        self.past = earlier_messages.of_topics((STANDING,))
+        events = _last(earlier_messages.of_topics((EVENTS, EVENT_LOG, RECENT_EVENTS)))
+        derived_messages = self._annotator.messages(*self.evaluated.part(sample_index, self._next))
+        shown_messages = merge([events, *derived_messages, self._seek_own(int(self._times_ns[sample_index]))])
+        return join([shown_messages, _last(self._end())])
 
     def advance_to(self, time_ns: int) -> Messages:
         """Return the remaining messages up to a time, inclusive.
@@ -678,16 +692,16 @@ class Playback:
             LogError: the log can no longer be read.
         """
         self.time_ns = min(max(time_ns, self.time_ns), self.end_ns)
-        begin = self._next
+        first_sample = self._next
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        derived = self._annotator.messages(*self.evaluated.part(begin, self._next))
-        coming = merge([*derived, self._own.take_before(self.time_ns + 1)])
-        return join([coming, self._end()])
+        derived_messages = self._annotator.messages(*self.evaluated.part(first_sample, self._next))
+        next_messages = merge([*derived_messages, self._own.take_before(self.time_ns + 1)])
+        return join([next_messages, self._end()])
 
     def reach_ns(self, samples: int) -> int:
         """Return the time of the sample a number of samples after the last one taken, or the end."""
-        index = self._next + samples - 1
-        return int(self._times_ns[index]) if index < len(self._times_ns) else self.end_ns
+        sample_index = self._next + samples - 1
+        return int(self._times_ns[sample_index]) if sample_index < len(self._times_ns) else self.end_ns
 
     def _end(self) -> Messages:
         """Return the messages at the end of the log, once it is reached."""
@@ -706,8 +720,8 @@ class Playback:
 
 
 def _last(events: Messages) -> Messages:
-    places = [
-        rows[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :]
-        for channel, rows in events.by_channel()
+    event_rows = [
+        channel_rows[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :]
+        for channel, channel_rows in events.by_channel()
     ]
-    return select(events, np.sort(np.concatenate([np.empty(0, np.int64), *places])))
+    return select(events, np.sort(np.concatenate([np.empty(0, np.int64), *event_rows])))

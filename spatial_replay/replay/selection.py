@@ -58,8 +58,8 @@ def default_keep(source: Source) -> tuple[str, ...]:
     rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. Therefore the bag is
     unchanged, and the annotated log is opened next to it.
     """
-    messages = _external(source)
-    return () if messages is not None and messages.profile == "ros2" else KEEP_ALL
+    reader = _external(source)
+    return () if reader is not None and reader.profile == "ros2" else KEEP_ALL
 
 
 def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
@@ -97,8 +97,8 @@ def _topics(source: Source) -> list[str]:
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             return sorted({channel.topic for channel in walk.channels.values()})
-    messages = _external(source)
-    return [] if messages is None else [topic.name for topic in messages.topics()]
+    reader = _external(source)
+    return [] if reader is None else [topic.name for topic in reader.topics()]
 
 
 def _external(source: Source) -> MessageReader | None:
@@ -184,10 +184,10 @@ def first_sample_ns(source: Source) -> int:
 def named_zero_ns(source: Source) -> int | None:
     """Return the zero in a log's metadata: the first sample of the log that it was cut from."""
     records = dict(source.metadata())
-    for name in (METADATA, CLIP_METADATA):
-        text = records.get(name, {}).get(ZERO, "")
-        if _DECIMAL.fullmatch(text) and int(text) <= LATEST_NS:
-            return int(text)
+    for record_name in (METADATA, CLIP_METADATA):
+        zero_text = records.get(record_name, {}).get(ZERO, "")
+        if _DECIMAL.fullmatch(zero_text) and int(zero_text) <= LATEST_NS:
+            return int(zero_text)
     return None
 
 
@@ -197,8 +197,8 @@ def zero_ns(source: Source) -> int:
     Raises:
         LogError: the log has no sample.
     """
-    named_ns = named_zero_ns(source)
-    return first_sample_ns(source) if named_ns is None else named_ns
+    recorded_zero_ns = named_zero_ns(source)
+    return first_sample_ns(source) if recorded_zero_ns is None else recorded_zero_ns
 
 
 def first_message_ns(source: Source) -> int | None:
@@ -216,8 +216,8 @@ def log_zero_ns(source: Source, window: Window, ends: RunEnds) -> int:
     """Return the zero of a log whose samples were read, see `zero_ns`."""
     if window.start_ns or ends.begin_ns is None:
         return known_zero_ns(source)
-    named_ns = named_zero_ns(source)
-    return ends.log_begin_ns if named_ns is None else named_ns
+    recorded_zero_ns = named_zero_ns(source)
+    return ends.log_begin_ns if recorded_zero_ns is None else recorded_zero_ns
 
 
 def last_sample_ns(source: Source) -> int:
@@ -226,10 +226,12 @@ def last_sample_ns(source: Source) -> int:
     Raises:
         LogError: the log has no sample.
     """
-    times_ns = [int(block.trace.times_ns[-1]) for block in read_blocks(source.keeping()) if len(block.trace)]
-    if not times_ns:
+    last_times_ns = [
+        int(block.trace.times_ns[-1]) for block in read_blocks(source.keeping()) if len(block.trace)
+    ]
+    if not last_times_ns:
         raise LogError(f"{source.name} has no sample")
-    return times_ns[-1]
+    return last_times_ns[-1]
 
 
 def absolute_ns(point: TimePoint, source: Source) -> int:
@@ -252,9 +254,9 @@ def window_from_points(
         UsageError: the window is empty.
         LogError: a time counts from a sample, and the log has none.
     """
-    whole = Window()
-    start_ns = whole.start_ns if start is None else absolute_ns(start, source)
-    end_ns = whole.end_ns if end is None else absolute_ns(end, source)
+    whole_log = Window()
+    start_ns = whole_log.start_ns if start is None else absolute_ns(start, source)
+    end_ns = whole_log.end_ns if end is None else absolute_ns(end, source)
     return Window(start_ns, end_ns, every)
 
 
@@ -376,13 +378,13 @@ class Selection:
             ends: a new result of `run_ends`, which callers can read afterwards.
         """
         ends = ends or self.run_ends()
-        waiting: deque[Block] = deque()
+        pending_blocks: deque[Block] = deque()
         for block, trace in self._read_samples(messages=messages):
-            waiting.append(block)
-            for counting in ends.add(trace):
-                yield _trim(waiting.popleft(), ends), counting
-        for counting in ends.finish():
-            yield _trim(waiting.popleft(), ends), counting
+            pending_blocks.append(block)
+            for evaluated_trace in ends.add(trace):
+                yield _trim(pending_blocks.popleft(), ends), evaluated_trace
+        for evaluated_trace in ends.finish():
+            yield _trim(pending_blocks.popleft(), ends), evaluated_trace
         if ends.remarks:
             remarks = tuple(Sentence(f"{self.source.name}: ", remark) for remark in ends.remarks)
             yield Block(Trace.empty(), remarks=remarks), Trace.empty()
@@ -391,15 +393,17 @@ class Selection:
         """Read each block, with every Nth of its samples."""
         window = self.window
         # every Nth sample is counted from the log's first sample, independent of the window
-        from_start = self.looks_back or window.every > 1
-        read = 0
+        reads_from_start = self.looks_back or window.every > 1
+        read_count = 0
         source = self.source if messages else self.source.keeping()
-        for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
+        for block in read_blocks(source, None if reads_from_start else window.start_ns, window.end_ns):
             trace = block.trace
             if window.every > 1:
-                samples = np.arange(-read % window.every, len(trace), window.every, dtype=np.int64)
-                read += len(trace)
-                trace = trace.take(samples)
+                sample_indices = np.arange(
+                    -read_count % window.every, len(trace), window.every, dtype=np.int64
+                )
+                read_count += len(trace)
+                trace = trace.take(sample_indices)
             yield block, trace
 
     def iter_traces(self, ends: RunEnds | None = None) -> Iterator[Trace]:
@@ -433,12 +437,12 @@ class Selection:
             LogError, UsageError: the window has no sample.
             SpecificationError: a name is missing, and names are strict.
         """
-        ends = self.run_ends()
-        trace = self.trace(advance, ends)
+        run_ends = self.run_ends()
+        trace = self.trace(advance, run_ends)
         if not len(self.inside(trace)):
             raise self.nothing_to_evaluate(trace.faults)
-        missing = self.missing_names(LogNames.of(trace))
-        return CheckedTrace(trace, missing, log_zero_ns(self.source, self.window, ends))
+        missing_names = self.missing_names(LogNames.of(trace))
+        return CheckedTrace(trace, missing_names, log_zero_ns(self.source, self.window, run_ends))
 
     def inside(self, trace: Trace) -> Trace:
         """Return the samples in the window."""
@@ -451,12 +455,12 @@ class Selection:
             first: the number of the block's first sample in the window.
         """
         messages = block.messages
-        inside = messages.within(self.window.start_ns, self.window.end_ns)
+        window_messages = messages.within(self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
             # the source orders messages of one time by its own channel numbers, and `merge` by content
-            return merge([inside])
+            return merge([window_messages])
         trace = self.inside(block.trace)
-        return merge([inside, sample_messages(trace, first)])
+        return merge([window_messages, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
         """Return the instances of a specification. For templates, the source is read to find objects.
@@ -479,16 +483,16 @@ class Selection:
         Raises:
             SpecificationError: a name is missing, and names are strict.
         """
-        missing = self._missing_names(*names.frozen())
-        if missing and not self.window.is_whole:
+        diagnostics = self._missing_names(*names.frozen())
+        if diagnostics and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
-            whole = LogNames()
+            log_names = LogNames()
             for block in read_blocks(self.source.keeping()):
-                whole.add(block.trace)
-            missing = self._missing_names(*whole.frozen())
-        if missing and self.options.strict_names:
-            raise SpecificationError(missing)
-        return tuple(replace(diagnostic, severity="warning") for diagnostic in missing)
+                log_names.add(block.trace)
+            diagnostics = self._missing_names(*log_names.frozen())
+        if diagnostics and self.options.strict_names:
+            raise SpecificationError(diagnostics)
+        return tuple(replace(diagnostic, severity="warning") for diagnostic in diagnostics)
 
     def nothing_to_evaluate(self, faults: Sequence[str]) -> LogError | UsageError:
         """Return the error for a window without any sample.
@@ -496,30 +500,30 @@ class Selection:
         Args:
             faults: faults of the log so far.
         """
-        name = self.source.name
-        spans = [
+        log_name = self.source.name
+        block_spans_ns = [
             (int(block.trace.times_ns[0]), int(block.trace.times_ns[-1]))
             for block in read_blocks(self.source.keeping())
             if len(block.trace)
         ]
-        if not spans:
-            return LogError("; ".join([f"{name} has no sample", *faults[:1]]))
-        first_ns, last_ns = spans[0][0], spans[-1][1]
-        named_ns = named_zero_ns(self.source)
-        from_ns = first_ns if named_ns is None else named_ns
-        pauses = " and pause there" if first_ns < self.window.start_ns < last_ns else ""
+        if not block_spans_ns:
+            return LogError("; ".join([f"{log_name} has no sample", *faults[:1]]))
+        log_start_ns, log_end_ns = block_spans_ns[0][0], block_spans_ns[-1][1]
+        recorded_zero_ns = named_zero_ns(self.source)
+        origin_ns = log_start_ns if recorded_zero_ns is None else recorded_zero_ns
+        pause_text = " and pause there" if log_start_ns < self.window.start_ns < log_end_ns else ""
         return UsageError(
-            f"{name} has no sample in the requested window; its samples are from "
-            f"{time_text(first_ns, from_ns)} to {time_text(last_ns, from_ns)} "
-            f"({first_ns} to {last_ns} ns on its clock){pauses}"
+            f"{log_name} has no sample in the requested window; its samples are from "
+            f"{time_text(log_start_ns, origin_ns)} to {time_text(log_end_ns, origin_ns)} "
+            f"({log_start_ns} to {log_end_ns} ns on its clock){pause_text}"
         )
 
     def _find_missing(
         self, objects: frozenset[str], signals: frozenset[str], classes: frozenset[str]
     ) -> list[Diagnostic]:
         names = LogNames({*objects}, {*signals}, {*classes})
-        remarks = [remark for file in self.files for remark in names.check(file, self.options.each)]
-        return [remark for remark in remarks if remark.severity == "error"]
+        remarks = [diagnostic for file in self.files for diagnostic in names.check(file, self.options.each)]
+        return [diagnostic for diagnostic in remarks if diagnostic.severity == "error"]
 
 
 def _trim(block: Block, ends: RunEnds) -> Block:
@@ -531,16 +535,16 @@ def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
     """Check that no time window can lie between two samples that fill a pause."""
     if not max_gap_ns:
         return
-    step_ns = max_gap_ns // SAMPLES_A_GAP
+    sample_step_ns = max_gap_ns // SAMPLES_A_GAP
     nodes = (node for file in files for spec in file.results for node in iter_formulas(spec.formula))
     for bound in (node.bound for node in nodes if isinstance(node, Temporal) and node.bound is not None):
-        is_apart = bound.unit == "ns" and bound.lower > 0 and bound.upper is not None
-        if is_apart and (bound.upper or 0) - bound.lower < step_ns:
-            what = (
+        excludes_present = bound.unit == "ns" and bound.lower > 0 and bound.upper is not None
+        if excludes_present and (bound.upper or 0) - bound.lower < sample_step_ns:
+            problem = (
                 f"the window {format_bound(bound)} is too narrow for max_gap: it may lie between two samples"
             )
-            remedy = f"make it {format_duration(step_ns)} long, or max_gap shorter"
-            raise UsageError(f"{what} of a pause, {format_duration(step_ns)} apart; {remedy}")
+            remedy = f"make it {format_duration(sample_step_ns)} long, or max_gap shorter"
+            raise UsageError(f"{problem} of a pause, {format_duration(sample_step_ns)} apart; {remedy}")
 
 
 @dataclass(frozen=True)
@@ -554,13 +558,13 @@ class _ClippedSource(SourceOf):
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
-        first = max(self.start_ns, start_ns or 0)
-        last = min(self.end_ns, FOREVER if end_ns is None else end_ns)
+        read_start_ns = max(self.start_ns, start_ns or 0)
+        read_end_ns = min(self.end_ns, FOREVER if end_ns is None else end_ns)
         if len(self.latched) and (start_ns or 0) <= self.start_ns:
             yield Block(Trace.from_samples(()), self.latched)
-        for block in self.source.iter_blocks(first, last):
+        for block in self.source.iter_blocks(read_start_ns, read_end_ns):
             # an external log is read from before the window, to find the values valid in it
-            yield replace(block, messages=block.messages.within(first, last))
+            yield replace(block, messages=block.messages.within(read_start_ns, read_end_ns))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
@@ -580,8 +584,8 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
     """
     try:
         start_ns, end_ns = int(about["start_ns"]), int(about["end_ns"])
-        keep = json.loads(about.get("keep", json.dumps(KEEP_ALL)))
-        kept_source = source_keeping(source, tuple(map(str, keep)))
+        kept_topics = json.loads(about.get("keep", json.dumps(KEEP_ALL)))
+        kept_source = source_keeping(source, tuple(map(str, kept_topics)))
     except (LookupError, TypeError, ValueError) as error:
         raise LogError(f"the metadata {CLIP_METADATA} of the clip cannot be read: {error}") from error
     # the record has the time of the last sample, and a window ends before its end
@@ -590,22 +594,22 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
 
 def _last_before(source: Source, start_ns: int) -> Messages:
     """Return the last message of each topic before a time, or of each frame for transforms; no samples."""
-    latest: dict[tuple[Channel, str], Messages] = {}
-    frames: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
+    latest_messages: dict[tuple[Channel, str], Messages] = {}
+    frame_readers: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
-        for channel, rows in messages.by_channel():
+        for channel, message_rows in messages.by_channel():
             if channel.topic == OBJECTS:
                 continue
-            if channel not in frames:
-                frames[channel] = _frame_names(channel)
-            kind = short_type(channel.schema.name) if channel.schema is not None else ""
-            for index in rows.tolist() if kind in TRANSFORM_TYPES else rows[-1:].tolist():
-                message = select(messages, np.array([index]))
-                for frame in frames[channel](message.payloads[0]):
-                    latest[channel, frame] = message
+            if channel not in frame_readers:
+                frame_readers[channel] = _frame_names(channel)
+            type_name = short_type(channel.schema.name) if channel.schema is not None else ""
+            for row in message_rows.tolist() if type_name in TRANSFORM_TYPES else message_rows[-1:].tolist():
+                message = select(messages, np.array([row]))
+                for frame in frame_readers[channel](message.payloads[0]):
+                    latest_messages[channel, frame] = message
     # one message may place several frames
-    distinct = {id(message): message for message in latest.values()}
-    return merge(list(distinct.values()))
+    distinct_messages = {id(message): message for message in latest_messages.values()}
+    return merge(list(distinct_messages.values()))
 
 
 def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
@@ -621,12 +625,12 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
 
 def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
     """Return a function from a message to its child frames; other messages give one empty name."""
-    kind = "" if channel.schema is None else channel.schema.name
+    schema_name = "" if channel.schema is None else channel.schema.name
     decode: Callable[[bytes], Any] | None = None
-    if short_type(kind) in TRANSFORM_TYPES:
+    if short_type(schema_name) in TRANSFORM_TYPES:
         with suppress(LogError):
-            name = full_type_name(kind) if channel.encoding in ("ros1", "cdr") else kind
-            topic = Topic(channel.topic, name, channel.encoding, schema=channel.schema)
+            type_name = full_type_name(schema_name) if channel.encoding in ("ros1", "cdr") else schema_name
+            topic = Topic(channel.topic, type_name, channel.encoding, schema=channel.schema)
             decode = decoder_of(topic)
 
     def names(payload: bytes) -> Sequence[str]:

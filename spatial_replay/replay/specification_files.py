@@ -75,9 +75,9 @@ class SpecificationFiles:
             files = load_specifications(self.paths, constants=self._constants)
             self._sources = [file.source for file in files]
             self._written = {
-                (index, name): value
-                for (index, name), value in self._written.items()
-                if files[index].constants.get(name) == value
+                (file_index, name): constant
+                for (file_index, name), constant in self._written.items()
+                if files[file_index].constants.get(name) == constant
             }
             return files
 
@@ -97,12 +97,12 @@ class SpecificationFiles:
         with importing("--watch needs watchfiles", extra="live"):
             from watchfiles import watch
         # a link and its target lie in different folders, and either may be saved
-        places = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
-        names = {path.name for path in places}
+        watched_paths = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
+        file_names = {path.name for path in watched_paths}
         # folders are watched, because many editors replace a file instead of writing into it
         for _ in watch(
-            *{path.parent for path in places},
-            watch_filter=lambda change, path: Path(path).name in names,
+            *{path.parent for path in watched_paths},
+            watch_filter=lambda change, path: Path(path).name in file_names,
             step=_STEP_MS,
             debounce=_IDLE_MS,
             rust_timeout=_IDLE_MS,
@@ -124,50 +124,58 @@ class SpecificationFiles:
             The changed values by name.
         """
         with self._turn:
-            files = load_specifications(self.paths, constants=self._constants)
-            plain = load_specifications(self.paths)
-            changed: dict[str, float | str] = {}
-            for index, (path, new_values, with_given, file_as_written) in enumerate(
-                zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
+            files_with_given = load_specifications(self.paths, constants=self._constants)
+            files_as_written = load_specifications(self.paths)
+            changed_values: dict[str, float | str] = {}
+            for file_index, (path, new_values, file_with_given, file_as_written) in enumerate(
+                zip(
+                    self.paths,
+                    values or [{}] * len(self.paths),
+                    files_with_given,
+                    files_as_written,
+                    strict=True,
+                )
             ):
                 given_values = {
                     name: value
-                    for name, value in plain_values(with_given).items()
-                    if with_given.constants[name] != file_as_written.constants[name]
+                    for name, value in plain_values(file_with_given).items()
+                    if file_with_given.constants[name] != file_as_written.constants[name]
                 }
                 if loaded:
-                    self._check_saves(index, new_values, loaded[index].constants, with_given.constants)
-                new = {**given_values, **new_values}
-                names = write_constants(path, new)
-                changed |= {name: new[name] for name in names}
-                after = load_specification(path) if names else file_as_written
-                self._written |= {(index, name): after.constants[name] for name in names}
+                    self._check_saves(
+                        file_index, new_values, loaded[file_index].constants, file_with_given.constants
+                    )
+                values_to_write = {**given_values, **new_values}
+                changed_names = write_constants(path, values_to_write)
+                changed_values |= {name: values_to_write[name] for name in changed_names}
+                saved_file = load_specification(path) if changed_names else file_as_written
+                self._written |= {(file_index, name): saved_file.constants[name] for name in changed_names}
             self._constants = {}
-            return changed
+            return changed_values
 
     def _check_saves(
         self,
-        index: int,
-        names: Iterable[str],
-        loaded: Mapping[str, Constant],
-        present: Mapping[str, Constant],
+        file_index: int,
+        new_names: Iterable[str],
+        loaded_constants: Mapping[str, Constant],
+        saved_constants: Mapping[str, Constant],
     ) -> None:
         """Refuse to overwrite a number that was saved by somebody else after the file was loaded."""
-        for name in names:
-            constant = present.get(name)
-            if constant not in (None, loaded[name], self._written.get((index, name))):
-                saved = str(constant_value(constant)).removesuffix(".0")
+        for name in new_names:
+            constant = saved_constants.get(name)
+            if constant not in (None, loaded_constants[name], self._written.get((file_index, name))):
+                saved_text = str(constant_value(constant)).removesuffix(".0")
                 raise UsageError(
-                    f"{name} was just saved as {saved}; write it again once the saved file is evaluated"
+                    f"{name} was just saved as {saved_text}; write it again once the saved file is evaluated"
                 )
 
     def _wait_for_save(self) -> list[Specification] | SpatialReplayError | None:
         """Return the saved files; None if their texts are unchanged, or if they keep changing."""
-        before, give_up = self._sources, time.monotonic() + _PATIENCE_S
-        while time.monotonic() < give_up:
-            state = self._state()
+        previous_sources, deadline_s = self._sources, time.monotonic() + _PATIENCE_S
+        while time.monotonic() < deadline_s:
+            states = self._state()
             time.sleep(_SETTLE_S)
-            if self._state() != state:
+            if self._state() != states:
                 continue
             try:
                 files = self.load()
@@ -177,9 +185,9 @@ class SpecificationFiles:
                     return error
                 continue
             if self._state() == self._read:
-                return files if self._sources != before else None
+                return files if self._sources != previous_sources else None
         # the last read may have been incomplete, so the next call reads the files again
-        self._read, self._sources = [], before
+        self._read, self._sources = [], previous_sources
         return None
 
     def _state(self) -> list[_State | None]:
@@ -216,26 +224,26 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
         text = content.removeprefix(_MARK).decode("utf-8")
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from error
-    before = parse_specification(text, filename=path.name)
-    after = parse_specification(text, filename=path.name, constants=values)
-    changed = {
-        name: value for name, value in values.items() if before.constants[name] != after.constants[name]
+    old_file = parse_specification(text, filename=path.name)
+    new_file = parse_specification(text, filename=path.name, constants=values)
+    changed_values = {
+        name: value for name, value in values.items() if old_file.constants[name] != new_file.constants[name]
     }
-    if not changed:
+    if not changed_values:
         return ()
-    computed = [name for name in changed if before.constants[name].is_computed]
-    if computed:
+    computed_names = [name for name in changed_values if old_file.constants[name].is_computed]
+    if computed_names:
         raise UsageError(
-            f"{path.name} computes {', '.join(computed)} from other constants; "
+            f"{path.name} computes {', '.join(computed_names)} from other constants; "
             "change those, or write a number there"
         )
-    changed_file = parse_specification(text, filename=path.name, constants=changed)
-    mark = _MARK if content.startswith(_MARK) else b""
+    changed_file = parse_specification(text, filename=path.name, constants=changed_values)
+    byte_order_mark = _MARK if content.startswith(_MARK) else b""
     with replacing(path) as stream:
-        stream.write(mark + changed_file.source.encode("utf-8"))
+        stream.write(byte_order_mark + changed_file.source.encode("utf-8"))
     # `replacing` makes a new file, which gets the mode of the old one
     path.chmod(mode)
-    return tuple(changed)
+    return tuple(changed_values)
 
 
 def plain_values(file: Specification) -> dict[str, float | str]:

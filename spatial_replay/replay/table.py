@@ -82,16 +82,16 @@ def export_table(
     """
     check_table_name(output)
     writer = _WRITERS[output.suffix.lower()]
-    titles, automata = _titles(source)
+    titles, automaton_titles = _titles(source)
     faults: list[str] = []
     rows, first_ns = 0, named_zero_ns(source)
-    columns = [TIME, SECONDS, *titles.values()], list(automata.values())
-    with replacing(output, inputs) as stream, writer(stream, *columns) as write:
-        for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
-            write(table)
-            first_ns = int(table.times_ns[0]) if first_ns is None else first_ns
-            rows += len(table.times_ns)
-            advance(len(table.times_ns))
+    column_titles = [TIME, SECONDS, *titles.values()], list(automaton_titles.values())
+    with replacing(output, inputs) as stream, writer(stream, *column_titles) as write_rows:
+        for table_rows in _iter_tables(source, titles, automaton_titles, QUANTITIES.index(quantity), faults):
+            write_rows(table_rows)
+            first_ns = int(table_rows.times_ns[0]) if first_ns is None else first_ns
+            rows += len(table_rows.times_ns)
+            advance(len(table_rows.times_ns))
     return rows, len(titles), counted_from(faults, first_ns or 0)
 
 
@@ -115,9 +115,9 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
             f"{source.name} is not an annotated log; give --spec SPEC, or write one with spatial-replay"
             " replay … -o FILE.mcap"
         )
-    for payloads, faults in source.iter_payloads(ROBUSTNESS):
+    for payloads, block_faults in source.iter_payloads(ROBUSTNESS):
         try:
-            yield decode_robustness(payloads), faults
+            yield decode_robustness(payloads), block_faults
         except ValueError as error:
             raise LogError(f"{source.name}: a message of {ROBUSTNESS} cannot be read: {error}") from error
 
@@ -128,37 +128,37 @@ def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]
     The title of a node lists the named specs on the path to it: `task/deliver`. A node without a name has the
     title of the nearest named spec, followed by its own text.
     """
-    nodes: dict[_Node, str | None] = {}
+    node_names: dict[_Node, str | None] = {}
     faults: list[str] = []
     # the whole log is read first, because a node may appear in a later block
-    for series, lost in _iter_series(source):
-        faults += lost
-        for part in series:
-            result = (part.specification, part.object or None)
-            for identifier, name in zip(part.ids, part.names, strict=True):
-                nodes.setdefault((result, int(identifier)), name or None)
-    if not nodes:
+    for series, block_faults in _iter_series(source):
+        faults += block_faults
+        for result_series in series:
+            result = (result_series.specification, result_series.object or None)
+            for node_id, name in zip(result_series.ids, result_series.names, strict=True):
+                node_names.setdefault((result, int(node_id)), name or None)
+    if not node_names:
         if faults:
             raise LogError(f"{source.name} holds no {ROBUSTNESS} that can be read: {faults[0]}")
         raise UsageError(
             f"{source.name} holds no {ROBUSTNESS}; write it with spatial-replay replay … -o FILE.mcap"
         )
     used_titles = {TIME, SECONDS}
-    paths = {result: _paths(result, tree) for result, tree in _trees(source).items()}
+    path_titles = {result: _paths(result, tree) for result, tree in _trees(source).items()}
     titles: dict[_Node, str] = {}
-    for (result, identifier), name in nodes.items():
-        numbered = f"{_result_title(result)}#{identifier}"
-        name_title = f"{_result_title(result)}/{name}" if name and identifier else _result_title(result)
-        fallback = name_title if name or not identifier else numbered
-        title = paths.get(result, {}).get(identifier, fallback)
-        titles[result, identifier] = _claim_title(title, numbered, used_titles)
-    automata = {
+    for (result, node_id), name in node_names.items():
+        numbered_title = f"{_result_title(result)}#{node_id}"
+        name_title = f"{_result_title(result)}/{name}" if name and node_id else _result_title(result)
+        fallback = name_title if name or not node_id else numbered_title
+        title = path_titles.get(result, {}).get(node_id, fallback)
+        titles[result, node_id] = _claim_title(title, numbered_title, used_titles)
+    automaton_titles = {
         result: _claim_title(
             f"{_result_title(result)}/automaton", f"{_result_title(result)}#automaton", used_titles
         )
         for result in dict.fromkeys(result for _, result, _ in _iter_states(source))
     }
-    return titles, automata
+    return titles, automaton_titles
 
 
 def _result_title(result: _Result) -> str:
@@ -167,10 +167,11 @@ def _result_title(result: _Result) -> str:
 
 def _claim_title(title: str, fallback: str, used_titles: set[str]) -> str:
     """Return a title, or an alternative if a column has it already, and mark it as used."""
-    choices = chain(
-        [title, f"{title} #{fallback.rpartition('#')[2]}", fallback], (f"{fallback} ({n})" for n in count(2))
+    candidates = chain(
+        [title, f"{title} #{fallback.rpartition('#')[2]}", fallback],
+        (f"{fallback} ({number})" for number in count(2)),
     )
-    free_title = next(choice for choice in choices if choice not in used_titles)
+    free_title = next(candidate for candidate in candidates if candidate not in used_titles)
     used_titles.add(free_title)
     return free_title
 
@@ -180,10 +181,10 @@ def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
     trees: dict[_Result, SpecificationResult] = {}
     for payload in _payloads(source, SPECIFICATION):
         try:
-            message = Specification.FromString(payload)
+            specification = Specification.FromString(payload)
         except DecodeError:
             continue
-        trees |= {(tree.name, tree.object or None): tree for tree in message.results}
+        trees |= {(tree.name, tree.object or None): tree for tree in specification.results}
     return trees
 
 
@@ -217,8 +218,8 @@ def _iter_states(source: Source) -> Iterator[tuple[int, _Result, str]]:
             state = AutomatonState.FromString(payload)
         except DecodeError:
             continue
-        states = "|".join(map(str, state.states))
-        yield state.time_ns, (state.specification, state.object or None), states
+        state_text = "|".join(map(str, state.states))
+        yield state.time_ns, (state.specification, state.object or None), state_text
 
 
 def _iter_tables(
@@ -228,28 +229,28 @@ def _iter_tables(
     quantity: int,
     faults: list[str],
 ) -> Iterator[TableRows]:
-    column = {node: index for index, node in enumerate(titles)}
-    states: dict[_Result, dict[int, str]] = {result: {} for result in automata}
-    for time_ns, result, state in _iter_states(source) if automata else ():
-        states[result][time_ns] = state
+    column_by_node = {node: index for index, node in enumerate(titles)}
+    states_by_result: dict[_Result, dict[int, str]] = {result: {} for result in automata}
+    for time_ns, result, state_text in _iter_states(source) if automata else ():
+        states_by_result[result][time_ns] = state_text
     first_ns = named_zero_ns(source)
-    for series, lost in _iter_series(source):
-        faults += lost
+    for series, block_faults in _iter_series(source):
+        faults += block_faults
         if not series:
             continue
-        times_ns = np.unique(np.concatenate([part.times_ns for part in series]))
+        times_ns = np.unique(np.concatenate([result_series.times_ns for result_series in series]))
         first_ns = int(times_ns[0]) if first_ns is None else first_ns
-        numbers = np.full((len(times_ns), len(column)), np.nan)
-        for part in series:
-            result = (part.specification, part.object or None)
-            rows = np.searchsorted(times_ns, part.times_ns)
-            columns = [column[result, int(identifier)] for identifier in part.ids]
-            numbers[rows[:, None], columns] = part.series[:, quantity].T
-        cells = [
+        numbers = np.full((len(times_ns), len(column_by_node)), np.nan)
+        for result_series in series:
+            result = (result_series.specification, result_series.object or None)
+            time_rows = np.searchsorted(times_ns, result_series.times_ns)
+            node_columns = [column_by_node[result, int(node_id)] for node_id in result_series.ids]
+            numbers[time_rows[:, None], node_columns] = result_series.series[:, quantity].T
+        state_cells = [
             [state_by_time.get(time_ns, "") for time_ns in times_ns.tolist()]
-            for state_by_time in states.values()
+            for state_by_time in states_by_result.values()
         ]
-        yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, cells)
+        yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, state_cells)
 
 
 def _text_cell(text: str) -> str:
@@ -261,21 +262,21 @@ def _text_cell(text: str) -> str:
 def _csv_writer(
     stream: Any, titles: Sequence[str], automata: Sequence[str]
 ) -> Iterator[Callable[[TableRows], None]]:
-    text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
-    rows = csv.writer(text)
-    rows.writerow(map(_text_cell, [*titles, *automata]))
+    text_stream = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+    row_writer = csv.writer(text_stream)
+    row_writer.writerow(map(_text_cell, [*titles, *automata]))
 
     def write(table: TableRows) -> None:
         columns = [table.times_ns.tolist(), table.seconds.tolist(), table.numbers.tolist()]
-        for index, (time_ns, seconds, numbers) in enumerate(zip(*columns, strict=True)):
-            cells = ("" if math.isnan(number) else number for number in numbers)
-            rows.writerow([time_ns, seconds, *cells, *(states[index] for states in table.states)])
+        for row, (time_ns, seconds, numbers) in enumerate(zip(*columns, strict=True)):
+            number_cells = ("" if math.isnan(number) else number for number in numbers)
+            row_writer.writerow([time_ns, seconds, *number_cells, *(states[row] for states in table.states)])
 
     try:
         yield write
     finally:
         # otherwise the wrapper would close the stream when it is garbage-collected
-        text.detach()
+        text_stream.detach()
 
 
 @contextmanager
@@ -285,11 +286,11 @@ def _parquet_writer(
     with importing("Parquet, unlike .csv, needs pyarrow", extra="parquet"):
         import pyarrow as pa
         from pyarrow import parquet
-    time, *numbers = titles
+    time_title, *number_titles = titles
     schema = pa.schema(
         [
-            (time, pa.int64()),
-            *((title, pa.float64()) for title in numbers),
+            (time_title, pa.int64()),
+            *((title, pa.float64()) for title in number_titles),
             *((title, pa.string()) for title in automata),
         ]
     )
@@ -299,7 +300,7 @@ def _parquet_writer(
         columns = [
             pa.array(table.times_ns),
             pa.array(table.seconds),
-            *(pa.array(column, from_pandas=True) for column in table.numbers.T),
+            *(pa.array(number_column, from_pandas=True) for number_column in table.numbers.T),
             *(pa.array([state or None for state in states], pa.string()) for states in table.states),
         ]
         writer.write_table(pa.table(columns, schema=schema))

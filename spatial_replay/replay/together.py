@@ -83,18 +83,18 @@ class JointReplay:
             LogError, UsageError: the log cannot be read, or has no sample.
         """
         selection, account = self._selection.over(source), LogAccount(self._plan)
-        ends = selection.run_ends()
+        run_ends = selection.run_ends()
         traces: list[Trace] = []
-        samples = nbytes = 0
-        for block, trace in selection.read_blocks(messages=False, ends=ends):
-            samples, nbytes = samples + len(trace), nbytes + trace.nbytes
-            if samples > _MOST_SAMPLES or nbytes > _MOST_BYTES:
+        sample_count = nbytes = 0
+        for block, trace in selection.read_blocks(messages=False, ends=run_ends):
+            sample_count, nbytes = sample_count + len(trace), nbytes + trace.nbytes
+            if sample_count > _MOST_SAMPLES or nbytes > _MOST_BYTES:
                 return None
             account.add(block, trace)
             traces.append(trace)
         account.check_samples(selection)
-        zero_ns = log_zero_ns(source, selection.window, ends)
-        return ShortLog(selection, traces, account, zero_ns, samples, nbytes)
+        zero_ns = log_zero_ns(source, selection.window, run_ends)
+        return ShortLog(selection, traces, account, zero_ns, sample_count, nbytes)
 
     def is_enough(self, logs: Collection[ShortLog]) -> bool:
         """Return whether more logs would take too much memory."""
@@ -110,12 +110,12 @@ class JointReplay:
             SpecificationError: a name is missing in a log, and names are strict.
         """
         traces = [log.traces[0] if len(log.traces) == 1 else Trace.concatenate(log.traces) for log in logs]
-        joined, semantics = one_after_another(traces), self._selection.options.semantics
-        runs = [
-            run_together(instances, TraceScene(joined, file.regions), traces, semantics)
+        joined_trace, semantics = one_after_another(traces), self._selection.options.semantics
+        runs_by_file = [
+            run_together(instances, TraceScene(joined_trace, file.regions), traces, semantics)
             for instances, file in zip(self._plan.instances, self._plan.files, strict=True)
         ]
-        for log, *runs_of_log in zip(logs, *runs, strict=True):
+        for log, *runs_of_log in zip(logs, *runs_by_file, strict=True):
             streams = [stream for streams, _ in runs_of_log for stream in streams]
             blocks = [block for _, blocks in runs_of_log for block in blocks]
             yield self._log_result(log, streams, blocks)

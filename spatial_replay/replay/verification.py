@@ -74,12 +74,12 @@ def sign_certificate(certificate: Mapping[str, str], key: Path) -> bytes:
         UsageError: ssh-keygen is missing, or cannot sign with it.
     """
     _require(key)
-    signed = _ssh_keygen(["sign", "-f", str(key.resolve()), "-n", NAMESPACE], statement(certificate))
-    if signed.returncode != 0 or not signed.stdout:
+    signing = _ssh_keygen(["sign", "-f", str(key.resolve()), "-n", NAMESPACE], statement(certificate))
+    if signing.returncode != 0 or not signing.stdout:
         raise UsageError(
-            f"{key} cannot sign: {_reason(signed)}; give an OpenSSH key, such as ~/.ssh/id_ed25519"
+            f"{key} cannot sign: {_reason(signing)}; give an OpenSSH key, such as ~/.ssh/id_ed25519"
         )
-    return signed.stdout
+    return signing.stdout
 
 
 def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) -> str | None:
@@ -97,16 +97,16 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
         _require(file)
     if signature.stat().st_size > LARGEST_SIGNATURE:
         return None
-    allowed, names = _allowed_signers(signers)
+    allowed_text, signer_names = _allowed_signers(signers)
     with TemporaryDirectory(prefix="spatial-replay-") as folder:
-        (signers_file := Path(folder) / "allowed_signers").write_text(allowed)
-        files = ["-f", str(signers_file), "-s", str(signature.resolve())]
-        principals = _ssh_keygen(["find-principals", *files], b"")
+        (signers_file := Path(folder) / "allowed_signers").write_text(allowed_text)
+        file_arguments = ["-f", str(signers_file), "-s", str(signature.resolve())]
+        search = _ssh_keygen(["find-principals", *file_arguments], b"")
         # ssh-keygen verifies a signature for one principal at a time
-        for principal in principals.stdout.decode("utf-8", "replace").splitlines():
-            arguments = ["verify", *files, "-n", NAMESPACE, "-I", principal]
+        for principal in search.stdout.decode("utf-8", "replace").splitlines():
+            arguments = ["verify", *file_arguments, "-n", NAMESPACE, "-I", principal]
             if _ssh_keygen(arguments, statement(certificate)).returncode == 0:
-                return names.get(principal, principal)
+                return signer_names.get(principal, principal)
     return None
 
 
@@ -116,17 +116,19 @@ def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
         lines = [line.strip() for line in signers.read_text().splitlines()]
     except UnicodeDecodeError:
         raise UsageError(f"{signers} is not text; give public keys or an allowed_signers file") from None
-    allowed_lines, names = [], {}
-    for number, line in enumerate((line for line in lines if line and not line.startswith("#")), 1):
-        if bare := _PUBLIC_KEY.match(line):
+    allowed_lines, name_by_principal = [], {}
+    for key_number, line in enumerate((line for line in lines if line and not line.startswith("#")), 1):
+        if bare_key := _PUBLIC_KEY.match(line):
             # a line of allowed_signers begins with a principal (man ssh-keygen), which bare keys lack
-            names[f"key{number}"] = bare["comment"] or f"key {number} of {signers.name}"
-            allowed_lines.append(f"key{number} {line}")
+            name_by_principal[f"key{key_number}"] = (
+                bare_key["comment"] or f"key {key_number} of {signers.name}"
+            )
+            allowed_lines.append(f"key{key_number} {line}")
         else:
             allowed_lines.append(line)
     if not allowed_lines:
         raise UsageError(f"{signers} has no public key; give an id_ed25519.pub or an allowed_signers file")
-    return "\n".join([*allowed_lines, ""]), names
+    return "\n".join([*allowed_lines, ""]), name_by_principal
 
 
 def _require(path: Path) -> None:
@@ -153,9 +155,9 @@ def _ssh_keygen(arguments: Sequence[str], content: bytes) -> subprocess.Complete
         raise UsageError(f"ssh-keygen has not answered in {_LONGEST_S:.0f} s; is the key there?") from None
 
 
-def _reason(ended: subprocess.CompletedProcess[bytes]) -> str:
-    lines = ended.stderr.decode("utf-8", "replace").strip().splitlines()
-    return printable(lines[-1]) if lines else f"ssh-keygen ended with {ended.returncode}"
+def _reason(process: subprocess.CompletedProcess[bytes]) -> str:
+    lines = process.stderr.decode("utf-8", "replace").strip().splitlines()
+    return printable(lines[-1]) if lines else f"ssh-keygen ended with {process.returncode}"
 
 
 _QUANTITIES = ("value", "now", "lower", "upper")
@@ -181,23 +183,23 @@ class FirstDifferences:
         for topic in (topic_of_log.name for topic_of_log in self._reader.topics()):
             is_compared = topic in self._recorded or topic not in DERIVED
             if topic not in self._found and is_compared:
-                extra = next(self._messages(topic), None)
-                if extra is not None:
-                    when = Instant(extra.log_time_ns, 0)
-                    self._found[topic] = Sentence("the one at ", when, " is only in the log")
+                extra_message = next(self._messages(topic), None)
+                if extra_message is not None:
+                    extra_time = Instant(extra_message.log_time_ns, 0)
+                    self._found[topic] = Sentence("the one at ", extra_time, " is only in the log")
         return self._found
 
     def _compare(self, topic: str, time_ns: int, payload: bytes) -> None:
-        recorded = next(self._messages(topic), None)
-        if recorded is None:
+        recorded_message = next(self._messages(topic), None)
+        if recorded_message is None:
             self._found[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
-        elif recorded.log_time_ns != time_ns:
-            now, then = Instant(time_ns, 0), Instant(recorded.log_time_ns, 0)
-            self._found[topic] = Sentence("one is at ", now, " now, and was at ", then)
-        elif recorded.payload != payload:
-            what = _difference(topic, payload, recorded.payload)
-            if what is not None:
-                self._found[topic] = Sentence("at ", Instant(time_ns, 0), f": {what}")
+        elif recorded_message.log_time_ns != time_ns:
+            computed_time, recorded_time = Instant(time_ns, 0), Instant(recorded_message.log_time_ns, 0)
+            self._found[topic] = Sentence("one is at ", computed_time, " now, and was at ", recorded_time)
+        elif recorded_message.payload != payload:
+            difference = _difference(topic, payload, recorded_message.payload)
+            if difference is not None:
+                self._found[topic] = Sentence("at ", Instant(time_ns, 0), f": {difference}")
 
     def _messages(self, topic: str) -> Iterator[Message]:
         if topic not in self._recorded:
@@ -213,101 +215,125 @@ def explain_differences(
     Args:
         differences: the first difference of each topic, in a clause; see `FirstDifferences`.
     """
-    beside = {topic: what for topic, what in differences.items() if topic not in DERIVED and topic != OBJECTS}
-    first = next((Sentence(f"on {topic}, ", what) for topic, what in sorted(beside.items())), None)
-    parts = (
+    message_clauses = {
+        topic: clause for topic, clause in differences.items() if topic not in DERIVED and topic != OBJECTS
+    }
+    first_clause = next(
+        (Sentence(f"on {topic}, ", clause) for topic, clause in sorted(message_clauses.items())), None
+    )
+    certificate_parts = (
         ("samples", differences.get(OBJECTS)),
-        ("messages", first or differences.get(OBJECTS)),
+        ("messages", first_clause or differences.get(OBJECTS)),
         ("specification", differences.get(SPECIFICATION)),
         ("results", differences.get(ROBUSTNESS)),
     )
-    lines = []
-    for name, where in parts:
-        key = f"{name}_sha256"
-        if recorded.get(key) == computed.get(key):
-            lines.append(Sentence(f"{name:<14} the same"))
-        elif where is None:
-            lines.append(Sentence(f"{name:<14} differ from those certified; the log does not show where"))
+    sentences = []
+    for part_name, part_clause in certificate_parts:
+        entry = f"{part_name}_sha256"
+        if recorded.get(entry) == computed.get(entry):
+            sentences.append(Sentence(f"{part_name:<14} the same"))
+        elif part_clause is None:
+            sentences.append(
+                Sentence(f"{part_name:<14} differ from those certified; the log does not show where")
+            )
         else:
-            lines.append(Sentence(f"{name:<14} differ first ", where))
+            sentences.append(Sentence(f"{part_name:<14} differ first ", part_clause))
     if PLAN_SHA256 in recorded:
         is_same = recorded[PLAN_SHA256] == computed.get(PLAN_SHA256)
-        lines.append(
+        sentences.append(
             Sentence(f"{'plan settings':<14} {'the same' if is_same else 'differ from those certified'}")
         )
-    doubts = [certificate.get("doubts", "none") for certificate in (recorded, computed)]
-    if doubts != ["none", "none"]:
-        is_same = doubts[0] == doubts[1]
-        what = "the same" if is_same else f"{doubts[1]} now, {doubts[0]} recorded"
-        lines.append(Sentence(f"{'doubts':<14} {what}"))
-    version = recorded.get("spatial_replay_version", "unknown")
-    is_same = version == __version__
-    lines.append(
-        Sentence(f"{'program':<14} " + ("the same" if is_same else f"{__version__} now, {version} recorded"))
+    doubt_texts = [certificate.get("doubts", "none") for certificate in (recorded, computed)]
+    if doubt_texts != ["none", "none"]:
+        is_same = doubt_texts[0] == doubt_texts[1]
+        clause = "the same" if is_same else f"{doubt_texts[1]} now, {doubt_texts[0]} recorded"
+        sentences.append(Sentence(f"{'doubts':<14} {clause}"))
+    recorded_version = recorded.get("spatial_replay_version", "unknown")
+    is_same = recorded_version == __version__
+    sentences.append(
+        Sentence(
+            f"{'program':<14} "
+            + ("the same" if is_same else f"{__version__} now, {recorded_version} recorded")
+        )
     )
-    return lines
+    return sentences
 
 
-def _difference(topic: str, now: bytes, then: bytes) -> str | None:
+def _difference(topic: str, new_payload: bytes, old_payload: bytes) -> str | None:
     """Return the difference of a message from the recorded one; None if only the encoding differs."""
     try:
         # literals, because a bare name in a pattern would capture the topic
         match topic:
             case "/spatial/objects":
-                return _of_samples(ObjectStates.FromString(now), ObjectStates.FromString(then))
+                return _of_samples(ObjectStates.FromString(new_payload), ObjectStates.FromString(old_payload))
             case "/spatial/robustness":
-                return _of_results(Robustness.FromString(now), Robustness.FromString(then))
+                return _of_results(Robustness.FromString(new_payload), Robustness.FromString(old_payload))
             case "/spatial/specification":
                 return _of_specifications(
-                    SpecificationMessage.FromString(now), SpecificationMessage.FromString(then)
+                    SpecificationMessage.FromString(new_payload),
+                    SpecificationMessage.FromString(old_payload),
                 )
     # the recorded payload may be any bytes
     except ValueError:
         return "what is recorded cannot be decoded"
-    return f"{len(now)} bytes now, {len(then)} recorded, of other content"
+    return f"{len(new_payload)} bytes now, {len(old_payload)} recorded, of other content"
 
 
-def _of_samples(now: ObjectStates, then: ObjectStates) -> str | None:
-    objects, before = ({tracked.name: tracked for tracked in sample.objects} for sample in (now, then))
-    for name in sorted(objects.keys() | before.keys()):
-        if name not in objects or name not in before:
-            return f"`{name}` is {'only in the log' if name in before else 'not in the log'}"
+def _of_samples(new_sample: ObjectStates, old_sample: ObjectStates) -> str | None:
+    new_objects, old_objects = (
+        {tracked.name: tracked for tracked in sample.objects} for sample in (new_sample, old_sample)
+    )
+    for name in sorted(new_objects.keys() | old_objects.keys()):
+        if name not in new_objects or name not in old_objects:
+            return f"`{name}` is {'only in the log' if name in old_objects else 'not in the log'}"
         for field in ("class_name", "parts", "yaw", "height", "uncertainty"):
-            if getattr(objects[name], field) != getattr(before[name], field):
-                what = {"class_name": "class", "parts": "footprint"}.get(field, field)
-                return f"`{name}` has another {what}"
-    signals, old = ({signal.name: signal.value for signal in sample.signals} for sample in (now, then))
-    for name in sorted(signals.keys() | old.keys()):
-        if signals.get(name) != old.get(name):
-            values = [side.get(name, "missing") for side in (signals, old)]
-            return f"the signal `{name}` is {values[0]} now, {values[1]} recorded"
+            if getattr(new_objects[name], field) != getattr(old_objects[name], field):
+                quantity = {"class_name": "class", "parts": "footprint"}.get(field, field)
+                return f"`{name}` has another {quantity}"
+    new_signals, old_signals = (
+        {signal.name: signal.value for signal in sample.signals} for sample in (new_sample, old_sample)
+    )
+    for name in sorted(new_signals.keys() | old_signals.keys()):
+        if new_signals.get(name) != old_signals.get(name):
+            signal_values = [
+                sample_signals.get(name, "missing") for sample_signals in (new_signals, old_signals)
+            ]
+            return f"the signal `{name}` is {signal_values[0]} now, {signal_values[1]} recorded"
     return None
 
 
-def _of_results(now: Robustness, then: Robustness) -> str | None:
-    if (now.specification, now.object) != (then.specification, then.object):
-        return f"`{now.specification}` now, `{then.specification}` recorded"
-    for node_now, node_then in zip_longest(now.nodes, then.nodes):
-        if node_now is None or node_then is None:
-            return f"`{now.specification}` has {len(now.nodes)} nodes now, {len(then.nodes)} recorded"
-        for name in _QUANTITIES:
-            values = getattr(node_now, name), getattr(node_then, name)
-            if not np.array_equal(*values, equal_nan=True):
-                node = f"`{node_now.name or f'node {node_now.id}'}` in `{now.specification}`"
-                return f"{name} of {node} is {values[0]!r} now, {values[1]!r} recorded"
+def _of_results(new_result: Robustness, old_result: Robustness) -> str | None:
+    if (new_result.specification, new_result.object) != (
+        old_result.specification,
+        old_result.object,
+    ):
+        return f"`{new_result.specification}` now, `{old_result.specification}` recorded"
+    for new_node, old_node in zip_longest(new_result.nodes, old_result.nodes):
+        if new_node is None or old_node is None:
+            return (
+                f"`{new_result.specification}` has {len(new_result.nodes)} nodes now, "
+                f"{len(old_result.nodes)} recorded"
+            )
+        for quantity in _QUANTITIES:
+            numbers = getattr(new_node, quantity), getattr(old_node, quantity)
+            if not np.array_equal(*numbers, equal_nan=True):
+                node_text = f"`{new_node.name or f'node {new_node.id}'}` in `{new_result.specification}`"
+                return f"{quantity} of {node_text} is {numbers[0]!r} now, {numbers[1]!r} recorded"
     return None
 
 
-def _of_specifications(now: SpecificationMessage, then: SpecificationMessage) -> str | None:
-    for file_now, file_then in zip_longest(now.files, then.files):
-        if file_now is None or file_then is None:
-            return f"{len(now.files)} files now, {len(then.files)} recorded"
-        lines = zip_longest(file_now.canonical.splitlines(), file_then.canonical.splitlines(), fillvalue="")
-        for number, (line, before) in enumerate(lines, 1):
-            if line != before:
-                texts = [printable(text, _LONGEST_LINE) for text in (line, before)]
-                place = f"{file_now.name}, line {number} as formatted"
-                return f"{place}: `{texts[0]}` now, `{texts[1]}` recorded"
+def _of_specifications(new_message: SpecificationMessage, old_message: SpecificationMessage) -> str | None:
+    for new_file, old_file in zip_longest(new_message.files, old_message.files):
+        if new_file is None or old_file is None:
+            return f"{len(new_message.files)} files now, {len(old_message.files)} recorded"
+        line_pairs = zip_longest(
+            new_file.canonical.splitlines(), old_file.canonical.splitlines(), fillvalue=""
+        )
+        for line_number, (new_line, old_line) in enumerate(line_pairs, 1):
+            if new_line != old_line:
+                line_texts = [printable(text, _LONGEST_LINE) for text in (new_line, old_line)]
+                place = f"{new_file.name}, line {line_number} as formatted"
+                return f"{place}: `{line_texts[0]}` now, `{line_texts[1]}` recorded"
     return None
 
 
@@ -357,11 +383,12 @@ class Verified:
         if not self.recorded:
             return ("the log has no certificate: it is not annotated, or was not written to its end",)
         differences = [
-            f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
-            for key, what in _HASHES.items()
-            if self.recorded.get(key) != self.computed.get(key)
+            f"{text}: {self.computed.get(entry, 'nothing')} now, "
+            f"{self.recorded.get(entry, 'nothing')} recorded"
+            for entry, text in _HASHES.items()
+            if self.recorded.get(entry) != self.computed.get(entry)
             # older certificates have no hash of the plan settings
-            and not (key == PLAN_SHA256 and key not in self.recorded)
+            and not (entry == PLAN_SHA256 and entry not in self.recorded)
         ]
         return (*differences, *([_NO_PLAN] if self.lacks_plan else []))
 
@@ -384,49 +411,49 @@ def verify_certificate(
         UsageError, LogError, SpecificationError: the log cannot be evaluated.
     """
     metadata = dict(log.metadata())
-    recorded, about = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
+    recorded, log_record = metadata.get(CERTIFICATE, {}), metadata.get(METADATA, {})
     if not recorded:
         return Verified({}, {})
-    options = _options(about)
+    options = _options(log_record)
     if source is None and options.get("layer"):
         raise UsageError(
             f"{log.name} is a layer without samples; give the log that it was made from: --source SOURCE"
         )
-    keep = None if source is None else _topics_of_copy(about, options)
-    clip = metadata.get(CLIP_METADATA, {})
+    kept_topics = None if source is None else _topics_of_copy(log_record, options)
+    clip_record = metadata.get(CLIP_METADATA, {})
     # a replay of a clip also has the clip's record; if the source is that clip, it is not cut again
-    if source is not None and clip and dict(source.metadata()).get(CLIP_METADATA) != clip:
-        source, keep = clipped_source(source, clip), None
-    evaluated = log if source is None else source
+    if source is not None and clip_record and dict(source.metadata()).get(CLIP_METADATA) != clip_record:
+        source, kept_topics = clipped_source(source, clip_record), None
+    evaluated_source = log if source is None else source
     replay_options = ReplayOptions(
-        Window(**{name: options[name] for name in _WINDOW if name in options}),
+        Window(**{option: options[option] for option in _WINDOW if option in options}),
         options.get("each", {}),
-        _semantics(about),
-        keep=keep,
+        _semantics(log_record),
+        keep=kept_topics,
         arrow=str(options.get("arrow", "")),
     )
-    replayed = run_replay(evaluated, _files(log), replay_options, advance=advance)
+    replayed = run_replay(evaluated_source, _files(log), replay_options, advance=advance)
     computed = dict(replayed.certificate)
-    plan = metadata.get(PLAN_METADATA)
+    plan_settings = metadata.get(PLAN_METADATA)
     if not options.get("layer") and recorded.get(PLAN_SHA256) == computed.get(PLAN_SHA256):
         # the source has the certified settings, and the log's own copy of them is checked, too
-        computed |= {} if plan is None else {PLAN_SHA256: plan_sha256(plan)}
-        if plan is None:
+        computed |= {} if plan_settings is None else {PLAN_SHA256: plan_sha256(plan_settings)}
+        if plan_settings is None:
             computed.pop(PLAN_SHA256, None)
-    lacks_plan = about.get("planned") == "true" and plan is None and PLAN_SHA256 not in recorded
+    lacks_plan = log_record.get("planned") == "true" and plan_settings is None and PLAN_SHA256 not in recorded
     lacks_plan = lacks_plan and not options.get("layer")
-    is_covered = plan is None or PLAN_SHA256 in recorded
-    notes = () if is_covered else (_NOT_COVERED,)
+    is_plan_covered = plan_settings is None or PLAN_SHA256 in recorded
+    notes = () if is_plan_covered else (_NOT_COVERED,)
     verified = Verified(dict(recorded), computed, replayed.faults, lacks_plan=lacks_plan, notes=notes)
     if not explain:
         return verified
     first_differences: Mapping[str, Sentence] = {}
     if verified.differences and isinstance(log, McapSource):
-        compared = FirstDifferences(log.path)
-        Replay(evaluated, _files(log), replay_options, certify=False).run(
-            compared.add, layer=bool(options.get("layer")), advance=advance
+        comparison = FirstDifferences(log.path)
+        Replay(evaluated_source, _files(log), replay_options, certify=False).run(
+            comparison.add, layer=bool(options.get("layer")), advance=advance
         )
-        first_differences = compared.finish()
+        first_differences = comparison.finish()
     explanation = explain_differences(verified.recorded, verified.computed, first_differences)
     return replace(verified, explanation=counted_from(explanation, replayed.first_ns))
 
@@ -437,11 +464,11 @@ def recorded_reading(log: Source, source: str) -> dict[str, Any]:
     Args:
         source: file name of the given source; options apply only to the recorded source.
     """
-    about = dict(log.metadata()).get(METADATA, {})
-    if about.get("source") != source:
+    log_record = dict(log.metadata()).get(METADATA, {})
+    if log_record.get("source") != source:
         return {}
     try:
-        options = json.loads(about.get("options", "{}"))
+        options = json.loads(log_record.get("options", "{}"))
     except ValueError:
         return {}
     return {name: options[name] for name in KEYS if name in options} if isinstance(options, dict) else {}
@@ -455,23 +482,23 @@ def _files(log: Source) -> list[Specification]:
         return []
 
 
-def _options(about: Mapping[str, str]) -> dict[str, Any]:
+def _options(log_record: Mapping[str, str]) -> dict[str, Any]:
     """Return the options of the replay that wrote a log; none for a recording."""
-    if about.get("written_by") != "replay":
+    if log_record.get("written_by") != "replay":
         return {}
     try:
-        options = json.loads(about.get("options", "{}"))
+        options = json.loads(log_record.get("options", "{}"))
     except ValueError as error:
         raise LogError(f"the options in the log's metadata cannot be read: {error}") from error
     return options if isinstance(options, dict) else {}
 
 
-def _topics_of_copy(about: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
+def _topics_of_copy(log_record: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return the topics of its source that a log kept: none in a recording, by default all in a copy."""
-    if about.get("written_by") != "replay":
+    if log_record.get("written_by") != "replay":
         return ()
     return None if options.get("layer") else tuple(options.get("keep", KEEP_ALL))
 
 
-def _semantics(about: Mapping[str, str]) -> Semantics:
-    return "paper" if about.get("semantics") == "paper" else "ltlf"
+def _semantics(log_record: Mapping[str, str]) -> Semantics:
+    return "paper" if log_record.get("semantics") == "paper" else "ltlf"
