@@ -57,21 +57,21 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
         UsageError: a name that no result or spec has.
     """
     if not of:
-        violated = [result for result in results if result.verdict is Verdict.VIOLATED]
-        return [KeptNode(result, 0, result.title) for result in violated or results]
-    nodes, spec_names = [], dict[str, None]()
+        violated_results = [result for result in results if result.verdict is Verdict.VIOLATED]
+        return [KeptNode(result, 0, result.title) for result in violated_results or results]
+    kept_nodes, spec_names = [], dict[str, None]()
     for result in results:
         # in reverse, so that the first of several nodes with one name remains
-        names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
-        spec_names |= dict.fromkeys([result.title, *names])
+        ids_by_name = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
+        spec_names |= dict.fromkeys([result.title, *ids_by_name])
         if result.title in of or result.name in of:
-            nodes.append(KeptNode(result, 0, result.title))
-        nodes += [KeptNode(result, names[name], name) for name in of if names.get(name)]
+            kept_nodes.append(KeptNode(result, 0, result.title))
+        kept_nodes += [KeptNode(result, ids_by_name[name], name) for name in of if ids_by_name.get(name)]
     for name in of:
         if name not in spec_names and all(name != result.name for result in results):
             hint = nearest_hint(name, spec_names) or f"there are {', '.join(spec_names)}"
             raise UsageError(f"no spec is named {name!r}; {hint}")
-    return nodes
+    return kept_nodes
 
 
 class _Path(NamedTuple):
@@ -124,11 +124,11 @@ class _Decision(NamedTuple):
 class _Part:
     """Node of a result that can be evaluated over any window of its samples."""
 
-    def __init__(self, kept: KeptNode, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
-        result = kept.result
+    def __init__(self, kept_node: KeptNode, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
+        result = kept_node.result
         if result.leaves is None:
             raise UsageError("a clip needs the leaves of every sample, which were not stored")
-        self._result, self._node = result, kept.node
+        self._result, self._node = result, kept_node.node
         self._leaves, self._times_ns = result.leaves, result.times_ns
         self._order = result.evidence.instance.program.leaves
         self._trace, self._regions = trace, regions
@@ -136,19 +136,19 @@ class _Part:
         # an instance lasts from the first to the last appearance of its object
         self._seen_ns: Integers | None = None
         if result.object is not None and trace is not None:
-            column = trace.names.index(result.object)
-            self._seen_ns = trace.times_ns[trace.rows[:, column] != ABSENT]
+            object_column = trace.names.index(result.object)
+            self._seen_ns = trace.times_ns[trace.rows[:, object_column] != ABSENT]
         self._decision = self._decide(result, self._leaves)
         # of several events at one time, the last entry is shown
         self._moments = {
-            self._decision.settled.decided_ns: f", where `{kept.title}` was settled",
-            self._decision.path.decided_ns: f", where the robustness of `{kept.title}` is decided",
+            self._decision.settled.decided_ns: f", where `{kept_node.title}` was settled",
+            self._decision.path.decided_ns: f", where the robustness of `{kept_node.title}` is decided",
         }
         if self._decision.certain_ns is not None:
-            certain = f", where `{kept.title}` became {self._decision.verdict} for certain"
-            self._moments[self._decision.certain_ns] = certain
+            certain_clause = f", where `{kept_node.title}` became {self._decision.verdict} for certain"
+            self._moments[self._decision.certain_ns] = certain_clause
         self.span_ns = min(self._moments), max(self._moments)
-        self._title = kept.title
+        self._title = kept_node.title
 
     def moment(self, time_ns: int) -> str | None:
         """Return the event at a deciding time as a clause; None at other times."""
@@ -168,77 +168,85 @@ class _Part:
     def _decision_over(self, start_ns: int, end_ns: int) -> _Decision | None:
         """Return the decision over the samples between two times; None without a sample."""
         if self._seen_ns is not None:
-            begin, end = window_of(self._seen_ns, start_ns, end_ns + 1)
-            if begin == end:
+            begin_index, end_index = window_of(self._seen_ns, start_ns, end_ns + 1)
+            if begin_index == end_index:
                 return None
-            start_ns, end_ns = self._seen_ns[[begin, end - 1]].tolist()
-        begin, end = window_of(self._times_ns, start_ns, end_ns + 1)
-        if begin == end:
+            start_ns, end_ns = self._seen_ns[[begin_index, end_index - 1]].tolist()
+        begin_index, end_index = window_of(self._times_ns, start_ns, end_ns + 1)
+        if begin_index == end_index:
             return None
-        leaves = self._within(begin, end, start_ns)
+        leaves = self._within(begin_index, end_index, start_ns)
         stream = InstanceStream(self._result.evidence.instance)
-        block = stream.extend_leaves(leaves, self._times_ns[begin:end])
+        block = stream.extend_leaves(leaves, self._times_ns[begin_index:end_index])
         result = SpecResult.from_stream(stream, self._result.evidence, block)
         return self._decide(result, leaves)
 
-    def _within(self, begin: int, end: int, first_ns: int) -> Floats:
+    def _within(self, begin_index: int, end_index: int, start_ns: int) -> Floats:
         """Return the leaves that a log of the window alone has; nothing is known before its start."""
-        leaves = np.ascontiguousarray(self._leaves[:, :, begin:end])
-        samples, duration_ns, to_reports = self._reach
+        leaves = np.ascontiguousarray(self._leaves[:, :, begin_index:end_index])
+        delay_samples, delay_ns, has_report_delay = self._reach
         if self._trace is None or not self._reach:
             return leaves
-        times_ns = self._times_ns[begin:end]
-        count = max(samples, to_reports, int(np.searchsorted(times_ns, first_ns + duration_ns)))
-        if to_reports and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
+        times_ns = self._times_ns[begin_index:end_index]
+        head_length = max(
+            delay_samples, has_report_delay, int(np.searchsorted(times_ns, start_ns + delay_ns))
+        )
+        if has_report_delay and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
             # a rate reads the last two reports: up to the second report in the window, one is from before it
-            count = len(times_ns)
-        from_, to = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
-        head = self._trace.slice(from_, min(from_ + count, to))
-        if not len(head):
+            head_length = len(times_ns)
+        trace_begin, trace_end = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
+        head_trace = self._trace.slice(trace_begin, min(trace_begin + head_length, trace_end))
+        if not len(head_trace):
             return leaves
         instance = self._result.evidence.instance
-        head_leaves = leaf_values(TraceScene(head, self._regions), self._order, instance.bindings)
-        channels = max(len(head_leaves), len(leaves))
-        leaves = np.array(in_channels(leaves, channels))
-        leaves[:, :, : len(head)] = in_channels(head_leaves, channels)
+        head_leaves = leaf_values(TraceScene(head_trace, self._regions), self._order, instance.bindings)
+        channel_count = max(len(head_leaves), len(leaves))
+        leaves = np.array(in_channels(leaves, channel_count))
+        leaves[:, :, : len(head_trace)] = in_channels(head_leaves, channel_count)
         return leaves
 
     def _decide(self, result: SpecResult, leaves: Floats) -> _Decision:
         """Return the verdict over the samples of a result with given leaves, and its reason."""
         times_ns, certain_ns = result.times_ns, result.certain_ns(self._node)
         cause = result.first_cause(self._node)
-        part, settled_ns = (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
+        deciding_node, settled_ns = (
+            (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
+        )
         evaluation = evaluate_offline(result.formula, self._order, leaves, times_ns)
         path = _path(evaluation, self._node)
         if settled_ns is None:
-            settled = _path(evaluation, part)
+            settled_path = _path(evaluation, deciding_node)
         else:
-            count = int(np.searchsorted(times_ns, settled_ns, side="right"))
-            first = evaluate_prefix(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
-            settled = _path(first, part)
-        numbers = (*_deciding_numbers(evaluation, self._node), *_deciding_numbers(evaluation, part))
+            prefix_length = int(np.searchsorted(times_ns, settled_ns, side="right"))
+            prefix_evaluation = evaluate_prefix(
+                result.formula, self._order, leaves[:, :, :prefix_length], times_ns[:prefix_length]
+            )
+            settled_path = _path(prefix_evaluation, deciding_node)
+        numbers = (*_deciding_numbers(evaluation, self._node), *_deciding_numbers(evaluation, deciding_node))
         verdict = final_verdict(*evaluation.interval(self._node))
-        return _Decision(verdict, certain_ns, numbers, None if cause is None else part, path, settled)
+        return _Decision(
+            verdict, certain_ns, numbers, None if cause is None else deciding_node, path, settled_path
+        )
 
 
-def _deciding_numbers(done: OfflineNodes, node: int) -> tuple[float, ...]:
+def _deciding_numbers(evaluation: OfflineNodes, node: int) -> tuple[float, ...]:
     """Return the deciding ends of a node's interval and nominal interval; none if the verdict is open."""
-    end = End.of(final_verdict(*done.interval(node)))
-    if end is End.OPEN:
+    deciding_end = End.of(final_verdict(*evaluation.interval(node)))
+    if deciding_end is End.OPEN:
         return ()
-    which = int(end is End.HIGH)
-    return done.interval(node)[which], done.interval(node, wide=False)[which]
+    end_index = int(deciding_end is End.HIGH)
+    return evaluation.interval(node)[end_index], evaluation.interval(node, wide=False)[end_index]
 
 
-def _path(done: OfflineNodes, node: int) -> _Path:
-    end = End.of(final_verdict(*done.interval(node)))
-    path = deciding_path(done, node, end)
-    last = path.steps[-1]
+def _path(evaluation: OfflineNodes, node: int) -> _Path:
+    deciding_end = End.of(final_verdict(*evaluation.interval(node)))
+    path = deciding_path(evaluation, node, deciding_end)
+    last_step = path.steps[-1]
     return _Path(
         tuple(step.node for step in path.steps),
-        int(done.times_ns[last.sample]),
-        done.interval(last.node, last.sample),
-        missed_response(path, done)[0] if end is End.HIGH else None,
+        int(evaluation.times_ns[last_step.sample]),
+        evaluation.interval(last_step.node, last_step.sample),
+        missed_response(path, evaluation)[0] if deciding_end is End.HIGH else None,
     )
 
 
@@ -253,84 +261,89 @@ class ClipSearch:
         kept: Sequence[KeptNode],
         around_ns: int,
     ) -> None:
-        results = [node.result for node in kept]
+        results = [kept_node.result for kept_node in kept]
         needs_samples = any(result.object is not None or look_back([result.formula]) for result in results)
         # only delayed terms and objects that come and go need samples, which take time to read
         trace = Selection(source, files, options).trace() if needs_samples else None
         self._parts = []
-        for node in kept:
-            if len(node.result.times_ns):
-                file = file_of(files, node.result)
-                self._parts.append(_Part(node, trace, {} if file is None else file.regions))
+        for kept_node in kept:
+            if len(kept_node.result.times_ns):
+                file = file_of(files, kept_node.result)
+                self._parts.append(_Part(kept_node, trace, {} if file is None else file.regions))
         self._times_ns = _join_times([result.times_ns for result in results])
-        first_ns = min(part.span_ns[0] for part in self._parts) - around_ns
-        last_ns = max(part.span_ns[1] for part in self._parts) + around_ns
-        last = len(self._times_ns) - 1
+        inner_start_ns = min(part.span_ns[0] for part in self._parts) - around_ns
+        inner_end_ns = max(part.span_ns[1] for part in self._parts) + around_ns
+        last_index = len(self._times_ns) - 1
         self._inner = (
-            int(np.searchsorted(self._times_ns, first_ns)),
-            min(last, int(np.searchsorted(self._times_ns, last_ns, side="right")) - 1),
+            int(np.searchsorted(self._times_ns, inner_start_ns)),
+            min(last_index, int(np.searchsorted(self._times_ns, inner_end_ns, side="right")) - 1),
         )
         self._around_ns = around_ns
         self._known: dict[tuple[int, int], bool] = {}
 
     def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
         """Yield sentences on why the window cannot begin later or end earlier; times count from 0."""
-        first, last = np.searchsorted(self._times_ns, [start_ns, end_ns]).tolist()
-        for verb, at, shorter in (("begins", first, (first + 1, last)), ("ends", last, (first, last - 1))):
-            time_ns = int(self._times_ns[at])
-            moments = (part.moment(time_ns) for part in self._parts)
-            window = [int(self._times_ns[place]) for place in shorter] if first < last else []
-            changes = (part.change_over(*window) for part in self._parts if window)
-            reason = next(filter(None, (*moments, *changes)), None)
-            is_border = at in (0, len(self._times_ns) - 1)
-            if reason is None and self._around_ns and at in self._inner and not is_border:
+        first_index, last_index = np.searchsorted(self._times_ns, [start_ns, end_ns]).tolist()
+        for verb, edge_index, shorter_window in (
+            ("begins", first_index, (first_index + 1, last_index)),
+            ("ends", last_index, (first_index, last_index - 1)),
+        ):
+            time_ns = int(self._times_ns[edge_index])
+            moment_clauses = (part.moment(time_ns) for part in self._parts)
+            window_ns = (
+                [int(self._times_ns[index]) for index in shorter_window] if first_index < last_index else []
+            )
+            change_clauses = (part.change_over(*window_ns) for part in self._parts if window_ns)
+            reason = next(filter(None, (*moment_clauses, *change_clauses)), None)
+            is_log_end = edge_index in (0, len(self._times_ns) - 1)
+            if reason is None and self._around_ns and edge_index in self._inner and not is_log_end:
                 reason = f", {format_duration(self._around_ns)} from the samples that decide, by --around"
-            if window and reason is not None:
+            if window_ns and reason is not None:
                 yield Sentence(f"it {verb} at ", Instant(time_ns, 0), reason)
 
     def window(self) -> tuple[int, int]:
         """Return the times of the first and the last sample of the clip."""
-        first, last = self._outwards()
+        first_index, last_index = self._outwards()
         while True:
-            begin = self._cut(first, self._inner[0], partial(self._holds, last=last))
-            end = self._cut(last, self._inner[1], partial(self._holds, begin))
-            if (begin, end) == (first, last):
-                return int(self._times_ns[first]), int(self._times_ns[last])
-            first, last = begin, end
+            cut_first = self._cut(first_index, self._inner[0], partial(self._holds, last=last_index))
+            cut_last = self._cut(last_index, self._inner[1], partial(self._holds, cut_first))
+            if (cut_first, cut_last) == (first_index, last_index):
+                return int(self._times_ns[first_index]), int(self._times_ns[last_index])
+            first_index, last_index = cut_first, cut_last
 
     def _outwards(self) -> tuple[int, int]:
         """Widen the window in doubling steps until it has the results, because small windows cost least."""
-        low, high = self._inner
-        last, step = len(self._times_ns) - 1, 0
+        inner_first, inner_last = self._inner
+        last_index, margin_samples = len(self._times_ns) - 1, 0
         while True:
-            window = max(low - step, 0), min(high + step, last)
-            if window == (0, last) or self._holds(*window):
+            window = max(inner_first - margin_samples, 0), min(inner_last + margin_samples, last_index)
+            if window == (0, last_index) or self._holds(*window):
                 return window
-            step = max(2 * step, 1)
+            margin_samples = max(2 * margin_samples, 1)
 
-    def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
+    def _cut(self, outer_index: int, inner_index: int, holds: Callable[[int], bool]) -> int:
         """Return the end of the shortest window that still has the results, between two ends.
 
         The window with the outer end has them. The search starts inside, because long windows cost most.
         """
-        if inner == outer or holds(inner):
-            return inner
-        towards = 1 if outer > inner else -1
-        return last_that_holds(inner, outer - towards, lambda at: not holds(at)) + towards
+        if inner_index == outer_index or holds(inner_index):
+            return inner_index
+        direction = 1 if outer_index > inner_index else -1
+        return last_that_holds(inner_index, outer_index - direction, lambda at: not holds(at)) + direction
 
     def _holds(self, first: int, last: int) -> bool:
         """Return whether a window has every result for the same reason."""
         if (first, last) not in self._known:
-            times = int(self._times_ns[first]), int(self._times_ns[last])
-            self._known[first, last] = all(part.holds_over(*times) for part in self._parts)
+            window_ns = int(self._times_ns[first]), int(self._times_ns[last])
+            self._known[first, last] = all(part.holds_over(*window_ns) for part in self._parts)
         return self._known[first, last]
 
 
 def _join_times(times_ns: Sequence[Integers]) -> Integers:
-    first = times_ns[0]
+    first_times_ns = times_ns[0]
     # times are compared, not lengths: objects that appear one after another can have equally many samples
-    if all(np.array_equal(sample_times, first) for sample_times in times_ns):
-        return first
+    if all(np.array_equal(result_times_ns, first_times_ns) for result_times_ns in times_ns):
+        return first_times_ns
     return np.unique(np.concatenate(times_ns))
 
 
@@ -384,14 +397,14 @@ class Clip:
     def added(self) -> tuple[str, ...]:
         """Named parts that fail in the clip but not in the log, in results with an unchanged verdict."""
         results = {result.title: result for result in self.whole.results}
-        parts = (
+        part_names = (
             cause.spec
             for result in self.replayed.results
             if result.title not in self.changed
             for cause in result.causes
             if cause.spec not in {cause.spec for cause in results[result.title].causes}
         )
-        return tuple(dict.fromkeys(parts))
+        return tuple(dict.fromkeys(part_names))
 
 
 def cut_clip(
@@ -426,24 +439,24 @@ def cut_clip(
         raise UsageError("a clip keeps every sample; leave out --every")
     require_ltlf(options.semantics, "a clip")
     # the first pass only evaluates, so it copies no messages
-    first_pass = replace(options, keep=())
-    whole = Replay(source, files, first_pass, keep_leaves=True, certify=False).run(advance=advance)
-    nodes = chosen_nodes(whole.results, of)
-    search = ClipSearch(source, files, first_pass, nodes, around_ns)
+    first_options = replace(options, keep=())
+    log_replay = Replay(source, files, first_options, keep_leaves=True, certify=False).run(advance=advance)
+    kept_nodes = chosen_nodes(log_replay.results, of)
+    search = ClipSearch(source, files, first_options, kept_nodes, around_ns)
     start_ns, end_ns = search.window()
-    keep = KEEP_ALL if options.keep is None else options.keep
-    about = {
+    kept_topics = KEEP_ALL if options.keep is None else options.keep
+    clip_record = {
         "source": source.name,
-        "samples": str(whole.samples),
+        "samples": str(log_replay.samples),
         "start_ns": str(start_ns),
         "end_ns": str(end_ns),
-        ZERO: str(whole.first_ns),
-        "keep": json.dumps(list(keep)),
-        "kept": ", ".join(node.title for node in nodes),
+        ZERO: str(log_replay.first_ns),
+        "keep": json.dumps(list(kept_topics)),
+        "kept": ", ".join(kept_node.title for kept_node in kept_nodes),
     }
-    clipped = clipped_source(source, about)
-    replayed = run_replay(
-        clipped,
+    clip_source = clipped_source(source, clip_record)
+    clip_replay = run_replay(
+        clip_source,
         files,
         replace(options, window=Window(), keep=None),
         keep_leaves=True,
@@ -451,14 +464,14 @@ def cut_clip(
         inputs=inputs,
     )
     return Clip(
-        whole,
-        replayed,
+        log_replay,
+        clip_replay,
         start_ns,
         end_ns,
-        tuple(node.title for node in nodes),
+        tuple(kept_node.title for kept_node in kept_nodes),
         _size_of(source),
         output.stat().st_size,
-        counted_from(search.reasons(start_ns, end_ns), whole.first_ns),
+        counted_from(search.reasons(start_ns, end_ns), log_replay.first_ns),
     )
 
 

@@ -59,24 +59,24 @@ def unify_regions(
     Returns:
         The formulas, and the regions of both sides by name.
     """
-    renamed: dict[str, str] = {}
-    joined = dict(others)
+    new_names: dict[str, str] = {}
+    all_regions = dict(others)
     for name, outline in regions.items():
         if others.get(name, outline) != outline:
             new_name = f"{name} (before)"
             while new_name in others or new_name in regions:
                 new_name += "'"
-            renamed[name] = new_name
-        joined[renamed.get(name, name)] = outline
-    if not renamed:
-        return list(formulas), joined
-    change = partial(_rename_regions, regions=renamed)
+            new_names[name] = new_name
+        all_regions[new_names.get(name, name)] = outline
+    if not new_names:
+        return list(formulas), all_regions
+    rename_term = partial(_rename_regions, regions=new_names)
 
     def change_atom(atom: Atom) -> Atom:
-        expression = map_leaves(atom.expression, partial(changed_leaf, change=change))
-        return replace(atom, expression=expression, terms=tuple(map(change, atom.terms)))
+        expression = map_leaves(atom.expression, partial(changed_leaf, change=rename_term))
+        return replace(atom, expression=expression, terms=tuple(map(rename_term, atom.terms)))
 
-    return [rewritten(formula, change_atom) for formula in formulas], joined
+    return [rewritten(formula, change_atom) for formula in formulas], all_regions
 
 
 def _rename_regions(term: Any, regions: Mapping[str, str], *, without_groups: bool = False) -> Any:
@@ -149,10 +149,12 @@ class TextVersions:
         self._statements = statements_of(old), statements_of(new)
         old_statements, new_statements = self._statements
         # specs are left out, because they are compared node by node
-        keys = [key for key in dict.fromkeys((*old_statements, *new_statements)) if key[0] != "SPEC"]
-        self._keys = [key for key in keys if _words(old_statements, key) != _words(new_statements, key)][
-            :_MOST_CHANGES
+        statement_keys = [
+            key for key in dict.fromkeys((*old_statements, *new_statements)) if key[0] != "SPEC"
         ]
+        self._keys = [
+            key for key in statement_keys if _words(old_statements, key) != _words(new_statements, key)
+        ][:_MOST_CHANGES]
         self.changes = tuple(
             DeclarationChange(
                 _KINDS[key[0]], key[1], _place(old_statements, key), _place(new_statements, key)
@@ -168,16 +170,18 @@ class TextVersions:
             changes: indices of the declarations in `changes`.
             is_undone: whether the result is the new text with these old declarations instead.
         """
-        version = is_undone, frozenset(changes)
-        if version not in self._known:
-            keys = [self._keys[number] for number in changes]
+        mixture = is_undone, frozenset(changes)
+        if mixture not in self._known:
+            exchanged_keys = [self._keys[index] for index in changes]
             # an exchanged declaration may need others that only its own text has
-            texts = (self._exchange(keys, is_undone, is_strict) for is_strict in (True, False))
-            versions = (self._parse(text, keys, is_undone) for text in texts)
-            self._known[version] = next(
-                (specification for specification in versions if specification is not None), None
+            candidate_texts = (
+                self._exchange(exchanged_keys, is_undone, is_strict) for is_strict in (True, False)
             )
-        return self._known[version]
+            candidates = (self._parse(text, exchanged_keys, is_undone) for text in candidate_texts)
+            self._known[mixture] = next(
+                (candidate for candidate in candidates if candidate is not None), None
+            )
+        return self._known[mixture]
 
     def edited_lines(
         self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
@@ -190,8 +194,11 @@ class TextVersions:
             specs: names of each spec in the old and in the new text.
             spans: preferred places in the old and in the new text, if several lines changed.
         """
-        for names in specs:
-            statements = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
+        for spec_names in specs:
+            statements = [
+                text_statements.get(("SPEC", name))
+                for text_statements, name in zip(self._statements, spec_names, strict=True)
+            ]
             old_statement, new_statement = statements
             if (
                 old_statement is not None
@@ -201,45 +208,52 @@ class TextVersions:
                 break
         else:
             return None, None
-        old = _lines_of(self.old, old_statement.span, spans[0])
-        new = _lines_of(self.new, new_statement.span, spans[1])
-        one_words, other_words = (
-            [tuple(line.place.text.partition("#")[0].split()) for line in lines] for lines in (old, new)
+        old_lines = _lines_of(self.old, old_statement.span, spans[0])
+        new_lines = _lines_of(self.new, new_statement.span, spans[1])
+        old_words, new_words = (
+            [tuple(line.place.text.partition("#")[0].split()) for line in lines]
+            for lines in (old_lines, new_lines)
         )
         # autojunk would ignore frequent lines of long texts (https://docs.python.org/3/library/difflib.html)
-        codes = SequenceMatcher(None, one_words, other_words, autojunk=False).get_opcodes()
-        blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
+        opcodes = SequenceMatcher(None, old_words, new_words, autojunk=False).get_opcodes()
+        changed_blocks = [(old_lines[a:b], new_lines[c:d]) for tag, a, b, c, d in opcodes if tag != "equal"]
         return _edited_places(
-            max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1])))
+            max(changed_blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1])))
         )
 
-    def _exchange(self, keys: Collection[_Key], is_undone: bool, is_strict: bool) -> str:
-        base, donor = self._statements[::-1] if is_undone else self._statements
-        file, source = (self.new, self.old) if is_undone else (self.old, self.new)
-        pieces: list[tuple[Span, str]] = []
-        first = []
+    def _exchange(self, exchanged_keys: Collection[_Key], is_undone: bool, is_strict: bool) -> str:
+        base_statements, donor_statements = self._statements[::-1] if is_undone else self._statements
+        base_file, donor_file = (self.new, self.old) if is_undone else (self.old, self.new)
+        replacements: list[tuple[Span, str]] = []
+        added_texts = []
         for key in self._keys:
-            if key in base and key in donor and key in keys:
-                pieces.append((base[key].span, _text(source, donor[key].span)))
-            elif key not in base and (key in keys or not is_strict):
-                first.append(_text(source, donor[key].span))
-            elif key not in donor and key in keys and is_strict:
-                pieces.append((base[key].span, ""))
-        text = file.source
-        for span, piece in sorted(pieces, reverse=True):
-            text = text[: span.start] + piece + text[span.end :]
-        return "\n".join((*first, text))
+            if key in base_statements and key in donor_statements and key in exchanged_keys:
+                replacements.append(
+                    (base_statements[key].span, _text(donor_file, donor_statements[key].span))
+                )
+            elif key not in base_statements and (key in exchanged_keys or not is_strict):
+                added_texts.append(_text(donor_file, donor_statements[key].span))
+            elif key not in donor_statements and key in exchanged_keys and is_strict:
+                replacements.append((base_statements[key].span, ""))
+        mixed_text = base_file.source
+        for span, replacement in sorted(replacements, reverse=True):
+            mixed_text = mixed_text[: span.start] + replacement + mixed_text[span.end :]
+        return "\n".join((*added_texts, mixed_text))
 
-    def _parse(self, text: str, keys: Iterable[_Key], is_undone: bool) -> Specification | None:
-        file, donor = (self.new, self.old) if is_undone else (self.old, self.new)
-        profile = donor.profile if any(word == "USE" for word, _ in keys) else file.profile
+    def _parse(self, text: str, exchanged_keys: Iterable[_Key], is_undone: bool) -> Specification | None:
+        base_file, donor_file = (self.new, self.old) if is_undone else (self.old, self.new)
+        profile = (
+            donor_file.profile
+            if any(first_word == "USE" for first_word, _ in exchanged_keys)
+            else base_file.profile
+        )
         with suppress(SpecificationError, UsageError):
-            version = parse_specification(text, filename=file.filename, profile=profile)
-            atoms = (atom for spec in version.specs for atom in iter_atoms(spec.formula))
-            signals = {name for atom in atoms for name in signals_in(atom.expression)}
+            specification = parse_specification(text, filename=base_file.filename, profile=profile)
+            atoms = (atom for spec in specification.specs for atom in iter_atoms(spec.formula))
+            signal_names = {name for atom in atoms for name in signals_in(atom.expression)}
             # without its declaration, a constant of the other text is parsed as a signal
-            if not any(word == "CONST" and name in signals for word, name in self._keys):
-                return with_numbers(version, self._units)
+            if not any(first_word == "CONST" and name in signal_names for first_word, name in self._keys):
+                return with_numbers(specification, self._units)
         return None
 
 
@@ -250,13 +264,19 @@ class _Line(NamedTuple):
     is_wanted: bool
 
 
-def _lines_of(file: Specification, statement: Span, span: Span | None) -> list[_Line]:
-    first, last = (file.source.count("\n", 0, at) for at in (statement.start, statement.end))
-    wanted_line = -1 if span is None or span == Span(0, 0) else file.source.count("\n", 0, span.start)
+def _lines_of(file: Specification, statement_span: Span, wanted_span: Span | None) -> list[_Line]:
+    first_line, last_line = (
+        file.source.count("\n", 0, offset) for offset in (statement_span.start, statement_span.end)
+    )
+    wanted_line = (
+        -1
+        if wanted_span is None or wanted_span == Span(0, 0)
+        else file.source.count("\n", 0, wanted_span.start)
+    )
     lines = file.source.split("\n")
     return [
-        _Line(TextPlace(file.filename, number + 1, lines[number].strip()), number == wanted_line)
-        for number in range(first, last + 1)
+        _Line(TextPlace(file.filename, line_index + 1, lines[line_index].strip()), line_index == wanted_line)
+        for line_index in range(first_line, last_line + 1)
     ]
 
 
@@ -264,13 +284,13 @@ def _edited_places(
     block: tuple[Sequence[_Line], Sequence[_Line]],
 ) -> tuple[TextPlace | None, TextPlace | None]:
     """Return the preferred line of each text, or else its line at the same position in the block."""
-    wanted_lines = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
-    old, new = (
+    wanted_indices = [index for lines in block for index, line in enumerate(lines) if line.is_wanted]
+    old_place, new_place = (
         next((line.place for line in lines if line.is_wanted), None)
-        or (lines[min(next(iter(wanted_lines), 0), len(lines) - 1)].place if lines else None)
+        or (lines[min(next(iter(wanted_indices), 0), len(lines) - 1)].place if lines else None)
         for lines in block
     )
-    return old, new
+    return old_place, new_place
 
 
 def statements_of(file: Specification) -> dict[_Key, _Statement]:
@@ -278,28 +298,33 @@ def statements_of(file: Specification) -> dict[_Key, _Statement]:
     source = SourceText.of(file.source, file.filename)
     faults = Faults(source)
     statements: dict[_Key, _Statement] = {}
-    for group in split_statements(tokenize(file.source, RELATION_NAMES | file.relations, faults), faults):
-        first, last = group.tokens[0], group.tokens[-1]
-        if first.type not in (*_KINDS, "SPEC") or first is last:
+    for statement in split_statements(tokenize(file.source, RELATION_NAMES | file.relations, faults), faults):
+        first_token, last_token = statement.tokens[0], statement.tokens[-1]
+        if first_token.type not in (*_KINDS, "SPEC") or first_token is last_token:
             continue
-        span = Span(span_of(first).start, span_of(last).end)
-        place = TextPlace(file.filename, source.line_of(span.start), _on_one_line(file.source, group.tokens))
-        name = "profile" if first.type == "USE" else str(group.tokens[1].value)
-        words = tuple(f"{token.type} {token.value}" for token in group.tokens)
-        statements.setdefault((first.type, name), _Statement(span, place, words))
+        span = Span(span_of(first_token).start, span_of(last_token).end)
+        place = TextPlace(
+            file.filename, source.line_of(span.start), _on_one_line(file.source, statement.tokens)
+        )
+        name = "profile" if first_token.type == "USE" else str(statement.tokens[1].value)
+        token_words = tuple(f"{token.type} {token.value}" for token in statement.tokens)
+        statements.setdefault((first_token.type, name), _Statement(span, place, token_words))
     return statements
 
 
 def _on_one_line(source: str, tokens: Sequence[Token]) -> str:
     """Return the text of a statement without line breaks and comments."""
-    pieces: list[str] = []
-    at = span_of(tokens[0]).start
+    texts: list[str] = []
+    previous_end = span_of(tokens[0]).start
     for token in tokens:
-        start, end = span_of(token)
-        gap = source[at:start]
-        pieces += [gap if gap.isspace() and "\n" not in gap else " " * bool(gap), source[start:end]]
-        at = end
-    return "".join(pieces)
+        token_start, token_end = span_of(token)
+        gap = source[previous_end:token_start]
+        texts += [
+            gap if gap.isspace() and "\n" not in gap else " " * bool(gap),
+            source[token_start:token_end],
+        ]
+        previous_end = token_end
+    return "".join(texts)
 
 
 def _words(statements: Mapping[_Key, _Statement], key: _Key) -> tuple[str, ...] | None:
@@ -356,7 +381,7 @@ class Edit:
     new_specs: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
-        about = f" {self.subject}" if self.subject else ""
+        subject_text = f" {self.subject}" if self.subject else ""
         match self.kind:
             case "added":
                 return f"added `{self.new}`"
@@ -367,10 +392,12 @@ class Edit:
             case "renamed":
                 return f"renamed {self.old} to {self.new}"
             case "region" | "group" | "definition":
-                return f"{self.kind}{about} changed in `{self.old if self.new is None else self.new}`"
+                return f"{self.kind}{subject_text} changed in `{self.old if self.new is None else self.new}`"
         if self.old is None or self.new is None:
-            return f"{self.kind}{about}: {f'adds `{self.new}`' if self.new else f'removes `{self.old}`'}"
-        return f"{self.kind}{about}: `{self.old}` to `{self.new}`"
+            return (
+                f"{self.kind}{subject_text}: {f'adds `{self.new}`' if self.new else f'removes `{self.old}`'}"
+            )
+        return f"{self.kind}{subject_text}: `{self.old}` to `{self.new}`"
 
 
 class Origin(NamedTuple):
@@ -403,11 +430,11 @@ class Place:
     @property
     def operands(self) -> list[Place]:
         """Places of the operands of the node."""
-        places, identifier = [], self.id + 1
+        places, operand_id = [], self.id + 1
         for operand in operands_of(self.node):
-            specs = self.specs if operand.name is None else (operand.name, *self.specs)
-            places.append(Place(operand, identifier, specs, self.depth + 1))
-            identifier += _size(operand)
+            operand_specs = self.specs if operand.name is None else (operand.name, *self.specs)
+            places.append(Place(operand, operand_id, operand_specs, self.depth + 1))
+            operand_id += _size(operand)
         return places
 
     def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
@@ -416,12 +443,18 @@ class Place:
         Args:
             through_names: whether named specs are replaced by their operands, too.
         """
-        places: list[Place] = []
-        for place in self.operands:
-            inner = place.bare if through_names else place
-            is_more = operator_of(inner.node) == operator and (through_names or inner.node.name is None)
-            places += inner.members(operator, through_names=through_names) if is_more else [place]
-        return places
+        member_places: list[Place] = []
+        for operand in self.operands:
+            inner_operand = operand.bare if through_names else operand
+            has_same_operator = operator_of(inner_operand.node) == operator and (
+                through_names or inner_operand.node.name is None
+            )
+            member_places += (
+                inner_operand.members(operator, through_names=through_names)
+                if has_same_operator
+                else [operand]
+            )
+        return member_places
 
     @property
     def bare(self) -> Place:
@@ -444,13 +477,17 @@ class FoundSite(NamedTuple):
     @property
     def ids(self) -> tuple[range, range]:
         """The ids of the nodes that differ; after a change of window or name, operands are left out."""
-        is_window = self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
-        is_alone = self.kind == "renamed" or is_window
-        old, new = (
-            range(0) if place is None else range(place.id, place.id + (1 if is_alone else _size(place.node)))
+        is_window_change = (
+            self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
+        )
+        excludes_operands = self.kind == "renamed" or is_window_change
+        old_ids, new_ids = (
+            range(0)
+            if place is None
+            else range(place.id, place.id + (1 if excludes_operands else _size(place.node)))
             for place in (self.old, self.new)
         )
-        return old, new
+        return old_ids, new_ids
 
     def follows_from(self, origin: Origin) -> bool:
         """Return whether the difference depends on an edit of the texts."""
@@ -505,27 +542,27 @@ class TreeDiff:
     @property
     def effective(self) -> tuple[int, ...]:
         """The indices of the units that change the meaning of the formula; renames do not."""
-        return tuple(number for number, unit in enumerate(self.units) if unit[0].kind != "renamed")
+        return tuple(index for index, unit in enumerate(self.units) if unit[0].kind != "renamed")
 
     def formula(self, units: Collection[int]) -> Formula:
         """Return the old formula with some units of edits applied: those with the given indices."""
         sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
-        built = _build(self._merged, sites)
-        return Truth(True) if built is None else built
+        mixed_formula = _build(self._merged, sites)
+        return Truth(True) if mixed_formula is None else mixed_formula
 
 
-def _build(merged: Merged, chosen: frozenset[int]) -> Formula | None:
+def _build(merged: Merged, applied_sites: frozenset[int]) -> Formula | None:
     if isinstance(merged, Site):
-        return merged.new if merged.site in chosen else merged.old
+        return merged.new if merged.site in applied_sites else merged.old
     if not isinstance(merged, Inner):
         return merged
-    head = merged.new if merged.site in chosen else merged.old
+    operator_node = merged.new if merged.site in applied_sites else merged.old
     operands = tuple(
-        formula for operand in merged.operands if (formula := _build(operand, chosen)) is not None
+        formula for operand in merged.operands if (formula := _build(operand, applied_sites)) is not None
     )
-    if head.operator in ("and", "or") and len(operands) < 2:
-        return operands[0] if operands else Truth(head.operator == "and")
-    return replace(head, operands=operands)
+    if operator_node.operator in ("and", "or") and len(operands) < 2:
+        return operands[0] if operands else Truth(operator_node.operator == "and")
+    return replace(operator_node, operands=operands)
 
 
 def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
@@ -546,13 +583,19 @@ def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
 
 
 def _without_numbers(atom: Atom) -> Hashable:
-    texts = tuple(parameter for parameter in atom.parameters if isinstance(parameter, str))
+    text_parameters = tuple(parameter for parameter in atom.parameters if isinstance(parameter, str))
     # a signal's comparison has the parameters name, sign and limit; the limit can be a text, too
-    texts = texts[:2] if atom.relation == "signal" else texts
+    text_parameters = text_parameters[:2] if atom.relation == "signal" else text_parameters
     if atom.relation == "sum":
         zero = Number(0.0)
-        return texts, map_leaves(atom.expression, lambda leaf: zero if isinstance(leaf, Number) else leaf)
-    return texts, len(atom.parameters), tuple((type(term), format_term(base_of(term))) for term in atom.terms)
+        return text_parameters, map_leaves(
+            atom.expression, lambda leaf: zero if isinstance(leaf, Number) else leaf
+        )
+    return (
+        text_parameters,
+        len(atom.parameters),
+        tuple((type(term), format_term(base_of(term))) for term in atom.terms),
+    )
 
 
 def similarity(old: Formula, new: Formula) -> float:
@@ -594,7 +637,7 @@ def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) ->
     comparison = _Comparison(regions)
     comparison.align(Place(old, 0, ("",), 0), Place(new, 0, ("",), 0))
     sites = [site for site in comparison.sites if site.kind != "renamed"]
-    return frozenset(number for site in sites for number in site.ids[1])
+    return frozenset(node_id for site in sites for node_id in site.ids[1])
 
 
 class _Comparison:
@@ -603,9 +646,9 @@ class _Comparison:
     def __init__(
         self, regions: Mapping[str, Outline], specs: tuple[Collection[str], Collection[str]] = ((), ())
     ) -> None:
-        first: dict[Outline, str] = {}
-        shapes = {name: first.setdefault(outline, name) for name, outline in regions.items()}
-        self._alike = partial(_rename_regions, regions=shapes, without_groups=True)
+        name_by_outline: dict[Outline, str] = {}
+        first_names = {name: name_by_outline.setdefault(outline, name) for name, outline in regions.items()}
+        self._alike = partial(_rename_regions, regions=first_names, without_groups=True)
         self._specs = specs
         self._renamed: set[tuple[str | None, str | None]] = set()
         self._numbers: dict[Hashable, int] = {}
@@ -617,47 +660,56 @@ class _Comparison:
 
         Names, and the order of operands of commutative operators, do not matter.
         """
-        entry = self._known.get(id(node))
-        if entry is None:
-            entry = self._known[id(node)] = (node, self._meaning(node))
-        return entry[1]
+        cache_entry = self._known.get(id(node))
+        if cache_entry is None:
+            cache_entry = self._known[id(node)] = (node, self._meaning(node))
+        return cache_entry[1]
 
     def _meaning(self, node: Formula) -> int:
-        key: Hashable
+        meaning_key: Hashable
         match node:
             case Truth():
-                key = node.value
+                meaning_key = node.value
             case Atom():
-                key = map_leaves(node.expression, partial(changed_leaf, change=self._alike))
+                meaning_key = map_leaves(node.expression, partial(changed_leaf, change=self._alike))
             case Quantified():
                 group = self._alike(node.group)
-                key = (node.quantifier, len(node.variables), group, self.meaning(without_variables(node)))
+                meaning_key = (
+                    node.quantifier,
+                    len(node.variables),
+                    group,
+                    self.meaning(without_variables(node)),
+                )
             case Boolean(operator="spec"):
                 return self.meaning(node.operands[0])
             case Boolean(operator="and" | "or" as operator):
                 # brackets around operands of the same operator do not change the meaning
                 members = Place(node, 0, ("",), 0).members(operator, through_names=True)
-                key = (operator, tuple(sorted(self.meaning(member.node) for member in members)))
+                meaning_key = (operator, tuple(sorted(self.meaning(member.node) for member in members)))
             case Boolean(operator="xor" | "<->"):
-                key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
+                meaning_key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
             case Boolean():
-                key = (node.operator, tuple(map(self.meaning, node.operands)))
+                meaning_key = (node.operator, tuple(map(self.meaning, node.operands)))
             case Temporal():
-                key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
-        return self._numbers.setdefault(key, len(self._numbers))
+                meaning_key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
+        return self._numbers.setdefault(meaning_key, len(self._numbers))
 
     def align(self, old: Place, new: Place) -> Merged:
         """Compare two corresponding nodes."""
-        names = old.node.name, new.node.name
-        is_renamed = names[0] != names[1] and None not in names
-        is_equal = self.meaning(old.node) == self.meaning(new.node)
-        if is_renamed and not is_equal and (names[0] in self._specs[1] or names[1] in self._specs[0]):
+        spec_names = old.node.name, new.node.name
+        is_renamed = spec_names[0] != spec_names[1] and None not in spec_names
+        has_equal_meaning = self.meaning(old.node) == self.meaning(new.node)
+        if (
+            is_renamed
+            and not has_equal_meaning
+            and (spec_names[0] in self._specs[1] or spec_names[1] in self._specs[0])
+        ):
             # the reference changed to another spec; neither spec was edited
             return self._site(FoundSite("replaced", old, new))
         if is_renamed:
-            self._renamed.add(names)
+            self._renamed.add(spec_names)
             self.sites.append(FoundSite("renamed", old, new))
-        if is_equal:
+        if has_equal_meaning:
             self._align_names(old, new)
             return new.node
         old, new = old.bare, new.bare
@@ -674,70 +726,78 @@ class _Comparison:
             case Boolean(), Boolean() if old.node.operator == new.node.operator:
                 return Inner(None, old.node, new.node, self._pairwise(old, new))
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
-                site = None
+                window_site = None
                 if old.node.bound != new.node.bound:
-                    site = self._site(FoundSite("constant", old, new)).site
-                return Inner(site, old.node, new.node, self._pairwise(old, new))
+                    window_site = self._site(FoundSite("constant", old, new)).site
+                return Inner(window_site, old.node, new.node, self._pairwise(old, new))
             case Quantified(), Quantified() if _ranges_alike(old.node, new.node):
-                kind, subject = kind_of(old.node, new.node)
-                return self._site(FoundSite(kind, old, new, subject, self._parts(old, new)))
-        kind, subject = kind_of(old.node, new.node)
-        return self._site(FoundSite(kind, old, new, subject))
+                edit_kind, subject = kind_of(old.node, new.node)
+                return self._site(FoundSite(edit_kind, old, new, subject, self._parts(old, new)))
+        edit_kind, subject = kind_of(old.node, new.node)
+        return self._site(FoundSite(edit_kind, old, new, subject))
 
     def _parts(self, old: Place, new: Place) -> tuple[FoundSite, ...]:
         """Return the differences of two quantifiers' bodies, each of which is evaluated as one node."""
-        count = len(self.sites)
+        site_count = len(self.sites)
         bodies = [
             Place(place.node.body, place.id, place.specs, place.depth + 1)
             for place in (old, new)
             if isinstance(place.node, Quantified)
         ]
         self.align(bodies[0], bodies[1])
-        inner, self.sites = self.sites[count:], self.sites[:count]
+        body_sites, self.sites = self.sites[site_count:], self.sites[:site_count]
 
-        def inside(place: Place | None, whole: Place) -> Place | None:
-            return None if place is None else replace(place, id=whole.id)
+        def inside(place: Place | None, quantifier_place: Place) -> Place | None:
+            return None if place is None else replace(place, id=quantifier_place.id)
 
-        parts = chain(*(site.parts or (site,) for site in inner))
-        return tuple(site._replace(old=inside(site.old, old), new=inside(site.new, new)) for site in parts)
+        flat_sites = chain(*(site.parts or (site,) for site in body_sites))
+        return tuple(
+            site._replace(old=inside(site.old, old), new=inside(site.new, new)) for site in flat_sites
+        )
 
     def join_sites(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
         """Join the sites of each edit, and return the edits."""
-        declared = [origin for origin in origins if origin.change is not None]
-        shared: list[tuple[set[int], list[int]]] = []
-        rest: list[int] = []
-        for number, site in enumerate(self.sites):
-            followed = {index for index, origin in enumerate(declared) if site.follows_from(origin)}
-            if not followed:
-                rest.append(number)
+        declaration_origins = [origin for origin in origins if origin.change is not None]
+        declaration_units: list[tuple[set[int], list[int]]] = []
+        other_sites: list[int] = []
+        for site_index, site in enumerate(self.sites):
+            origin_indices = {
+                index for index, origin in enumerate(declaration_origins) if site.follows_from(origin)
+            }
+            if not origin_indices:
+                other_sites.append(site_index)
                 continue
             # declarations that share a node form one unit
-            joined = [unit for unit in shared if unit[0] & followed]
-            shared = [unit for unit in shared if not unit[0] & followed]
-            shared.append(
+            overlapping_units = [unit for unit in declaration_units if unit[0] & origin_indices]
+            declaration_units = [unit for unit in declaration_units if not unit[0] & origin_indices]
+            declaration_units.append(
                 (
-                    followed.union(*(unit[0] for unit in joined)),
-                    [*chain(*(unit[1] for unit in joined)), number],
+                    origin_indices.union(*(unit[0] for unit in overlapping_units)),
+                    [*chain(*(unit[1] for unit in overlapping_units)), site_index],
                 )
             )
-        units = [(min(sites), sites, sorted(followed)) for followed, sites in shared]
-        joined_rest = self._join([self.sites[number] for number in rest])
-        units += [(rest[sites[0]], [rest[number] for number in sites], []) for sites in joined_rest]
+        units = [(min(sites), sites, sorted(origin_indices)) for origin_indices, sites in declaration_units]
+        groups = self._join([self.sites[site_index] for site_index in other_sites])
+        units += [
+            (other_sites[sites[0]], [other_sites[site_index] for site_index in sites], []) for sites in groups
+        ]
         units.sort()
-        numbers = {site: unit for unit, (_, sites, _) in enumerate(units) for site in sites}
-        text = [origin for origin in origins if origin.change is None]
+        unit_of_site = {site: unit for unit, (_, sites, _) in enumerate(units) for site in sites}
+        text_origins = [origin for origin in origins if origin.change is None]
         return TreeDiff(
             tuple(
-                tuple(self._unit(sites, [declared[index] for index in followed], text))
-                for _, sites, followed in units
+                tuple(
+                    self._unit(sites, [declaration_origins[index] for index in origin_indices], text_origins)
+                )
+                for _, sites, origin_indices in units
             ),
             merged,
-            numbers,
+            unit_of_site,
         )
 
     def _join(self, sites: Sequence[FoundSite]) -> Iterable[list[int]]:
         """Return the indices of sites, grouped by the edit of the specs' text that they depend on."""
-        removed, added = (
+        removed_meanings, added_meanings = (
             {
                 self.meaning(place.node)
                 for site in sites
@@ -746,64 +806,73 @@ class _Comparison:
             }
             for kind in ("removed", "added")
         )
-        joined: dict[Hashable, list[int]] = {}
-        for number, site in enumerate(sites):
+        sites_by_edit: dict[Hashable, list[int]] = {}
+        for site_index, site in enumerate(sites):
             places = site.old, site.new
             meanings = [None if place is None else self.meaning(place.node) for place in places]
             known_meanings = {meaning for meaning in meanings if meaning is not None}
             spans = tuple(None if place is None else place.node.span for place in places)
             specs = self._specs_of(site.old, site.new)[:1]
-            key: Hashable = ("place", site.kind == "renamed", specs, *spans)
-            if site.kind in ("added", "removed") and known_meanings <= removed & added:
-                key = ("moved", *known_meanings)
+            edit_key: Hashable = ("place", site.kind == "renamed", specs, *spans)
+            if site.kind in ("added", "removed") and known_meanings <= removed_meanings & added_meanings:
+                edit_key = ("moved", *known_meanings)
             elif Span(0, 0) in spans:
-                key = (site.kind, specs, *(_place_text(place, site.kind) for place in places), *meanings)
-            joined.setdefault(key, []).append(number)
-        return joined.values()
+                edit_key = (site.kind, specs, *(_place_text(place, site.kind) for place in places), *meanings)
+            sites_by_edit.setdefault(edit_key, []).append(site_index)
+        return sites_by_edit.values()
 
     def _specs_of(self, old: Place | None, new: Place | None) -> tuple[tuple[str, str], ...]:
         """Return the specs whose text contains both places, innermost first, by old and new name."""
         if old is None or new is None:
             return tuple((name, name) for place in (old, new) if place is not None for name in place.around)
-        pairs = [(old_name, new_name) for new_name in new.specs for old_name in old.specs]
-        return tuple(pair for pair in pairs if pair[0] == pair[1] or pair in self._renamed)
+        name_pairs = [(old_name, new_name) for new_name in new.specs for old_name in old.specs]
+        return tuple(
+            name_pair
+            for name_pair in name_pairs
+            if name_pair[0] == name_pair[1] or name_pair in self._renamed
+        )
 
     def _unit(
-        self, sites: Sequence[int], declared: Sequence[Origin], text: Sequence[Origin]
+        self,
+        site_indices: Sequence[int],
+        declaration_origins: Sequence[Origin],
+        text_origins: Sequence[Origin],
     ) -> Iterator[Edit]:
         """Yield the edits of a unit: first those of declarations, then those of the specs' text."""
-        unit_sites = [self.sites[site] for site in sites]
-        for origin in declared:
+        unit_sites = [self.sites[site] for site in site_indices]
+        for origin in declaration_origins:
             if origin.change is not None:
                 edit = self._edit([site for site in unit_sites if site.follows_from(origin)])
                 yield replace(edit, kind=origin.change.kind, subject=origin.change.name, change=origin.change)
-        if declared:
-            text_sites = [site for site in unit_sites if any(site.follows_from(origin) for origin in text)]
+        if declaration_origins:
+            text_sites = [
+                site for site in unit_sites if any(site.follows_from(origin) for origin in text_origins)
+            ]
         else:
             text_sites = list(chain(*(site.parts or (site,) for site in unit_sites)))
-        for numbers in self._join(text_sites):
-            yield self._edit([text_sites[number] for number in numbers])
+        for edit_indices in self._join(text_sites):
+            yield self._edit([text_sites[index] for index in edit_indices])
 
     def _edit(self, sites: Sequence[FoundSite]) -> Edit:
-        olds = [site.old for site in sites if site.old is not None]
-        news = [site.new for site in sites if site.new is not None]
+        old_places = [site.old for site in sites if site.old is not None]
+        new_places = [site.new for site in sites if site.new is not None]
         kinds = {site.kind for site in sites}
         kind: EditKind = "moved" if kinds == {"added", "removed"} else sites[0].kind
-        first_old, first_new = next(iter(olds), None), next(iter(news), None)
+        first_old_place, first_new_place = next(iter(old_places), None), next(iter(new_places), None)
         if kind == "moved":
-            specs = self._specs_of(first_old, None), self._specs_of(None, first_new)
+            specs = self._specs_of(first_old_place, None), self._specs_of(None, first_new_place)
         else:
-            specs = (self._specs_of(first_old, first_new),) * 2
+            specs = (self._specs_of(first_old_place, first_new_place),) * 2
         return Edit(
             kind,
             specs[1][0][1],
-            _place_text(first_old, kind),
-            _place_text(first_new, kind),
-            tuple(dict.fromkeys(place.id for place in olds)),
-            tuple(dict.fromkeys(place.id for place in news)),
-            None if first_old is None else first_old.node.span,
-            None if first_new is None else first_new.node.span,
-            max(place.depth for place in (*olds, *news)),
+            _place_text(first_old_place, kind),
+            _place_text(first_new_place, kind),
+            tuple(dict.fromkeys(place.id for place in old_places)),
+            tuple(dict.fromkeys(place.id for place in new_places)),
+            None if first_old_place is None else first_old_place.node.span,
+            None if first_new_place is None else first_new_place.node.span,
+            max(place.depth for place in (*old_places, *new_places)),
             sites[0].subject,
             old_specs=specs[0],
             new_specs=specs[1],
@@ -831,42 +900,50 @@ class _Comparison:
     def _is_among(self, place: Place, operands: Sequence[Place]) -> bool:
         return any(self.meaning(place.node) == self.meaning(operand.node) for operand in operands)
 
-    def _match(self, old_node: Any, olds: Sequence[Place], new_node: Any, news: Sequence[Place]) -> Inner:
+    def _match(
+        self, old_node: Any, old_places: Sequence[Place], new_node: Any, new_places: Sequence[Place]
+    ) -> Inner:
         """Match the operands of a conjunction or disjunction: by meaning, then by name, then similar ones."""
-        partner: dict[int, int] = {}
+        partner_indices: dict[int, int] = {}
         matched_indices: set[int] = set()
 
         def match(fits: Any) -> None:
-            for number, new in enumerate(news):
-                for index, old in enumerate(olds if number not in partner else ()):
-                    if index not in matched_indices and fits(old, new):
-                        partner[number] = index
-                        matched_indices.add(index)
+            for new_index, new in enumerate(new_places):
+                for old_index, old in enumerate(old_places if new_index not in partner_indices else ()):
+                    if old_index not in matched_indices and fits(old, new):
+                        partner_indices[new_index] = old_index
+                        matched_indices.add(old_index)
                         break
 
         match(lambda old, new: self.meaning(old.node) == self.meaning(new.node))
         match(lambda old, new: old.node.name is not None and old.node.name == new.node.name)
         # the most similar pairs first, so that they get each other as partners
-        for least in (1.0, 0.5, 0.01):
-            match(lambda old, new, least=least: _is_alike(old, new, least, by_operator=True))
+        for least_similarity in (1.0, 0.5, 0.01):
+            match(
+                lambda old, new, least_similarity=least_similarity: _is_alike(
+                    old, new, least_similarity, by_operator=True
+                )
+            )
         match(lambda old, new: _is_alike(old, new, 0.5, by_operator=False))
         operands: list[Merged] = [
-            self.align(olds[partner[number]], new)
-            if number in partner
+            self.align(old_places[partner_indices[new_index]], new)
+            if new_index in partner_indices
             else self._site(FoundSite("added", None, new))
-            for number, new in enumerate(news)
+            for new_index, new in enumerate(new_places)
         ]
-        left = [old for index, old in enumerate(olds) if index not in matched_indices]
-        operands += [self._site(FoundSite("removed", old, None)) for old in left]
+        unmatched_places = [
+            old for old_index, old in enumerate(old_places) if old_index not in matched_indices
+        ]
+        operands += [self._site(FoundSite("removed", old, None)) for old in unmatched_places]
         return Inner(None, old_node, new_node, tuple(operands))
 
 
-def _is_alike(old: Place, new: Place, least: float, *, by_operator: bool) -> bool:
+def _is_alike(old: Place, new: Place, least_similarity: float, *, by_operator: bool) -> bool:
     """Return whether two nodes are similar enough, and on request whether they have the same operator."""
     old_node, new_node = old.bare.node, new.bare.node
     return (not by_operator or operator_of(old_node) == operator_of(new_node)) and similarity(
         old_node, new_node
-    ) >= least
+    ) >= least_similarity
 
 
 def _ranges_alike(old: Quantified, new: Quantified) -> bool:

@@ -112,12 +112,12 @@ def align_runs(
     Raises:
         UsageError: an unknown spec, a spec that never changes its sign, or no result with an automaton.
     """
-    a, b = times_ns
+    a_ns, b_ns = times_ns
     if align == "time":
-        return _alignment("time", None, [Knot(*zeros_ns)], a, b)
-    kind, colon, name = align.partition(":")
-    if kind != "progress" or (colon and not name):
-        return _alignment("event", align, [_event(results, align)], a, b)
+        return _alignment("time", None, [Knot(*zeros_ns)], a_ns, b_ns)
+    method, separator, name = align.partition(":")
+    if method != "progress" or (separator and not name):
+        return _alignment("event", align, [_event(results, align)], a_ns, b_ns)
     if name:
         results = _find_pairs(results, name)
     candidates: list[tuple[str, list[Knot]]] = []
@@ -126,12 +126,13 @@ def align_runs(
         paths = [_path(result, files) for result in (result_a, result_b)]
         if paths[0] is None or paths[1] is None:
             continue
-        common = _common(paths[0], paths[1])
+        common_count = _common(paths[0], paths[1])
         knots = [
-            Knot(x.time_ns, y.time_ns) for x, y in zip(paths[0][:common], paths[1][:common], strict=True)
+            Knot(visit_a.time_ns, visit_b.time_ns)
+            for visit_a, visit_b in zip(paths[0][:common_count], paths[1][:common_count], strict=True)
         ]
-        if common == len(paths[0]) == len(paths[1]):
-            knots.append(Knot(int(a[-1]), int(b[-1])))
+        if common_count == len(paths[0]) == len(paths[1]):
+            knots.append(Knot(int(a_ns[-1]), int(b_ns[-1])))
         candidates.append((result_a.title, knots))
     if not candidates:
         raise UsageError(
@@ -140,22 +141,22 @@ def align_runs(
         )
     # the most knots win: the automaton of a formula without temporal operators gives hardly any
     name, knots = max(candidates, key=lambda candidate: len(candidate[1]))
-    return _alignment("progress", name, knots, a, b)
+    return _alignment("progress", name, knots, a_ns, b_ns)
 
 
 def _find_pairs(
-    results: Sequence[tuple[SpecResult, SpecResult]], wanted: str
+    results: Sequence[tuple[SpecResult, SpecResult]], wanted_name: str
 ) -> list[tuple[SpecResult, SpecResult]]:
     """Return the pairs of results with a name or title.
 
     Raises:
         UsageError: no result has the name.
     """
-    pairs = [pair for pair in results if wanted in (pair[0].title, pair[0].name)]
+    pairs = [pair for pair in results if wanted_name in (pair[0].title, pair[0].name)]
     if not pairs:
         titles = [result.title for result, _ in results]
-        hint = nearest_hint(wanted, titles) or f"there are {', '.join(titles) or 'none'}"
-        raise UsageError(f"no result is named {wanted!r}, so its progress cannot align the runs; {hint}")
+        hint = nearest_hint(wanted_name, titles) or f"there are {', '.join(titles) or 'none'}"
+        raise UsageError(f"no result is named {wanted_name!r}, so its progress cannot align the runs; {hint}")
     return pairs
 
 
@@ -164,15 +165,17 @@ def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification
     paths = [_path(result, files) for result in (one, other)]
     if paths[0] is None or paths[1] is None or paths[0] == paths[1]:
         return None
-    common = _common(paths[0], paths[1])
-    one_end, other_end = (path[common] if common < len(path) else None for path in (paths[0], paths[1]))
-    if one_end is None and other_end is None:
+    common_count = _common(paths[0], paths[1])
+    one_visit, other_visit = (
+        path[common_count] if common_count < len(path) else None for path in (paths[0], paths[1])
+    )
+    if one_visit is None and other_visit is None:
         return None
     return Parting(
-        None if one_end is None else one_end.time_ns,
-        None if other_end is None else other_end.time_ns,
-        () if one_end is None else one_end.states,
-        () if other_end is None else other_end.states,
+        None if one_visit is None else one_visit.time_ns,
+        None if other_visit is None else other_visit.time_ns,
+        () if one_visit is None else one_visit.states,
+        () if other_visit is None else other_visit.states,
     )
 
 
@@ -180,33 +183,42 @@ def _alignment(
     kind: AlignmentKind, about: str | None, knots: Sequence[Knot], a_ns: Integers, b_ns: Integers
 ) -> Alignment:
     # interpolation needs times that increase in both runs
-    increasing = [knots[0]]
+    increasing_knots = [knots[0]]
     for knot in knots[1:]:
-        if knot.a_ns > increasing[-1].a_ns and knot.b_ns > increasing[-1].b_ns:
-            increasing.append(knot)
-    beside_ns = _times_beside(a_ns, increasing)
-    after = np.clip(np.searchsorted(b_ns, beside_ns), 1, max(len(b_ns) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(b_ns) - 1)
-    nearest = np.where(beside_ns - b_ns[before] <= b_ns[after] - beside_ns, before, after)
+        if knot.a_ns > increasing_knots[-1].a_ns and knot.b_ns > increasing_knots[-1].b_ns:
+            increasing_knots.append(knot)
+    counterpart_ns = _times_beside(a_ns, increasing_knots)
+    after_index = np.clip(np.searchsorted(b_ns, counterpart_ns), 1, max(len(b_ns) - 1, 1))
+    before_index = after_index - 1
+    after_index = np.minimum(after_index, len(b_ns) - 1)
+    nearest_index = np.where(
+        counterpart_ns - b_ns[before_index] <= b_ns[after_index] - counterpart_ns, before_index, after_index
+    )
     # a sample of A has no counterpart if B has no sample within one step
-    steps = [int(np.median(np.diff(times_ns))) for times_ns in (a_ns, b_ns) if len(times_ns) > 1]
-    step_ns = max(steps, default=0)
-    is_beyond = (beside_ns < b_ns[0]) | (beside_ns > b_ns[-1])
-    is_near = np.abs(b_ns[nearest] - beside_ns) <= np.where(is_beyond, step_ns // 2, step_ns)
-    inside = np.flatnonzero(is_near)
-    return Alignment(kind, about, tuple(increasing), inside, nearest[inside])
+    median_steps_ns = [int(np.median(np.diff(times_ns))) for times_ns in (a_ns, b_ns) if len(times_ns) > 1]
+    longest_step_ns = max(median_steps_ns, default=0)
+    is_outside_b = (counterpart_ns < b_ns[0]) | (counterpart_ns > b_ns[-1])
+    is_near = np.abs(b_ns[nearest_index] - counterpart_ns) <= np.where(
+        is_outside_b, longest_step_ns // 2, longest_step_ns
+    )
+    paired_samples = np.flatnonzero(is_near)
+    return Alignment(kind, about, tuple(increasing_knots), paired_samples, nearest_index[paired_samples])
 
 
 def _times_beside(a_ns: Integers, knots: Sequence[Knot]) -> Integers:
     """Return the times in B that correspond to times in A."""
-    first, last = knots[0], knots[-1]
+    first_knot, last_knot = knots[0], knots[-1]
     # relative to the first knot, because floats are exact only up to 2**53 ns (104 days)
-    x = np.array([knot.a_ns - first.a_ns for knot in knots], np.float64)
-    y = np.array([knot.b_ns - first.b_ns for knot in knots], np.float64)
-    inner = np.round(np.interp((a_ns - first.a_ns).astype(np.float64), x, y)).astype(np.int64) + first.b_ns
-    inner = np.where(a_ns < first.a_ns, a_ns - first.a_ns + first.b_ns, inner)
-    return np.asarray(np.where(a_ns > last.a_ns, a_ns - last.a_ns + last.b_ns, inner), np.int64)
+    a_offsets_ns = np.array([knot.a_ns - first_knot.a_ns for knot in knots], np.float64)
+    b_offsets_ns = np.array([knot.b_ns - first_knot.b_ns for knot in knots], np.float64)
+    b_ns = (
+        np.round(np.interp((a_ns - first_knot.a_ns).astype(np.float64), a_offsets_ns, b_offsets_ns)).astype(
+            np.int64
+        )
+        + first_knot.b_ns
+    )
+    b_ns = np.where(a_ns < first_knot.a_ns, a_ns - first_knot.a_ns + first_knot.b_ns, b_ns)
+    return np.asarray(np.where(a_ns > last_knot.a_ns, a_ns - last_knot.a_ns + last_knot.b_ns, b_ns), np.int64)
 
 
 def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
@@ -215,33 +227,38 @@ def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
     Raises:
         UsageError: an unknown spec, or a spec that never changes its sign.
     """
-    names: list[str] = []
+    spec_names: list[str] = []
     for result_a, result_b in results:
-        names += [node.name for node in result_a.nodes if node.name is not None]
-        if name not in names:
+        spec_names += [node.name for node in result_a.nodes if node.name is not None]
+        if name not in spec_names:
             continue
         # `value` of a spec without temporal operators is constant, so `now` is used if it never changes
-        pairs = [
-            [_first_change(result.times_ns, series(result.node(name))) for result in (result_a, result_b)]
-            for series in (attrgetter("value"), attrgetter("now"))
+        time_pairs = [
+            [
+                _first_change(result.times_ns, read_series(result.node(name)))
+                for result in (result_a, result_b)
+            ]
+            for read_series in (attrgetter("value"), attrgetter("now"))
         ]
-        times = next((pair for pair in pairs if None not in pair), pairs[0])
-        for which, time_ns in zip("AB", times, strict=True):
+        change_times_ns = next(
+            (time_pair for time_pair in time_pairs if None not in time_pair), time_pairs[0]
+        )
+        for run, time_ns in zip("AB", change_times_ns, strict=True):
             if time_ns is None:
                 raise UsageError(
-                    f"{name} never changes its sign in run {which}, so it is no event to align by; "
+                    f"{name} never changes its sign in run {run}, so it is no event to align by; "
                     "align by time, or by another spec"
                 )
-        return Knot(*(time_ns for time_ns in times if time_ns is not None))
-    remedy = nearest_hint(name, names) or f"there are {', '.join(dict.fromkeys(names)) or 'none'}"
-    raise UsageError(f"no spec is named {name!r} to align by; {remedy}; or give time or progress")
+        return Knot(*(time_ns for time_ns in change_times_ns if time_ns is not None))
+    hint = nearest_hint(name, spec_names) or f"there are {', '.join(dict.fromkeys(spec_names)) or 'none'}"
+    raise UsageError(f"no spec is named {name!r} to align by; {hint}; or give time or progress")
 
 
 def _first_change(times_ns: Integers, values: Floats) -> int | None:
-    known_places = np.flatnonzero(~np.isnan(values))
-    holds = values[known_places] >= 0.0
-    turned = np.flatnonzero(holds != holds[0]) if len(known_places) else known_places
-    return int(times_ns[known_places[turned[0]]]) if len(turned) else None
+    known_samples = np.flatnonzero(~np.isnan(values))
+    holds = values[known_samples] >= 0.0
+    change_indices = np.flatnonzero(holds != holds[0]) if len(known_samples) else known_samples
+    return int(times_ns[known_samples[change_indices[0]]]) if len(change_indices) else None
 
 
 class _Visit(NamedTuple):
@@ -259,35 +276,41 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
     if file is None:
         return None
     try:
-        _, after = states_of_result(result, file)
+        _, states_after = states_of_result(result, file)
     except NoAutomatonError:
         return None
-    changed = after[1:] != after[:-1]
-    entered = [0, *(np.flatnonzero(changed if after.ndim == 1 else changed.any(axis=1)) + 1).tolist()]
+    is_changed = states_after[1:] != states_after[:-1]
+    entry_samples = [
+        0,
+        *(np.flatnonzero(is_changed if states_after.ndim == 1 else is_changed.any(axis=1)) + 1).tolist(),
+    ]
     return [
         _Visit(
-            int(result.times_ns[at]),
-            tuple(np.flatnonzero(after[at]).tolist()) if after.ndim > 1 else (int(after[at]),),
+            int(result.times_ns[sample]),
+            tuple(np.flatnonzero(states_after[sample]).tolist())
+            if states_after.ndim > 1
+            else (int(states_after[sample]),),
         )
-        for at in entered
+        for sample in entry_samples
     ]
 
 
 def file_of(files: Sequence[Specification], result: SpecResult) -> Specification | None:
     """Return the specification of a result; None if it is not in `files`."""
-    as_evaluated = [with_numbers(file, result.evidence.units) for file in files]
-    pairs = [(file, spec.formula) for file in as_evaluated for spec in file.specs]
-    same = (file for file, formula in pairs if formula is result.formula)
+    evaluated_files = [with_numbers(file, result.evidence.units) for file in files]
+    file_formulas = [(file, spec.formula) for file in evaluated_files for spec in file.specs]
+    identical_files = (file for file, formula in file_formulas if formula is result.formula)
     # an equal formula counts, too: a specification of another profile is parsed again in its logged form
-    equal = (file for file, formula in pairs if formula == result.formula)
-    return next(same, None) or next(equal, None)
+    equal_files = (file for file, formula in file_formulas if formula == result.formula)
+    return next(identical_files, None) or next(equal_files, None)
 
 
 def _common(one: Sequence[_Visit], other: Sequence[_Visit]) -> int:
     """Return the number of common states at the beginning of two paths."""
-    pairs = zip(one, other, strict=False)
+    visit_pairs = zip(one, other, strict=False)
     return next(
-        (index for index, (a, b) in enumerate(pairs) if a.states != b.states), min(len(one), len(other))
+        (index for index, (visit_a, visit_b) in enumerate(visit_pairs) if visit_a.states != visit_b.states),
+        min(len(one), len(other)),
     )
 
 
@@ -347,24 +370,26 @@ def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDif
     diffs = []
     for name in sorted(set(a.signals) & set(b.signals)):
         values_a, values_b = a.signals[name][alignment.a], b.signals[name][alignment.b]
-        differs = (values_a != values_b) & ~(np.isnan(values_a) & np.isnan(values_b))
-        if not differs.any():
+        is_different = (values_a != values_b) & ~(np.isnan(values_a) & np.isnan(values_b))
+        if not is_different.any():
             continue
         # two texts have no numeric difference
-        numeric = np.flatnonzero((values_a > TEXTS) & (values_b > TEXTS))
-        apart = np.abs(values_b - values_a)
-        farthest = int(numeric[apart[numeric].argmax()]) if len(numeric) else None
-        sizes = [
-            float(np.median(np.abs(values[numeric]))) if len(numeric) else 0.0
+        numeric_samples = np.flatnonzero((values_a > TEXTS) & (values_b > TEXTS))
+        differences = np.abs(values_b - values_a)
+        greatest_sample = (
+            int(numeric_samples[differences[numeric_samples].argmax()]) if len(numeric_samples) else None
+        )
+        magnitudes = [
+            float(np.median(np.abs(values[numeric_samples]))) if len(numeric_samples) else 0.0
             for values in (values_a, values_b)
         ]
         diffs.append(
             SignalDiff(
                 name,
-                int(times_ns[differs.argmax()]),
-                np.nan if farthest is None else float(apart[farthest]),
-                int(times_ns[differs.argmax() if farthest is None else farthest]),
-                sizes[1] / sizes[0] if min(sizes) > 0.0 else np.nan,
+                int(times_ns[is_different.argmax()]),
+                np.nan if greatest_sample is None else float(differences[greatest_sample]),
+                int(times_ns[is_different.argmax() if greatest_sample is None else greatest_sample]),
+                magnitudes[1] / magnitudes[0] if min(magnitudes) > 0.0 else np.nan,
             )
         )
     return tuple(diffs)
@@ -376,8 +401,8 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     Raises:
         UsageError: the runs have no common object, or different units.
     """
-    names = sorted(set(a.names) & set(b.names))
-    if not names and (a.names or b.names):
+    common_names = sorted(set(a.names) & set(b.names))
+    if not common_names and (a.names or b.names):
         raise UsageError(
             f"the runs have no object in common: A has {listing(a.names) or 'none'}; "
             f"B has {listing(b.names) or 'none'}. "
@@ -386,47 +411,49 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     require_same_units(a, b)
     # (P, K) observations
     rows_a, rows_b = (
-        trace.rows[rows][:, [trace.names.index(name) for name in names]]
-        for trace, rows in ((a, alignment.a), (b, alignment.b))
+        trace.rows[samples][:, [trace.names.index(name) for name in common_names]]
+        for trace, samples in ((a, alignment.a), (b, alignment.b))
     )
-    in_both = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
-    moved, shift, distances = (
+    common_observations = np.flatnonzero((rows_a >= 0) & (rows_b >= 0))
+    is_moved, squared_shifts, distances = (
         np.zeros(rows_a.shape, np.bool_),
         np.zeros(rows_a.shape),
         np.full(rows_a.shape, np.nan),
     )
-    for start in range(0, len(in_both), _PAIRS_AT_ONCE):
-        places = in_both[start : start + _PAIRS_AT_ONCE]
-        differences = _object_diff(a, rows_a.flat[places], b, rows_b.flat[places])
-        for values, part in zip((moved, shift, distances), differences, strict=True):
-            values.flat[places] = part
+    for batch_start in range(0, len(common_observations), _PAIRS_AT_ONCE):
+        batch_indices = common_observations[batch_start : batch_start + _PAIRS_AT_ONCE]
+        batch_results = _object_diff(a, rows_a.flat[batch_indices], b, rows_b.flat[batch_indices])
+        for quantities, batch_quantities in zip(
+            (is_moved, squared_shifts, distances), batch_results, strict=True
+        ):
+            quantities.flat[batch_indices] = batch_quantities
     times_ns = a.times_ns[alignment.a]
-    only = (rows_a >= 0) & (rows_b < 0), (rows_b >= 0) & (rows_a < 0)
+    is_only_in = (rows_a >= 0) & (rows_b < 0), (rows_b >= 0) & (rows_a < 0)
     diffs = []
-    for number, name in enumerate(names):
-        only_a, only_b = (absent[:, number] for absent in only)
-        differs = moved[:, number] | only_a | only_b
-        if not differs.any():
+    for column, name in enumerate(common_names):
+        is_only_in_a, is_only_in_b = (is_unpaired[:, column] for is_unpaired in is_only_in)
+        is_different = is_moved[:, column] | is_only_in_a | is_only_in_b
+        if not is_different.any():
             continue
-        distance = distances[:, number]
-        apart = np.flatnonzero(distance > 0.0)
-        farthest = None if np.isnan(distance).all() else int(np.nanargmax(distance))
+        object_distances = distances[:, column]
+        apart_samples = np.flatnonzero(object_distances > 0.0)
+        farthest_sample = None if np.isnan(object_distances).all() else int(np.nanargmax(object_distances))
         diffs.append(
             ObjectDiff(
                 name,
-                int(times_ns[differs.argmax()]),
-                int(times_ns[apart[0]]) if len(apart) else None,
-                np.nan if farthest is None else float(distance[farthest]),
-                int(times_ns[differs.argmax() if farthest is None else farthest]),
-                float(np.sqrt(shift[:, number].max())),
-                int(np.count_nonzero(only_a)),
-                int(np.count_nonzero(only_b)),
+                int(times_ns[is_different.argmax()]),
+                int(times_ns[apart_samples[0]]) if len(apart_samples) else None,
+                np.nan if farthest_sample is None else float(object_distances[farthest_sample]),
+                int(times_ns[is_different.argmax() if farthest_sample is None else farthest_sample]),
+                float(np.sqrt(squared_shifts[:, column].max())),
+                int(np.count_nonzero(is_only_in_a)),
+                int(np.count_nonzero(is_only_in_b)),
             )
         )
-    never = int(a.times_ns[-1]) + 1
+    never_ns = int(a.times_ns[-1]) + 1
     diffs.sort(
         key=lambda diff: (
-            never if diff.apart_ns is None else diff.apart_ns,
+            never_ns if diff.apart_ns is None else diff.apart_ns,
             -diff.greatest_shift,
             diff.first_ns,
             diff.name,
@@ -442,72 +469,84 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
         For each pair: whether it differs, the squared displacement of the mean of the vertices, and the
         signed distance of the footprints, which is NaN without a difference.
     """
-    first, second = a.footprints.select(a_rows), b.footprints.select(b_rows)
-    moved = ~_are_equal(first, second)
-    columns = [(first.bottom, second.bottom), (first.top, second.top)]
-    columns += [(a.yaw[a_rows], b.yaw[b_rows]), (a.uncertainty[a_rows], b.uncertainty[b_rows])]
-    for value, beside in columns:
+    footprints_a, footprints_b = a.footprints.select(a_rows), b.footprints.select(b_rows)
+    is_moved = ~_are_equal(footprints_a, footprints_b)
+    property_pairs = [(footprints_a.bottom, footprints_b.bottom), (footprints_a.top, footprints_b.top)]
+    property_pairs += [(a.yaw[a_rows], b.yaw[b_rows]), (a.uncertainty[a_rows], b.uncertainty[b_rows])]
+    for property_a, property_b in property_pairs:
         # NaN on both sides is no difference
-        moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
+        is_moved |= (property_a != property_b) & ~(np.isnan(property_a) & np.isnan(property_b))
     # relative to one vertex, because means of coordinates far from the origin lose digits when subtracted
-    corner = first.vertices[first.vertex_start[first.part_start[:-1]]]
-    x, y = _mean_vertices(second, corner) - _mean_vertices(first, corner)
-    distance = np.full(len(a_rows), np.nan)
-    operands = [Operand(np.flatnonzero(moved)[:, None] + start) for start in (0, len(a_rows))]
-    both = FootprintBatch.concatenate([first, second])
-    distance[moved] = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
-    return moved, x * x + y * y, distance
+    first_vertices = footprints_a.vertices[footprints_a.vertex_start[footprints_a.part_start[:-1]]]
+    shift_x, shift_y = _mean_vertices(footprints_b, first_vertices) - _mean_vertices(
+        footprints_a, first_vertices
+    )
+    distances = np.full(len(a_rows), np.nan)
+    operands = [Operand(np.flatnonzero(is_moved)[:, None] + first_row) for first_row in (0, len(a_rows))]
+    all_footprints = FootprintBatch.concatenate([footprints_a, footprints_b])
+    distances[is_moved] = measure(all_footprints, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
+    return is_moved, shift_x * shift_x + shift_y * shift_y, distances
 
 
-def _are_equal(first: FootprintBatch, second: FootprintBatch) -> Booleans:
+def _are_equal(batch_a: FootprintBatch, batch_b: FootprintBatch) -> Booleans:
     """Return whether each row has the same parts in both batches."""
-    sizes = [
+    row_sizes = [
         (np.diff(batch.part_start), np.diff(batch.vertex_start[batch.part_start]))
-        for batch in (first, second)
+        for batch in (batch_a, batch_b)
     ]
-    alike = (sizes[0][0] == sizes[1][0]) & (sizes[0][1] == sizes[1][1])
-    first, second = (batch.select(np.flatnonzero(alike)) for batch in (first, second))
-    parts = (np.diff(first.vertex_start) != np.diff(second.vertex_start)) | (first.radius != second.radius)
-    vertices = (first.vertices != second.vertices).any(axis=1)
-    unequal = count_in_rows(parts, first.part_start)
-    unequal += count_in_rows(vertices, first.vertex_start[first.part_start])
-    alike[alike] = unequal == 0
-    return np.asarray(alike)
+    is_equal = (row_sizes[0][0] == row_sizes[1][0]) & (row_sizes[0][1] == row_sizes[1][1])
+    batch_a, batch_b = (batch.select(np.flatnonzero(is_equal)) for batch in (batch_a, batch_b))
+    is_part_different = (np.diff(batch_a.vertex_start) != np.diff(batch_b.vertex_start)) | (
+        batch_a.radius != batch_b.radius
+    )
+    is_vertex_different = (batch_a.vertices != batch_b.vertices).any(axis=1)
+    difference_counts = count_in_rows(is_part_different, batch_a.part_start)
+    difference_counts += count_in_rows(is_vertex_different, batch_a.vertex_start[batch_a.part_start])
+    is_equal[is_equal] = difference_counts == 0
+    return np.asarray(is_equal)
 
 
 def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
     """Return the mean of each row's vertices relative to the origin of the row, (2, R)."""
-    counts = np.diff(batch.vertex_start[batch.part_start])
-    rows = np.repeat(np.arange(len(batch)), counts)
-    sums = [np.bincount(rows, coordinates, len(batch)) for coordinates in (batch.vertices - origin[rows]).T]
-    return np.stack(sums) / counts
+    vertex_counts = np.diff(batch.vertex_start[batch.part_start])
+    vertex_rows = np.repeat(np.arange(len(batch)), vertex_counts)
+    coordinate_sums = [
+        np.bincount(vertex_rows, coordinates, len(batch))
+        for coordinates in (batch.vertices - origin[vertex_rows]).T
+    ]
+    return np.stack(coordinate_sums) / vertex_counts
 
 
 def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     """Return a sentence on the first difference of an object and its greatest distance."""
-    parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
+    sentence_parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
     if diff.greatest_shift:
-        parts.append(f", by up to {with_unit(diff.greatest_shift, unit)}")
+        sentence_parts.append(f", by up to {with_unit(diff.greatest_shift, unit)}")
     if diff.apart_ns is not None:
-        farthest = with_unit(diff.greatest_distance, unit)
-        parts += ["; apart from itself since ", Instant(diff.apart_ns, start_ns)]
-        parts += [f", farthest by {farthest} at ", Instant(diff.greatest_ns, start_ns)]
-    for which, count in (("A", diff.samples_only_in_a), ("B", diff.samples_only_in_b)):
-        if count:
-            parts.append(f"; only {which} has it in {plural(count, 'sample')}")
-    return Sentence(*parts)
+        distance_text = with_unit(diff.greatest_distance, unit)
+        sentence_parts += ["; apart from itself since ", Instant(diff.apart_ns, start_ns)]
+        sentence_parts += [f", farthest by {distance_text} at ", Instant(diff.greatest_ns, start_ns)]
+    for run, sample_count in (("A", diff.samples_only_in_a), ("B", diff.samples_only_in_b)):
+        if sample_count:
+            sentence_parts.append(f"; only {run} has it in {plural(sample_count, 'sample')}")
+    return Sentence(*sentence_parts)
 
 
 def _signal_sentence(diff: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return a sentence on the first and the greatest difference of a signal, and on its unit."""
-    parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
-    greatest = diff.greatest_difference
-    if greatest > 0.0 and not names_from_unit(unit):
-        parts += [f", by up to {with_unit(greatest, unit)} at ", Instant(diff.greatest_ns, start_ns)]
+    sentence_parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
+    greatest_difference = diff.greatest_difference
+    if greatest_difference > 0.0 and not names_from_unit(unit):
+        sentence_parts += [
+            f", by up to {with_unit(greatest_difference, unit)} at ",
+            Instant(diff.greatest_ns, start_ns),
+        ]
     if diff.has_other_unit:
-        times, which = (diff.ratio, "B") if diff.ratio > 1.0 else (1.0 / diff.ratio, "A")
-        parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
-    return Sentence(*parts)
+        factor, larger_run = (diff.ratio, "B") if diff.ratio > 1.0 else (1.0 / diff.ratio, "A")
+        sentence_parts.append(
+            f"; {factor:,.0f} times as large in {larger_run}: it may be in another unit there"
+        )
+    return Sentence(*sentence_parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -546,22 +585,22 @@ class RunSpecDiff:
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
         if self.parting is not None:
-            where = self.parting
+            parting = self.parting
             yield Sentence(
                 "they part in the automaton: ",
-                *_entry_parts(where.a_ns, where.a_states, zeros_ns[0]),
+                *_entry_parts(parting.a_ns, parting.a_states, zeros_ns[0]),
                 " | ",
-                *_entry_parts(where.b_ns, where.b_states, zeros_ns[1]),
+                *_entry_parts(parting.b_ns, parting.b_states, zeros_ns[1]),
             )
-        for node in self.nodes:
-            yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
-        for which, result, start_ns in zip("AB", (self.a, self.b), zeros_ns, strict=True):
+        for node_id in self.nodes:
+            yield Sentence(f"brought about by `{self.a.nodes[node_id].text}`")
+        for run, result, zero_ns in zip("AB", (self.a, self.b), zeros_ns, strict=True):
             if self.is_flipped and result.causes and result.causes[0].witness is not None:
-                reason = cause_reason(result.causes[0], start_ns)
-                yield Sentence(f"{which}: ", *reason.parts)
+                reason = cause_reason(result.causes[0], zero_ns)
+                yield Sentence(f"{run}: ", *reason.parts)
         if self.moved:
-            names = ", ".join(diff.name for diff in self.moved)
-            yield Sentence(f"of what it is about, these moved differently: {names}")
+            object_names = ", ".join(diff.name for diff in self.moved)
+            yield Sentence(f"of what it is about, these moved differently: {object_names}")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -573,7 +612,7 @@ class RunSpecDiff:
             "a": json_value(EditOutcome.of(self.a)),
             "b": json_value(EditOutcome.of(self.b)),
             "first_ns": self.first_ns,
-            "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
+            "nodes": [{"id": node_id, "text": self.a.nodes[node_id].text} for node_id in self.nodes],
             "parting": json_value(self.parting),
             "moved": [diff.name for diff in self.moved],
         }
@@ -592,60 +631,62 @@ def compare_results(
     Args:
         objects: differences of objects.
     """
-    moved = {diff.name: diff for diff in objects}
-    nodes = _deepest_flips(one, other)
-    if not nodes and one.can_explain and one.robustness != other.robustness:
-        nodes = (one.deciding_node(),)
-    names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
+    diff_by_name = {diff.name: diff for diff in objects}
+    node_ids = _deepest_flips(one, other)
+    if not node_ids and one.can_explain and one.robustness != other.robustness:
+        node_ids = (one.deciding_node(),)
+    moved_names = [
+        name for node_id in node_ids for name in sorted(_objects_of(one, node_id)) if name in diff_by_name
+    ]
     return RunSpecDiff(
         one,
         other,
         _first_sign(one, other, alignment, traces),
-        nodes,
+        node_ids,
         parting_of(one, other, files) if one.verdict is not other.verdict else None,
-        tuple(moved[name] for name in dict.fromkeys(names)),
+        tuple(diff_by_name[name] for name in dict.fromkeys(moved_names)),
     )
 
 
 def _deepest_flips(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
     """Return the deepest nodes with different verdicts; none if the root has the same verdict."""
-    flipped = {
+    flipped_ids = {
         node.id
-        for node, beside in zip(one.nodes, other.nodes, strict=True)
-        if node.verdict is not beside.verdict
+        for node, other_node in zip(one.nodes, other.nodes, strict=True)
+        if node.verdict is not other_node.verdict
     }
-    if 0 not in flipped:
+    if 0 not in flipped_ids:
         return ()
-    below = {one.nodes[node].parent for node in flipped}
+    parent_ids = {one.nodes[node].parent for node in flipped_ids}
     # a node counts only if all nodes from the root down to it have different verdicts
-    reached = {0}
-    for node in sorted(flipped):
-        if one.nodes[node].parent in reached:
-            reached.add(node)
-    return tuple(sorted(reached - below))
+    connected_ids = {0}
+    for node in sorted(flipped_ids):
+        if one.nodes[node].parent in connected_ids:
+            connected_ids.add(node)
+    return tuple(sorted(connected_ids - parent_ids))
 
 
 def _objects_of(result: SpecResult, node: int) -> frozenset[str]:
     formula = nodes_of(result.formula)[node]
-    bound = result.evidence.bound(formula)
-    names: set[str] = set(other_names(bound))
-    for _, _, leaf in iter_nodes(bound):
+    bound_formula = result.evidence.bound(formula)
+    object_names: set[str] = set(other_names(bound_formula))
+    for _, _, leaf in iter_nodes(bound_formula):
         if isinstance(leaf, Atom):
-            names |= {getattr(term, "name", "") for term in leaf.terms}
-    return frozenset(names)
+            object_names |= {getattr(term, "name", "") for term in leaf.terms}
+    return frozenset(object_names)
 
 
 def _first_sign(
     one: SpecResult, other: SpecResult, alignment: Alignment, traces: tuple[Trace, Trace]
 ) -> int | None:
     """Return the time of the first sample whose value has another sign than its counterpart."""
-    signs = []
-    for result, trace, samples in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
-        value = np.full(len(trace), np.nan)
-        value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
-        signs.append(np.where(np.isnan(value), 0, np.where(value >= 0.0, 1, -1))[samples])
-    differs = signs[0] != signs[1]
-    return int(traces[0].times_ns[alignment.a[differs.argmax()]]) if differs.any() else None
+    run_signs = []
+    for result, trace, sample_indices in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
+        values = np.full(len(trace), np.nan)
+        values[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
+        run_signs.append(np.where(np.isnan(values), 0, np.where(values >= 0.0, 1, -1))[sample_indices])
+    is_different = run_signs[0] != run_signs[1]
+    return int(traces[0].times_ns[alignment.a[is_different.argmax()]]) if is_different.any() else None
 
 
 def _entry_parts(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
@@ -681,24 +722,31 @@ class DecisionDiff(NamedTuple):
 
 def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
     """Return the first decision that differs; None if there is none, or if no log was planned."""
-    decisions: list[tuple[PlanDecision, ...]] = []
+    decisions_by_source: list[tuple[PlanDecision, ...]] = []
     for source in sources:
         path = source.path
         decisions_of_source: tuple[PlanDecision, ...] = ()
         if isinstance(path, Path) and source.kind == "MCAP":
             with suppress(UsageError):
                 decisions_of_source = read_decisions(path).decisions
-        decisions.append(decisions_of_source)
-    for number in range(max(map(len, decisions))):
-        pair = [of_source[number] if number < len(of_source) else None for of_source in decisions]
-        if _bytes_to_compare(pair[0]) != _bytes_to_compare(pair[1]):
-            hashes = [_map_hashes(decision) for decision in pair]
-            maps = sorted(
-                name for name in hashes[0].keys() & hashes[1].keys() if hashes[0][name] != hashes[1][name]
+        decisions_by_source.append(decisions_of_source)
+    for index in range(max(map(len, decisions_by_source))):
+        decision_pair = [
+            run_decisions[index] if index < len(run_decisions) else None
+            for run_decisions in decisions_by_source
+        ]
+        if _bytes_to_compare(decision_pair[0]) != _bytes_to_compare(decision_pair[1]):
+            map_hashes = [_map_hashes(decision) for decision in decision_pair]
+            map_names = sorted(
+                name
+                for name in map_hashes[0].keys() & map_hashes[1].keys()
+                if map_hashes[0][name] != map_hashes[1][name]
             )
-            texts = [_decision_text(decision) for decision in pair]
-            times_ns = [None if decision is None else decision.time_ns for decision in pair]
-            return DecisionDiff(number, texts[0], texts[1], times_ns[0], times_ns[1], tuple(maps))
+            decision_texts = [_decision_text(decision) for decision in decision_pair]
+            times_ns = [None if decision is None else decision.time_ns for decision in decision_pair]
+            return DecisionDiff(
+                index, decision_texts[0], decision_texts[1], times_ns[0], times_ns[1], tuple(map_names)
+            )
     return None
 
 
@@ -706,13 +754,13 @@ def _bytes_to_compare(decision: PlanDecision | None) -> bytes | None:
     """Return the comparable part of a decision: action and reason, without time and outcome."""
     if decision is None:
         return None
-    copy = PlanDecision.FromString(decision.SerializeToString())
-    copy.ClearField("time_ns")
-    copy.ClearField("outcome")
+    decision_copy = PlanDecision.FromString(decision.SerializeToString())
+    decision_copy.ClearField("time_ns")
+    decision_copy.ClearField("outcome")
     # by default, equal messages can have different bytes
     # (https://protobuf.dev/programming-guides/serialization-not-canonical)
-    copied: bytes = copy.SerializeToString(deterministic=True)
-    return copied
+    comparable_bytes: bytes = decision_copy.SerializeToString(deterministic=True)
+    return comparable_bytes
 
 
 def _map_hashes(decision: PlanDecision | None) -> dict[str, tuple[bytes, ...]]:
@@ -726,8 +774,8 @@ def _map_hashes(decision: PlanDecision | None) -> dict[str, tuple[bytes, ...]]:
 def _decision_text(decision: PlanDecision | None) -> str:
     if decision is None:
         return "none: the run has no such decision"
-    where = f"; {place_text(decision.target)}" if decision.HasField("target") else ""
-    return f"{decision.reason}{where}"
+    target_text = f"; {place_text(decision.target)}" if decision.HasField("target") else ""
+    return f"{decision.reason}{target_text}"
 
 
 _MOST_LISTED: Final = 12
@@ -794,23 +842,25 @@ class LogDiff(Printed, Displayed):
         if self.is_empty:
             yield f"  the same {plural(self.samples[0], 'sample')}"
             return
-        paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
-        counts = " | ".join(plural(count, "sample") for count in self.samples)
-        yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
+        paired_counts = [
+            len(set(sample_indices.tolist())) for sample_indices in (self.alignment.a, self.alignment.b)
+        ]
+        counts_text = " | ".join(plural(sample_count, "sample") for sample_count in self.samples)
+        yield f"  {counts_text}; {self.alignment}: {paired_counts[0]:,} of A beside {paired_counts[1]:,} of B"
         yield from (f"  {sentence}" for sentence in self.movements[:_MOST_LISTED])
         if len(self.objects) > _MOST_LISTED:
             yield f"  and {plural(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
         yield from (f"  {sentence}" for sentence in self.signal_changes[:_MOST_LISTED])
         if len(self.signals) > _MOST_LISTED:
             yield f"  and {plural(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
-        for which, names in (("A", self.only_a), ("B", self.only_b)):
+        for run, names in (("A", self.only_a), ("B", self.only_b)):
             if names:
-                yield f"  only in {which}: {', '.join(names[:_MOST_LISTED])}"
+                yield f"  only in {run}: {', '.join(names[:_MOST_LISTED])}"
         for spec in self.specs:
-            first, *rest = spec.sentences(self.zeros_ns)
-            yield f"  {spec.a.title}: {first}"
+            first_sentence, *other_sentences = spec.sentences(self.zeros_ns)
+            yield f"  {spec.a.title}: {first_sentence}"
             if spec.is_different:
-                yield from (f"    {sentence}" for sentence in rest)
+                yield from (f"    {sentence}" for sentence in other_sentences)
         if self.decision is not None:
             yield f"  decision {self.decision.number} is the first that differs:"
             yield from (f"    {line}" for line in self.decision.lines())
@@ -865,17 +915,25 @@ def diff_sources(
         SpecificationError: the specifications mention names that a log never has, if names are strict.
     """
     selections = [
-        Selection(source, tuple(files), replace(reading, keep=()))
-        for source, reading in zip(sources, options, strict=True)
+        Selection(source, tuple(files), replace(run_options, keep=()))
+        for source, run_options in zip(sources, options, strict=True)
     ]
-    checked = [selection.checked_trace(advance) for selection in selections]
-    (a, b), zeros_ns = [read.trace for read in checked], (checked[0].zero_ns, checked[1].zero_ns)
-    pairs = zip((a, b), options, strict=True)
-    evaluations = [[evaluate_with(reading, file, trace) for file in files] for trace, reading in pairs]
+    checked_traces = [selection.checked_trace(advance) for selection in selections]
+    (a, b), zeros_ns = (
+        [checked_trace.trace for checked_trace in checked_traces],
+        (checked_traces[0].zero_ns, checked_traces[1].zero_ns),
+    )
+    trace_options = zip((a, b), options, strict=True)
+    evaluations = [
+        [evaluate_with(run_options, file, trace) for file in files] for trace, run_options in trace_options
+    ]
     results = _pair_results(evaluations)
     alignment = align_runs((a.times_ns, b.times_ns), zeros_ns, results, files, align)
     objects = compare_objects(a, b, alignment)
-    titles = [{result.title for evaluation in of_log for result in evaluation} for of_log in evaluations]
+    result_titles = [
+        {result.title for evaluation in log_evaluations for result in evaluation}
+        for log_evaluations in evaluations
+    ]
     return LogDiff(
         sources[0].name,
         sources[1].name,
@@ -884,22 +942,28 @@ def diff_sources(
         alignment,
         objects,
         compare_signals(a, b, alignment),
-        _only_in(a, b, titles[0] - titles[1]),
-        _only_in(b, a, titles[1] - titles[0]),
+        _only_in(a, b, result_titles[0] - result_titles[1]),
+        _only_in(b, a, result_titles[1] - result_titles[0]),
         tuple(
             compare_results(result_a, result_b, alignment, (a, b), objects, files)
             for result_a, result_b in results
         ),
         compare_decisions(sources),
         not objects and a == b,
-        tuple(text for read in checked for text in counted_from(read.trace.faults, read.zero_ns)),
+        tuple(
+            fault
+            for checked_trace in checked_traces
+            for fault in counted_from(checked_trace.trace.faults, checked_trace.zero_ns)
+        ),
         tuple(
             remark
-            for source, read in zip(sources, checked, strict=True)
-            for remark in counted_from((d.remark(source.name) for d in read.trace.doubts), read.zero_ns)
+            for source, checked_trace in zip(sources, checked_traces, strict=True)
+            for remark in counted_from(
+                (doubt.remark(source.name) for doubt in checked_trace.trace.doubts), checked_trace.zero_ns
+            )
         ),
         (a, b),
-        tuple(dict.fromkeys(remark for read in checked for remark in read.missing)),
+        tuple(dict.fromkeys(remark for checked_trace in checked_traces for remark in checked_trace.missing)),
     )
 
 
@@ -909,8 +973,12 @@ def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
 
 
 def _pair_results(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResult, SpecResult]]:
-    pairs = []
+    result_pairs = []
     for evaluation_a, evaluation_b in zip(*evaluations, strict=True):
-        named = {result.title: result for result in evaluation_b}
-        pairs += [(result, named[result.title]) for result in evaluation_a if result.title in named]
-    return pairs
+        result_by_title = {result.title: result for result in evaluation_b}
+        result_pairs += [
+            (result, result_by_title[result.title])
+            for result in evaluation_a
+            if result.title in result_by_title
+        ]
+    return result_pairs

@@ -68,8 +68,8 @@ class EditOutcome(NamedTuple):
         if verdict_only:
             return self.verdict is other.verdict
         # NaN, which is not equal to itself, counts as equal to NaN
-        pairs = zip(self[1:], other[1:], strict=True)
-        return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in pairs)
+        number_pairs = zip(self[1:], other[1:], strict=True)
+        return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in number_pairs)
 
 
 class EditOutcomes:
@@ -80,12 +80,12 @@ class EditOutcomes:
         self._times_ns = one.times_ns
         self._semantics = one.semantics
         self._rows: dict[Atom | Quantified, Floats] = {}
-        blocks = [(result, result.leaves) for result in (one, other) if result.leaves is not None]
-        channels = max((len(leaves) for _, leaves in blocks), default=0)
-        for result, leaves in blocks:
-            columns = in_channels(leaves, channels)
-            for index, leaf in enumerate(result.evidence.instance.program.leaves):
-                self._rows[leaf] = columns[:, index]
+        result_leaves = [(result, result.leaves) for result in (one, other) if result.leaves is not None]
+        channel_count = max((len(leaves) for _, leaves in result_leaves), default=0)
+        for result, leaves in result_leaves:
+            channel_leaves = in_channels(leaves, channel_count)
+            for leaf_index, leaf in enumerate(result.evidence.instance.program.leaves):
+                self._rows[leaf] = channel_leaves[:, leaf_index]
         self._known: dict[frozenset[int], EditOutcome] = {}
         self.count = 0
 
@@ -99,19 +99,24 @@ class EditOutcomes:
 
     def _evaluate(self, formula: Formula) -> EditOutcome:
         leaves = new_leaves(formula, ())
-        shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
-        rows = [self._rows[leaf] for leaf in leaves]
-        columns = np.stack(rows, axis=1) if rows else np.empty((shape[0], 0, shape[1]))
+        leaf_shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
+        leaf_rows = [self._rows[leaf] for leaf in leaves]
+        leaf_values = (
+            np.stack(leaf_rows, axis=1) if leaf_rows else np.empty((leaf_shape[0], 0, leaf_shape[1]))
+        )
         if self._semantics == "paper":
-            run = PaperRun(formula, leaves)
-            run.extend(columns, self._times_ns)
-            value = float(run.final[0, 0])
+            paper_run = PaperRun(formula, leaves)
+            paper_run.extend(leaf_values, self._times_ns)
+            value = float(paper_run.final[0, 0])
             return EditOutcome(final_verdict(value, value), value, value, value)
-        evaluation = evaluate_offline(formula, leaves, columns, self._times_ns)
+        evaluation = evaluate_offline(formula, leaves, leaf_values, self._times_ns)
         lower, upper = evaluation.interval(0)
-        least, greatest = evaluation.interval(0, wide=False)
+        nominal_lower, nominal_upper = evaluation.interval(0, wide=False)
         return EditOutcome(
-            final_verdict(lower, upper), least if least == greatest else math.nan, lower, upper
+            final_verdict(lower, upper),
+            nominal_lower if nominal_lower == nominal_upper else math.nan,
+            lower,
+            upper,
         )
 
 
@@ -129,22 +134,22 @@ def find_cause(
     if old.same_as(new):
         return ()
     verdict_only = old.verdict is not new.verdict
-    units = sorted(diff.effective, key=lambda number: -max(edit.depth for edit in diff.units[number]))
-    evaluated = 0
+    units = sorted(diff.effective, key=lambda unit: -max(edit.depth for edit in diff.units[unit]))
+    evaluation_count = 0
 
-    def suffices(chosen: Sequence[int]) -> bool:
-        nonlocal evaluated
-        evaluated += 1
-        others = [number for number in units if number not in chosen]
+    def suffices(chosen_units: Sequence[int]) -> bool:
+        nonlocal evaluation_count
+        evaluation_count += 1
+        other_units = [unit for unit in units if unit not in chosen_units]
         return (
-            evaluated <= _MOST_EVALUATIONS
-            and outcome(chosen).same_as(new, verdict_only=verdict_only)
-            and outcome(others).same_as(old, verdict_only=verdict_only)
+            evaluation_count <= _MOST_EVALUATIONS
+            and outcome(chosen_units).same_as(new, verdict_only=verdict_only)
+            and outcome(other_units).same_as(old, verdict_only=verdict_only)
         )
 
-    for number in units:
-        if suffices((number,)):
-            return (number,)
+    for unit in units:
+        if suffices((unit,)):
+            return (unit,)
     return tuple(minimise(units, suffices))
 
 
@@ -154,19 +159,19 @@ def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> li
     No single part of the subset can be left out. The method is delta debugging, which removes larger pieces
     first (Zeller and Hildebrandt 2002, https://doi.org/10.1109/32.988498).
     """
-    current = list(parts)
-    size = max(len(current) // 2, 1)
+    subset = list(parts)
+    piece_size = max(len(subset) // 2, 1)
     while True:
-        at, removed = 0, False
-        while at < len(current):
-            rest = current[:at] + current[at + size :]
-            if rest and holds(rest):
-                current, removed = rest, True
+        piece_begin, is_reduced = 0, False
+        while piece_begin < len(subset):
+            smaller_subset = subset[:piece_begin] + subset[piece_begin + piece_size :]
+            if smaller_subset and holds(smaller_subset):
+                subset, is_reduced = smaller_subset, True
             else:
-                at += size
-        if size == 1 and not removed:
-            return current
-        size = max(size // 2, 1)
+                piece_begin += piece_size
+        if piece_size == 1 and not is_reduced:
+            return subset
+        piece_size = max(piece_size // 2, 1)
 
 
 class FirstDifference(NamedTuple):
@@ -222,11 +227,15 @@ class SpecDiff(Displayed):
         if self.old.times_ns.shape != self.new.times_ns.shape:
             return None
         old_values, new_values = self.old.series[0, 0], self.new.series[0, 0]
-        differs = np.flatnonzero((old_values != new_values) & ~(np.isnan(old_values) & np.isnan(new_values)))
-        if not len(differs):
+        different_samples = np.flatnonzero(
+            (old_values != new_values) & ~(np.isnan(old_values) & np.isnan(new_values))
+        )
+        if not len(different_samples):
             return None
-        at = int(differs[0])
-        return FirstDifference(int(self.old.times_ns[at]), float(old_values[at]), float(new_values[at]))
+        sample = int(different_samples[0])
+        return FirstDifference(
+            int(self.old.times_ns[sample]), float(old_values[sample]), float(new_values[sample])
+        )
 
     @property
     def title(self) -> str:
@@ -240,46 +249,52 @@ class SpecDiff(Displayed):
         Args:
             shown: declarations whose lines are not repeated.
         """
-        outcomes = (self.old, self.new) if self.is_different else (self.old,)
-        yield Sentence(" → ".join(map(outcome_text, outcomes)) + difference_text(self.old, self.new))
+        results = (self.old, self.new) if self.is_different else (self.old,)
+        yield Sentence(" → ".join(map(outcome_text, results)) + difference_text(self.old, self.new))
         if self.first is not None:
-            pairs = (self.first.old, self.old.unit), (self.first.new, self.new.unit)
-            values = " → ".join(interval_text(value, value, value, unit) for value, unit in pairs)
-            yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
-        for edit, alone in zip(self.cause, self.alone, strict=True):
-            more = max(len(edit.old_nodes), len(edit.new_nodes)) - 1
-            elsewhere = f" (and {plural(more, 'more node')})" if more else ""
-            yield Sentence(f"because: {edit}, in `{edit.spec}`{elsewhere}")
+            values_with_units = (self.first.old, self.old.unit), (self.first.new, self.new.unit)
+            values_text = " → ".join(
+                interval_text(value, value, value, unit) for value, unit in values_with_units
+            )
+            yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values_text}")
+        for edit, outcome in zip(self.cause, self.alone, strict=True):
+            more_nodes = max(len(edit.old_nodes), len(edit.new_nodes)) - 1
+            more_text = f" (and {plural(more_nodes, 'more node')})" if more_nodes else ""
+            yield Sentence(f"because: {edit}, in `{edit.spec}`{more_text}")
             yield from self._lines_of(edit, shown)
-            if alone is not None:
-                number = interval_text(*alone[1:], self.old.unit)
-                yield Sentence(f"  with this edit alone: {alone.verdict}, robustness {number}")
+            if outcome is not None:
+                robustness_text = interval_text(*outcome[1:], self.old.unit)
+                yield Sentence(f"  with this edit alone: {outcome.verdict}, robustness {robustness_text}")
         if len(self.cause) > 1:
             yield Sentence(self._together())
         if self.is_flipped and self.new.causes and self.new.causes[0].witness is not None:
             yield cause_reason(self.new.causes[0], first_ns)
-        others = [edit for edit in self.edits if edit not in self.cause]
-        for edit in others[:_MOST_LISTED]:
-            what = "edited, too: " if self.cause else "edited, without effect on the result: "
-            yield Sentence(f"{'' if edit.kind == 'renamed' else what}{edit}")
+        other_edits = [edit for edit in self.edits if edit not in self.cause]
+        for edit in other_edits[:_MOST_LISTED]:
+            prefix = "edited, too: " if self.cause else "edited, without effect on the result: "
+            yield Sentence(f"{'' if edit.kind == 'renamed' else prefix}{edit}")
             if edit.kind != "renamed":
                 yield from self._lines_of(edit, shown)
-        if len(others) > _MOST_LISTED:
-            yield Sentence(f"and {plural(len(others) - _MOST_LISTED, 'other edit')}")
+        if len(other_edits) > _MOST_LISTED:
+            yield Sentence(f"and {plural(len(other_edits) - _MOST_LISTED, 'other edit')}")
 
     def _together(self) -> str:
         """Return a sentence on how several edits of a cause act together."""
-        new = EditOutcome.of(self.new)
-        enough = sum(
-            outcome is not None and outcome.same_as(new, verdict_only=self.is_flipped)
+        new_outcome = EditOutcome.of(self.new)
+        sufficient_count = sum(
+            outcome is not None and outcome.same_as(new_outcome, verdict_only=self.is_flipped)
             for outcome in self.alone
         )
-        count, what = len(self.cause), "verdict" if self.is_flipped else "robustness"
-        if not enough:
-            return f"it takes these {count} edits together"
-        which = f"each of these {count} edits" if enough == count else f"{enough} of these {count} edits"
-        all_of_them = "both" if count == 2 else f"all {count}"
-        return f"{which} is enough by itself; to get the old {what} back, undo {all_of_them}"
+        edit_count, quantity = len(self.cause), "verdict" if self.is_flipped else "robustness"
+        if not sufficient_count:
+            return f"it takes these {edit_count} edits together"
+        sufficient_edits = (
+            f"each of these {edit_count} edits"
+            if sufficient_count == edit_count
+            else f"{sufficient_count} of these {edit_count} edits"
+        )
+        all_edits = "both" if edit_count == 2 else f"all {edit_count}"
+        return f"{sufficient_edits} is enough by itself; to get the old {quantity} back, undo {all_edits}"
 
     def _lines_of(self, edit: Edit, shown: Collection[DeclarationChange]) -> Iterator[Sentence]:
         if edit.change in shown:
@@ -300,18 +315,18 @@ class SpecDiff(Displayed):
             "new": json_value(EditOutcome.of(self.new)),
             "first_difference": json_value(self.first),
             "cause": [
-                {**self._edit_value(edit), "alone": json_value(alone)}
-                for edit, alone in zip(self.cause, self.alone, strict=True)
+                {**self._edit_value(edit), "alone": json_value(outcome)}
+                for edit, outcome in zip(self.cause, self.alone, strict=True)
             ],
             "edits": [self._edit_value(edit) for edit in self.edits],
         }
 
     def _edit_value(self, edit: Edit) -> dict[str, Any]:
-        sides = {"old": self.old_places.get(edit), "new": self.new_places.get(edit)}
+        place_by_side = {"old": self.old_places.get(edit), "new": self.new_places.get(edit)}
         return {
             **json_fields(edit, "kind", "spec", "subject", "old", "new", "old_nodes", "new_nodes"),
-            **{f"{side}_line": place and place.line for side, place in sides.items()},
-            **{f"{side}_text": place and place.text for side, place in sides.items()},
+            **{f"{side}_line": place and place.line for side, place in place_by_side.items()},
+            **{f"{side}_text": place and place.text for side, place in place_by_side.items()},
         }
 
     def __repr__(self) -> str:
@@ -382,27 +397,29 @@ class SpecificationDiff(Printed, Displayed):
         for spec in self.specs:
             if spec.name == name:
                 return spec
-        names = [spec.name for spec in self.specs]
-        raise UsageError(f"no spec {name!r} to compare; {nearest_hint(name, names) or ', '.join(names)}")
+        spec_names = [spec.name for spec in self.specs]
+        raise UsageError(
+            f"no spec {name!r} to compare; {nearest_hint(name, spec_names) or ', '.join(spec_names)}"
+        )
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of text that the command `diff` prints."""
         yield f"{self.log}: {plural(self.samples, 'sample')}; {self.old.filename} → {self.new.filename}"
-        same = 0
+        same_count = 0
         printed_changes: set[DeclarationChange] = set()
         for spec in self.specs:
             if not spec.edits and not spec.is_different:
-                same += 1
+                same_count += 1
                 continue
-            first, *rest = spec.sentences(self.first_ns, printed_changes)
+            first_sentence, *other_sentences = spec.sentences(self.first_ns, printed_changes)
             printed_changes.update(edit.change for edit in spec.edits if edit.change is not None)
-            yield f"  {spec.title}: {first}"
-            yield from (f"    {sentence}" for sentence in rest)
-        for names, where in ((self.removed, self.old), (self.added, self.new)):
-            for name in names:
-                yield f"  {name}: only in {where.filename}"
-        if same:
-            yield f"  {plural(same, 'other spec') if same < len(self.specs) else 'all'} the same"
+            yield f"  {spec.title}: {first_sentence}"
+            yield from (f"    {sentence}" for sentence in other_sentences)
+        for spec_names, file in ((self.removed, self.old), (self.added, self.new)):
+            for name in spec_names:
+                yield f"  {name}: only in {file.filename}"
+        if same_count:
+            yield f"  {plural(same_count, 'other spec') if same_count < len(self.specs) else 'all'} the same"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -446,24 +463,27 @@ def diff_over_source(
         SpecificationError: the specifications mention names that the log never has, if names are strict.
     """
     selection = Selection(source, (old, new), replace(options, keep=()))
-    trace, missing, zero_ns = selection.checked_trace(advance)
+    trace, missing_names, zero_ns = selection.checked_trace(advance)
     versions = TextVersions(old, new, trace.units)
     old, new = versions.old, versions.new
-    pairs, removed, added = _pair_specs(old, new)
-    formulas, regions = unify_regions([old_spec.formula for old_spec, _ in pairs], old.regions, new.regions)
-    olds = [
-        replace(old_spec, formula=formula) for (old_spec, _), formula in zip(pairs, formulas, strict=True)
+    spec_pairs, removed_names, added_names = _pair_specs(old, new)
+    formulas, regions = unify_regions(
+        [old_spec.formula for old_spec, _ in spec_pairs], old.regions, new.regions
+    )
+    old_specs = [
+        replace(old_spec, formula=formula)
+        for (old_spec, _), formula in zip(spec_pairs, formulas, strict=True)
     ]
-    news = [new_spec for _, new_spec in pairs]
+    new_specs = [new_spec for _, new_spec in spec_pairs]
 
     def evaluate_version(
         specs: Sequence[NamedSpec], file: Specification, shapes: Mapping[str, Outline] = regions
     ) -> Evaluation:
-        results = tuple(replace(spec, is_result=True) for spec in specs)
-        version = Specification(results, file.profile, dict(shapes), filename=file.filename)
+        result_specs = tuple(replace(spec, is_result=True) for spec in specs)
+        version = Specification(result_specs, file.profile, dict(shapes), filename=file.filename)
         return evaluate_with(options, version, trace)
 
-    before, after = evaluate_version(olds, old), evaluate_version(news, new)
+    old_evaluation, new_evaluation = evaluate_version(old_specs, old), evaluate_version(new_specs, new)
     spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
         # by id, because two results can have equal formulas
@@ -475,7 +495,7 @@ def diff_over_source(
             tuple(_origins(versions, *pair)),
             spec_names,
         )
-        for old_spec, new_spec, pair in zip(olds, news, pairs, strict=True)
+        for old_spec, new_spec, pair in zip(old_specs, new_specs, spec_pairs, strict=True)
     }
 
     @cache
@@ -487,19 +507,19 @@ def diff_over_source(
 
     return SpecificationDiff(
         source.name,
-        len(before.results[0].times_ns) if before.results else 0,
+        len(old_evaluation.results[0].times_ns) if old_evaluation.results else 0,
         zero_ns,
         old,
         new,
         tuple(
             _spec_diff(old_result, new_result, trees[id(new_result.formula)], versions, by_version)
-            for old_result, new_result in zip(before.results, after.results, strict=True)
+            for old_result, new_result in zip(old_evaluation.results, new_evaluation.results, strict=True)
         ),
-        removed,
-        added,
+        removed_names,
+        added_names,
         counted_from(trace.faults, zero_ns),
         counted_from((doubt.remark(source.name) for doubt in trace.doubts), zero_ns),
-        missing,
+        missing_names,
     )
 
 
@@ -520,70 +540,74 @@ def _pair_specs(
     old: Specification, new: Specification
 ) -> tuple[list[tuple[NamedSpec, NamedSpec]], tuple[str, ...], tuple[str, ...]]:
     """Return pairs of specs that are results in either file, and names of results without a counterpart."""
-    olds, news = ({spec.name: spec for spec in file.specs} for file in (old, new))
-    pairs = [
-        (olds[spec.name], spec)
+    old_by_name, new_by_name = ({spec.name: spec for spec in file.specs} for file in (old, new))
+    spec_pairs = [
+        (old_by_name[spec.name], spec)
         for spec in new.specs
-        if spec.name in olds and (spec.is_result or olds[spec.name].is_result)
+        if spec.name in old_by_name and (spec.is_result or old_by_name[spec.name].is_result)
     ]
-    removed = [spec for spec in old.results if spec.name not in news]
-    added = [spec for spec in new.results if spec.name not in olds]
+    removed_specs = [spec for spec in old.results if spec.name not in new_by_name]
+    added_specs = [spec for spec in new.results if spec.name not in old_by_name]
     # a removed and an added result of equal meaning are one renamed result
-    for new_spec in tuple(added):
-        for old_spec in removed:
+    for new_spec in tuple(added_specs):
+        for old_spec in removed_specs:
             (formula,), regions = unify_regions([old_spec.formula], old.regions, new.regions)
             if (
                 old_spec.parameter == new_spec.parameter
                 and not compare_trees(formula, new_spec.formula, new_spec.name, regions).effective
             ):
-                pairs.append((old_spec, new_spec))
-                removed.remove(old_spec)
-                added.remove(new_spec)
+                spec_pairs.append((old_spec, new_spec))
+                removed_specs.remove(old_spec)
+                added_specs.remove(new_spec)
                 break
-    if not pairs:
-        names = [f"{file.filename} has {', '.join(spec.name for spec in file.specs)}" for file in (old, new)]
+    if not spec_pairs:
+        file_texts = [
+            f"{file.filename} has {', '.join(spec.name for spec in file.specs)}" for file in (old, new)
+        ]
         raise UsageError(
-            f"{old.filename} and {new.filename} have no spec in common: {'; '.join(names)}. "
+            f"{old.filename} and {new.filename} have no spec in common: {'; '.join(file_texts)}. "
             "Give specs that are to be compared the same name"
         )
-    for old_spec, new_spec in pairs:
+    for old_spec, new_spec in spec_pairs:
         if old_spec.parameter != new_spec.parameter:
             raise UsageError(
                 f"{new_spec.name} has the parameter {old_spec.parameter or 'none'} in {old.filename} and "
                 f"{new_spec.parameter or 'none'} in {new.filename}; give both the same"
             )
-    return pairs, tuple(spec.name for spec in removed), tuple(spec.name for spec in added)
+    return spec_pairs, tuple(spec.name for spec in removed_specs), tuple(spec.name for spec in added_specs)
 
 
-def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterator[Origin]:
+def _origins(versions: TextVersions, old_spec: NamedSpec, new_spec: NamedSpec) -> Iterator[Origin]:
     """Yield the nodes of a spec that depend on each declaration, and those that depend on text of specs."""
-    old, new = versions.old, versions.new
-    for number, change in enumerate(versions.changes):
-        applied, undone = (versions.version({number}, is_undone=is_undone) for is_undone in (False, True))
+    old_file, new_file = versions.old, versions.new
+    for change_index, change in enumerate(versions.changes):
+        applied_version, undone_version = (
+            versions.version({change_index}, is_undone=is_undone) for is_undone in (False, True)
+        )
         yield Origin(
             change,
-            _changes(old, one, applied, one.name) or frozenset(),
-            _changes(new, other, undone, other.name) or frozenset(),
+            _changes(old_file, old_spec, applied_version, old_spec.name) or frozenset(),
+            _changes(new_file, new_spec, undone_version, new_spec.name) or frozenset(),
         )
     if versions.changes:
-        every = range(len(versions.changes))
-        nodes = (
-            _changes(old, one, versions.version(every, is_undone=True), other.name),
-            _changes(new, other, versions.version(every, is_undone=False), one.name),
+        all_changes = range(len(versions.changes))
+        text_nodes = (
+            _changes(old_file, old_spec, versions.version(all_changes, is_undone=True), new_spec.name),
+            _changes(new_file, new_spec, versions.version(all_changes, is_undone=False), old_spec.name),
         )
         # without a valid mixed version, every node may depend on the text of specs
         all_nodes = frozenset(range(MAX_SIZE))
-        yield Origin(None, *(all_nodes if changed is None else changed for changed in nodes))
+        yield Origin(None, *(all_nodes if node_ids is None else node_ids for node_ids in text_nodes))
 
 
 def _changes(
-    file: Specification, spec: NamedSpec, version: Specification | None, name: str
+    file: Specification, spec: NamedSpec, other_file: Specification | None, counterpart_name: str
 ) -> frozenset[int] | None:
     """Return the ids of nodes of a spec that another version lacks; None if that version is invalid."""
-    counterpart = _find_spec(version, name)
-    if version is None or counterpart is None:
+    counterpart = _find_spec(other_file, counterpart_name)
+    if other_file is None or counterpart is None:
         return None
-    (formula,), regions = unify_regions([counterpart.formula], version.regions, file.regions)
+    (formula,), regions = unify_regions([counterpart.formula], other_file.regions, file.regions)
     return changed_nodes(formula, spec.formula, regions)
 
 
@@ -592,59 +616,63 @@ def _find_spec(file: Specification | None, name: str) -> NamedSpec | None:
 
 
 def _spec_diff(
-    one: SpecResult,
-    other: SpecResult,
+    old_result: SpecResult,
+    new_result: SpecResult,
     tree: TreeDiff,
     versions: TextVersions,
     by_version: Callable[..., Evaluation | None],
 ) -> SpecDiff:
-    outcomes = EditOutcomes(one, other, tree)
-    before, after = EditOutcome.of(one), EditOutcome.of(other)
-    units = find_cause(tree, outcomes, before, after)
+    edit_outcomes = EditOutcomes(old_result, new_result, tree)
+    old_outcome, new_outcome = EditOutcome.of(old_result), EditOutcome.of(new_result)
+    units = find_cause(tree, edit_outcomes, old_outcome, new_outcome)
 
     def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
         """Return the outcome with only one edit, or with all other edits; None if no text has just these."""
-        changes: Sequence[int] = range(len(versions.changes))
+        change_indices: Sequence[int] = range(len(versions.changes))
         if edit.change is not None:
-            changes = (versions.changes.index(edit.change),)
+            change_indices = (versions.changes.index(edit.change),)
         elif sum(other_edit.change is None and other_edit.kind != "renamed" for other_edit in tree.edits) > 1:
             return None
         else:
             # the only edit of the specs' text: the new text with all old declarations has just this edit
             is_undone = not is_undone
         evaluation = by_version(
-            frozenset(changes), other.name if is_undone else one.name, is_undone=is_undone
+            frozenset(change_indices), new_result.name if is_undone else old_result.name, is_undone=is_undone
         )
-        results = () if evaluation is None else evaluation.results
-        return next((EditOutcome.of(result) for result in results if result.object == one.object), None)
+        version_results = () if evaluation is None else evaluation.results
+        return next(
+            (EditOutcome.of(result) for result in version_results if result.object == old_result.object), None
+        )
 
     def suffices(edit: Edit) -> bool:
-        verdict_only = before.verdict is not after.verdict
+        verdict_only = old_outcome.verdict is not new_outcome.verdict
         outcomes_and_goals = (
-            (with_edit(edit, is_undone=False), after),
-            (with_edit(edit, is_undone=True), before),
+            (with_edit(edit, is_undone=False), new_outcome),
+            (with_edit(edit, is_undone=True), old_outcome),
         )
         return all(
             outcome is not None and outcome.same_as(goal, verdict_only=verdict_only)
             for outcome, goal in outcomes_and_goals
         )
 
-    cause = [(edit, unit) for unit in units for edit in tree.units[unit]]
-    if len(units) == 1 and len(cause) > 1:
+    cause_edits = [(edit, unit) for unit in units for edit in tree.units[unit]]
+    if len(units) == 1 and len(cause_edits) > 1:
         # of several edits that share a node, one may be enough
-        cause = next(([pair] for pair in cause if suffices(pair[0])), cause)
-    alone = [
-        outcomes((unit,)) if len(tree.units[unit]) == 1 else with_edit(edit, is_undone=False)
-        for edit, unit in cause
+        cause_edits = next(
+            ([edit_with_unit] for edit_with_unit in cause_edits if suffices(edit_with_unit[0])), cause_edits
+        )
+    outcomes_alone = [
+        edit_outcomes((unit,)) if len(tree.units[unit]) == 1 else with_edit(edit, is_undone=False)
+        for edit, unit in cause_edits
     ]
     return SpecDiff(
-        other.name,
-        one.name,
-        one,
-        other,
+        new_result.name,
+        old_result.name,
+        old_result,
+        new_result,
         tree,
-        tuple(edit for edit, _ in cause),
-        tuple(alone),
+        tuple(edit for edit, _ in cause_edits),
+        tuple(outcomes_alone),
         *_places(tree.edits, versions),
     )
 
@@ -663,7 +691,7 @@ def _places(
                 versions.edited_lines(edit.old_specs, spans)[0],
                 versions.edited_lines(edit.new_specs, spans)[1],
             )
-        for by_edit, place in zip(places_by_edit, places, strict=True):
+        for place_by_edit, place in zip(places_by_edit, places, strict=True):
             if place is not None:
-                by_edit[edit] = place
+                place_by_edit[edit] = place
     return places_by_edit
