@@ -1,1 +1,1 @@
-"""Footprints and the distances between them; knows no formulas."""
+"""Footprints and distances between footprints, without any dependence on formulas."""

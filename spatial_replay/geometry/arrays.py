@@ -31,7 +31,7 @@ Empty: TypeAlias = Callable[[tuple[int, ...]], Floats]
 _Number = TypeVar("_Number", np.float64, np.int64)
 
 _LARGE_BYTES: Final = 2**24
-"""Least size of arrays in a temporary file, bytes. With a full disk, they stay in memory."""
+"""Least size of arrays in a temporary file, bytes. If the disk is full, arrays stay in memory."""
 
 
 def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
@@ -93,7 +93,7 @@ def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
 def flat_index(first: Integers, counts: Integers) -> Integers:
     """Return the flat indices of the elements of rows starting at `first` (n,) with lengths `counts` (n,)."""
     if len(counts) and (counts == counts[0]).all():
-        # the common case, such as only boxes
+        # the common case of equal lengths, such as only boxes
         return np.asarray((first[:, None] + np.arange(counts[0], dtype=np.int64)).reshape(-1))
     row_starts = starts_from_counts(counts)
     return np.asarray(np.repeat(first - row_starts[:-1], counts) + np.arange(row_starts[-1], dtype=np.int64))

@@ -95,7 +95,8 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 @reference_free
 def fill_row(rows: Rows, row: int) -> None:
     """Compute the edges of a row for `rows_distance`."""
-    # with one part per row there are no far parts to skip; the test would take 0.25 instead of 0.23 us
+    # with one part per row there are no far parts to skip; with a test for far parts, boxes with heights took
+    # 0.25 instead of 0.23 us
     has_single_parts = len(rows.radius) == len(rows.bottom)
     for part in range(rows.part_start[row], rows.part_start[row + 1]):
         start, stop = rows.vertex_start[part], rows.vertex_start[part + 1]
@@ -169,7 +170,8 @@ def _separate(
                 if 0.0 <= nx * dy - ny * dx <= edges[edge, 2]:
                     nearest = min(nearest, nx * dx + ny * dy)
         if a_count == 2:
-            # normals of a segment show no gap to a part beyond its ends, so its direction is tried, too
+            # normals of a segment show no gap to a part beyond its ends, so the segment's direction is tried,
+            # too
             other_end = a_start + a_stop - 1 - edge
             x, y = vertices[other_end, 0], vertices[other_end, 1]
             separation = max(separation, _least_height(vertices, b_start, b_stop, x, y, -ny, nx))
@@ -286,11 +288,11 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
 
 @reference_free
 def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) -> float:
-    """Return the least protrusion of a part of row a from the parts of row b."""
     start, radius = rows.vertex_start, rows.radius
     least_protrusion = np.inf
     for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
         # the protrusion from a part is at least the distance from it, so far parts cannot give the least
+        # protrusion
         reach = least_protrusion - (radius[part] - radius[other_part]) - enlargement
         if least_protrusion < np.inf and _is_farther(rows, part, other_part, reach):
             continue
@@ -330,7 +332,6 @@ def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> flo
 def _union_distance(
     rows: Rows, members: Integers, first: tuple[int, int], second: tuple[int, int], enlargement: float
 ) -> float:
-    """Return the signed distance of two unions of rows: the least distance over pairs of rows."""
     least_distance = np.inf
     for first_member in range(first[0], first[1]):
         for second_member in range(second[0], second[1]):
@@ -405,9 +406,9 @@ def measure_rows(
     """Fill `values` (K, T) with K quantities in the samples from `begin` to before `end`; see `measure`.
 
     In sample t, the rows of operand o are the `width[o]` elements of `members` from
-    `member_start[o] + t * width[o]` on. `member_start` (O + 1,) ends with the total.
+    `member_start[o] + t * width[o]` on. `member_start` (O + 1,) ends with the number of all members.
 
-    `edges` (V, 4) is scratch space, one row per vertex. Parallel calls for other samples may share it,
+    `edges` (V, 4) is scratch space, one row per vertex. Parallel calls for other samples may share `edges`,
     because all calls write the same numbers.
     """
     # edges are computed on demand, because many rows of a log are only projected, or unused
@@ -558,10 +559,10 @@ def _push(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
         ax, ay = ax / length, ay / length
         height, low, high = _deepest(vertices, b_start, b_stop, x, y, ay, -ax)
         if height > best_line[4]:
-            # the middle of the contact on the edge
+            # the middle of the edge's part that touches B
             along = 0.5 * (min(max(low, 0.0), length) + min(max(high, 0.0), length)) if low < high else low
             best_line = (x + ax * along, y + ay * along, ay, -ax, height)
-        if a_stop - a_start == 2:  # normals of a segment see no gap to a part beyond its ends
+        if a_stop - a_start == 2:  # normals of a segment show no gap to a part beyond its ends
             x, y = vertices[next_vertex, 0], vertices[next_vertex, 1]
             height, low, high = _deepest(vertices, b_start, b_stop, x, y, ax, ay)
             if height > best_line[4]:

@@ -6,7 +6,7 @@ at least the gap between their boxes along either axis, also for a negative gap.
 of testing all pairs, bit for bit.
 
 A contact is the place where two footprints are nearest, overlap deepest, or where one footprint protrudes
-farthest. Contacts are for pictures and explanations only.
+farthest. Contacts are used only for pictures and explanations.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def misalignment_of(first: float, second: float) -> float:
     return 0.5 * (x * x + y * y)
 
 
-# -------------------------------------------------------------------------------------------- the closest two
+# ------------------------------------------------------------------------------------------- closest pairs
 
 LEFT, RIGHT, LOWER, UPPER = 0, 1, 2, 3
 
@@ -186,7 +186,8 @@ def candidate_pairs(
     greatest_coordinate = max(np.abs(lower_corners).max(), np.abs(upper_corners).max())
     # 1e-9 covers rounding, as in `closest_rows`
     reach = closest_distance + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * greatest_coordinate
-    # a sweep from left to right, because a matrix of all pairs of thousands of footprints takes gigabytes
+    # pairs are found by a sweep from left to right, because a matrix of all pairs takes gigabytes for
+    # thousands of footprints
     left_order = np.argsort(lower_corners[:, 0], kind="stable")
     lower_corners, upper_corners = lower_corners[left_order], upper_corners[left_order]
     end_positions = np.searchsorted(lower_corners[:, 0], upper_corners[:, 0] + reach, side="right").tolist()
@@ -340,8 +341,8 @@ def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protr
 
     Returns:
         (T, 6): x and y of a point of `first`, x and y of a point of `second`, their signed distance (or
-        protrusion), and the top of the higher footprint. The top is NaN if both have no height. The whole row
-        is NaN if an operand is empty.
+        protrusion), and the top of the higher footprint. The top is NaN if neither operand has a height. The
+        whole row is NaN if an operand is empty.
     """
     result = np.full((len(first.rows), 6), np.nan)
     fill_contacts(

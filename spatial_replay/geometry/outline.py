@@ -146,7 +146,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
             if winding == 0:
                 _copy(vertices, first, scratch, 0, counts[outline])
                 count_left = _tidy(scratch, counts[outline], tolerance)
-                # without a tolerance, because nearly collinear vertices have been dropped
+                # the tolerance is 0, because nearly collinear vertices have been dropped
                 winding = _winding(scratch, 0, count_left, 0.0) if count_left > 2 else 1
                 if winding == 0:
                     fault[outline] = NOT_CONVEX
@@ -163,7 +163,7 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
 
 @inlined
 def _copy(source: Floats, source_start: int, target: Floats, target_start: int, count: int) -> None:
-    """Copy vertices in ascending order; a target may overlap a source that begins after the target."""
+    """Copy vertices in ascending order, so that the target may overlap a later source."""
     for offset in range(count):
         target[target_start + offset, 0] = source[source_start + offset, 0]
         target[target_start + offset, 1] = source[source_start + offset, 1]
@@ -180,7 +180,7 @@ def _reverse(vertices: Floats, start: int, stop: int) -> None:
 
 @inlined
 def _tolerance(vertices: Floats, first: int, stop: int) -> float:
-    """Return the distance from a line within which a vertex is on it; -1 for an unusable outline."""
+    """Return the tolerance for vertices on a line; -1 for an unusable outline."""
     least_x = least_y = np.inf
     most_x = most_y = -np.inf
     for vertex in range(first, stop):
@@ -217,8 +217,8 @@ def _winding(vertices: Floats, first: int, stop: int, tolerance: float) -> int:
             left_turns += cross > 0.0
             right_turns += cross < 0.0
         is_upper = cy > by or (cy == by and cx > bx)
-        # a convex outline rises once and falls once; a star, which also has only left turns, does so more
-        # often
+        # a convex outline rises once and falls once; a star also has only left turns, but rises and falls
+        # more often
         vertical_changes += is_upper != was_upper
         was_upper = is_upper
         ax, ay, bx, by = bx, by, cx, cy
@@ -267,7 +267,6 @@ def _distance(vertices: Floats, i: int, j: int) -> float:
 
 @inlined
 def _farthest(vertices: Floats, count: int, origin: int) -> int:
-    """Return the vertex farthest from vertex `origin`."""
     greatest_distance, farthest = -1.0, origin
     for vertex in range(count):
         distance = _distance(vertices, vertex, origin)

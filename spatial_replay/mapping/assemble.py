@@ -65,8 +65,8 @@ class _Assembling:
     Args:
         name: name of the log, for errors and remarks.
         decoder: function from a topic to its decoder.
-        start_ns, end_ns: half-open window of the samples. Messages before the window may be added, because
-            they affect its samples.
+        start_ns, end_ns: half-open window of the samples. Messages outside the window may be added; they
+            affect its samples.
         on_time_jump: effect of a jump back by more than the plan's `late_ns`: an error or the end of the log.
     """
 
@@ -241,7 +241,7 @@ class _Assembling:
         return self._remarks.take() if self._settled_ns == LATEST_NS else ()
 
     def _add_step(self, messages: MessageColumns) -> None:
-        """Pass transforms to the frame tree, and other messages to the readers of their topics."""
+        """Pass transforms to the frame tree, and messages to the readers of their topics."""
         topics = messages.topics
         topic_numbers = map(self._number_of_topic.get, topics, repeat(-1))
         topic_of_message = np.fromiter(topic_numbers, np.int64, len(messages))
@@ -379,7 +379,7 @@ class _Assembling:
     def _counting(
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
     ) -> tuple[Integers, Booleans]:
-        """Return the times from which messages are valid, and whether each message is used."""
+        """Return the time from which each message is valid, and whether the message is used."""
         # a late message is valid after the samples that are final
         return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
@@ -395,7 +395,7 @@ class _Assembling:
             LogError, UsageError: see `Assembler.add`.
         """
         newest_ns = max(self._newest_ns, self._latest_ns)
-        # in a running system, messages older than the newest one may still arrive
+        # in a running system, messages older than the newest message may still arrive
         known_ns = upto_ns if self._is_live or is_last else newest_ns - self._plan.late_ns
         upto_ns = self._silences.limit(upto_ns, known_ns, is_last=is_last)
         if upto_ns <= self._settled_ns:
@@ -412,7 +412,7 @@ class _Assembling:
             trace = self._tracker.trace(times_ns, newest_ns)
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
-        # not in every call, because searching all transforms takes longer than a sample
+        # old transforms are dropped rarely, because searching all transforms takes longer than a sample
         if upto_ns - self._forgot_ns > DISORDER_NS:
             self._tree.forget_before(upto_ns - HISTORY_NS)
             self._forgot_ns = upto_ns
@@ -525,7 +525,6 @@ class _Stamped(NamedTuple):
     contents: list[Any]
 
     def before(self, message_index: int) -> _Stamped:
-        """Return the messages before an index."""
         count = int(np.searchsorted(self.message_indices, message_index))
         return _Stamped(
             self.reader,
@@ -573,7 +572,7 @@ class _SampleTimes:
         return sample_times_ns
 
     def note(self, time_ns: int) -> bool:
-        """Note an extra sample; return False unless there is a sample, and the last sample is earlier."""
+        """Note an extra sample if it follows the last sample; return whether it does."""
         comes_after = 0 <= self._last_ns < time_ns
         if comes_after:
             self._last_ns = time_ns
@@ -629,8 +628,8 @@ class _Silences:
         self._fallback_begin_ns: int | None = None
         # message times of the sampled topic: the last two before the next samples, and all later times
         self._past_ns = self._times_ns = np.empty(0, np.int64)
-        # whether fallback topics are sampled after each of `_times_ns`; the last element: before the first
-        # time
+        # whether fallback topics are sampled after each of `_times_ns`; the last element is for the time
+        # before the first
         self._is_filled = np.zeros(1, np.bool_)
         self._unread_ns: int | None = None
         self._first_pause_ns: tuple[int, int | None] | None = None
@@ -671,10 +670,10 @@ class _Silences:
             last_ns = int(times_ns[-1])
             upto_ns = upto_ns if last_ns > upto_ns or is_filled[-2] else last_ns
         elif self._fallback_begin_ns is not None and not is_filled[-1]:
-            # not yet decided whether samples begin at fallback topics
+            # it is not yet decided whether samples begin at fallback topics
             upto_ns = min(upto_ns, self._fallback_begin_ns - 1)
         self._times_ns, self._is_filled = times_ns, is_filled
-        # past messages stay past, even if this request ends before these messages
+        # past messages stay past, even if this request ends before an earlier request
         past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
         self._past_ns = times_ns[times_ns <= past_ns][-2:]
         if len(times_ns) and self.first_ns is None:
@@ -701,7 +700,7 @@ class _Silences:
         return np.append(next_ns[1:] - times_ns > limits_ns, begins_late)
 
     def sampled_in(self, others_ns: Integers) -> Integers:
-        """Return the sampled times among times of fallback topics up to the `limit`."""
+        """Return the times to sample among fallback topics' times, which are up to the `limit`."""
         message_index = np.searchsorted(self._times_ns, others_ns, "right") - 1
         is_sampled = self._is_filled[message_index]
         start_ns, end_ns = self._window_ns
@@ -711,7 +710,7 @@ class _Silences:
         return sampled_ns
 
     def _note(self, fallback_ns: Integers, message_index: Integers) -> None:
-        """Note samples at fallback topics, with the index of the sampled topic's preceding message."""
+        """Note samples at fallback topics, each with the index of the sampled topic's preceding message."""
         before_ns = fallback_ns[message_index < 0]
         if len(before_ns) and self.before_ns is None:
             self.before_ns = int(before_ns.min())
@@ -888,7 +887,7 @@ class LiveAssembler(_Assembling):
         if messages and not self.is_finished:
             self._add_step(self._columns(messages))
         waited_ns = self._deadlines[-1][1] if self._deadlines else max(self._settled_ns, self._expired_ns)
-        # one deadline for all times since the last deadline
+        # one deadline covers all times since the last deadline
         if waited_ns < self._newest_ns:
             patience_s = _MOMENT_S if self._is_in_order else self._max_delay_s
             self._deadlines.append((now_s + patience_s, self._newest_ns))
@@ -981,7 +980,7 @@ class LiveAssembler(_Assembling):
         back_ns = newest_ns[:-1] - times_ns
         # a message that steps back farther is too late anyway
         back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
-        # one nanosecond more, because samples are final only before the earliest time that may still come
+        # one nanosecond more, because samples are final only before the earliest time that may still arrive
         self._step_back_ns[name] = max(self._step_back_ns[name], int(back_ns.max(initial=-1)) + 1)
         if name in self._transform_topics:
             self._are_transforms_new = True

@@ -188,7 +188,7 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     passed_s, log_s = arrivals.stamps_passed_s, arrivals.log_passed_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps and passed_s > 0 and log_s > 0):
         return None
-    # a simulation may run at any rate, except exactly at the factor between two units
+    # a simulation may run at any rate, but a rate that equals a factor between units shows a wrong unit
     factor = passed_s / log_s
     if not any(
         abs(factor * unit_factor - 1) < _UNIT_ERROR or abs(factor / unit_factor - 1) < _UNIT_ERROR
@@ -216,7 +216,7 @@ def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     usual_s = medians_s[(len(medians_s) - 1) // 2]
     off_s = late_s.median - usual_s
-    # results of long computations are late, too, but by varying delays
+    # results of long computations are also late, but with varying delays
     is_steady = late_s.quantile(0.9) - late_s.quantile(0.1) < _STEADY_S
     if abs(off_s) < _OTHER_CLOCK_S or (0 < off_s < _SLOWEST_S and not is_steady):
         return None
@@ -255,7 +255,8 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _MOST_UPRIGHT, _FEW_UPRIGHT, _SOME_TURNED = 0.9, 0.5, 0.05
-"""Shares of objects: upright in the other order, upright in this order, turned in the other order."""
+"""Limits of shares of objects: least share upright in the other order, greatest share upright in this order,
+least share turned in the other order."""
 
 
 def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
@@ -343,7 +344,8 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
         return None
     fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
     keys = max(fits, key=lambda keys: fits[keys].real, default=None)
-    # a straight path is no evidence, because a robot may go sideways. A heading next to fixes is from north.
+    # a straight path is no evidence, because a robot may go sideways. A heading next to satellite fixes
+    # counts from north.
     is_straight = abs(motions.course) > _STRAIGHT
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
     if keys is None or (is_straight and not ("north" in keys and is_compass)):
@@ -379,8 +381,8 @@ _FEW_STEPS: Final = 20
 _STRAIGHT, _CLOSE = 0.8, 0.95
 """Least lengths of mean unit vectors: courses on a straight path, differences from a fitting angle."""
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
-"""Least length of a steady mean unit vector, and limits of its angle in radians: as read, in another
-reading."""
+"""Least length of a steady mean unit vector, and limits of its angle, radians: for the yaw as read, and for
+another reading."""
 
 
 def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
@@ -401,7 +403,7 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FAST_DEGREES: Final = 0.01
-"""Speed that objects do not reach in degrees, degrees per second."""
+"""Limit of the speed of positions in degrees, degrees per second."""
 
 
 def _upward(evidence: TopicEvidence, log: Log) -> str | None:
@@ -479,7 +481,7 @@ def _precision(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _COARSE: Final = 0.05
-"""Largest step of float32, in sizes of the smallest objects."""
+"""Largest step of float32, as a share of the smallest objects' size."""
 _METRES_A_DEGREE: Final = 111_320.0
 """Length of a degree at the equator, metres."""
 
@@ -496,7 +498,8 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
-    # few returns are sound, because each file of a bag has its own channels, and a publisher may be replaced
+    # few returns are no evidence, because each file of a bag has its own channels, and a publisher may be
+    # replaced
     if arrivals.returns < max(_FEW, _IN_TURN * arrivals.messages):
         return None
     shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0

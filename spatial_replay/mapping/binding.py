@@ -257,7 +257,7 @@ def _text(value: object, path: FieldPath) -> str:
     if isinstance(value, int | float) or (hasattr(value, "item") and not hasattr(value, "__len__")):
         return str(value)
     if field_names(value) in (("value",), ("uuid",)):
-        # such as osi3.Identifier and unique_identifier_msgs/UUID
+        # a message with one field, such as osi3.Identifier and unique_identifier_msgs/UUID
         return _text(get_field(value, field_names(value)[0]), path)
     if _is_uuid(value):
         digits = bytes(value).hex()  # type: ignore[call-overload]
@@ -291,7 +291,7 @@ _Resolved = TypeVar("_Resolved")
 _Alternative = TypeVar("_Alternative", str, tuple[str, ...], str | tuple[str, ...])
 
 _SECOND_NS = 10**9
-# names in ROS 2, in ROS 1, in Python and JSON of ROS 1, and in protobuf
+# names of the two fields in ROS 2, in ROS 1, in Python and JSON of ROS 1, and in protobuf
 _TIME_FIELDS = (
     ("sec", "nanosec"),
     ("sec", "nsec"),
@@ -360,7 +360,7 @@ class TimeGetter:
     unit_ns: int
 
     def nanoseconds(self, values: Sequence[object]) -> list[int]:
-        """Return the time, nanoseconds, of each value. Values are messages, or objects, according to `path`.
+        """Return the time of each value in nanoseconds. Values are messages or objects, according to `path`.
 
         Raises:
             FieldError: a time lies outside the times of a log.
@@ -386,7 +386,7 @@ class TimeGetter:
                 f"{self.path.text}: its nanoseconds, {nanoseconds.max()}, are not below one second, so the"
                 " stamp is invalid; `clock: log` takes the time of recording"
             )
-        # checked before the product below, because it could overflow
+        # this check comes before the product below, because the product could overflow
         if len(seconds) and max(np.abs(seconds).max(), np.abs(nanoseconds).max()) >= LATEST_NS // _SECOND_NS:
             raise FieldError(f"{self.path.text}: the time lies outside those of a log")
         return [int(time) for time in (seconds * _SECOND_NS + nanoseconds).tolist()]
@@ -410,7 +410,7 @@ def ns_from_text(text: str, unit_ns: int) -> int:
         ContentError: the text is none of these.
     """
     if seconds_match := _SECONDS.fullmatch(text):
-        # exact, because a float of seconds since 1970 resolves only 0.24 us
+        # the conversion is exact, because a float of seconds since 1970 resolves only 0.24 us
         return int(Decimal(seconds_match[1]) * (_SECOND_NS if seconds_match[2] else unit_ns))
     date_match = _DATE.fullmatch(text)
     try:

@@ -1,7 +1,7 @@
 """Detections in columns: chunks of decoded objects in; poses, solids and names as arrays out.
 
-Coordinates are those of the messages; `tracker` transforms them into the fixed frame. Footprints are
-projections of solids along z, with height intervals.
+Coordinates are in the frames of messages; `tracker` transforms coordinates into the fixed frame. Footprints
+are projections of solids along z, with height intervals.
 """
 
 from __future__ import annotations
@@ -252,11 +252,11 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         return [Solid(solid_kind, position, quaternion, scale)]
     points = [_vector(point, get) for point in get(marker, "points") or ()]
     if marker_type in (6, 7):
-        # elements of a list marker, each at a point in the marker's frame, which `_listed_solids` adds
+        # elements of a list marker; `_listed_solids` shifts each element to its point in the marker's frame
         element_kind = BOX if marker_type == 6 else SPHERE
         return [Solid(element_kind, position, quaternion, scale, (point,)) for point in points]
     if marker_type == 11 and len(points) >= 3:
-        # the points of a triangle list are in units of its scale
+        # the points of a triangle list are in units of the marker's scale
         scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
         return _triangles((position, quaternion), scaled)
     return []
@@ -269,8 +269,7 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
         for primitive in get(entity, name) or ():
             size = _vector(get(primitive, "size"), get)
             if kind == CYLINDER:
-                # a cylinder around a cone. A protobuf sender that leaves the scales unset sends 0, which
-                # means 1.
+                # the cylinder around a cone; scales that a protobuf sender leaves unset are 0 and mean 1
                 scale = (
                     max(_or_one(get(primitive, "bottom_scale")), _or_one(get(primitive, "top_scale"))) or 1.0
                 )

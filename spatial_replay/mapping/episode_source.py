@@ -328,7 +328,7 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
     columns_by_index: dict[int, EpisodeColumns] = {}
     frame_count = 0
     for index, source in enumerate(sources if sources[0].mapped_by is not None else ()):
-        # any error, because one episode must not end the reading of other episodes
+        # all errors are suppressed, because one episode must not end the reading of other episodes
         with suppress(Exception):
             columns = source.columns()
             frame_count += len(columns.times_ns)

@@ -31,10 +31,11 @@ _MOST_VALUES: Final = 4_096
 """Limit of values that a `Spread` keeps for its median."""
 
 _ROWS_AT_ONCE: Final = 4_096
-"""Number of objects measured together, because a short column costs as much as a long one."""
+"""Number of objects measured together, because a short column costs as much as a long column."""
 
 _LONGEST_GAP: Final = 9
-"""Limit of counted gaps between two reports of an object, messages. Longer gaps count as this gap."""
+"""Limit of counted gaps between two reports of an object, messages. Longer gaps count as gaps of this
+length."""
 
 _MOST_LEAPS: Final = 4
 """Limit of reports after which an object may return to its place."""
@@ -468,8 +469,8 @@ class TopicEvidence:
     """Measurements of the messages of one mapped topic, and of their objects and signals.
 
     Attributes:
-        arrivals: arrivals of its messages.
-        motions: motions of its objects.
+        arrivals: arrivals of the topic's messages.
+        motions: motions of the topic's objects.
         objects: number of reports of objects.
         most_at_once: greatest number of objects in one message.
         quaternion_length: lengths of quaternions other than zeros.
@@ -530,7 +531,7 @@ class TopicEvidence:
 
     @property
     def uses_frames(self) -> bool:
-        """Whether transforms place its objects."""
+        """Whether transforms place the topic's objects."""
         return self.reader.needs_frame and self.reader.extractor is not None
 
     @property
@@ -549,7 +550,7 @@ class TopicEvidence:
 
     @property
     def frames(self) -> frozenset[str]:
-        """Names of frames in its messages."""
+        """Names of frames in the topic's messages."""
         extractor = self.reader.extractor
         return frozenset() if extractor is None else frozenset(extractor.noted_frames - {""})
 
@@ -585,7 +586,7 @@ class TopicEvidence:
 
     @property
     def object_names(self) -> frozenset[str]:
-        """Names of its objects."""
+        """Names of the topic's objects."""
         return frozenset(str(self.names.by_code[code]) for code in self.name_codes)
 
     def add_objects(
@@ -781,9 +782,9 @@ class TopicEvidence:
 _FAR: Final = 1e4
 """Least coordinate at which the resolution of float32 is measured."""
 _LEVEL: Final = 0.0076
-"""Limit of x * x + y * y for upright objects, (1 - cos 10 degrees) / 2."""
+"""Limit of x * x + y * y of an upright object's quaternion: (1 - cos 10 degrees) / 2."""
 _TURNED: Final = 0.174
-"""Limit of z for turned objects, sin(20 degrees / 2)."""
+"""Least z of a turned object's quaternion: sin(20 degrees / 2)."""
 
 
 def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:

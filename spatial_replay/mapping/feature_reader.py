@@ -130,7 +130,7 @@ class FeatureReading:
     """The entries of a mapping, bound to a data set.
 
     Attributes:
-        objects: objects, in the order of the mapping.
+        objects: bound objects, in the order of the mapping.
         absent: optional features that the data set lacks.
     """
 

@@ -37,7 +37,7 @@ Style: TypeAlias = Literal["attributes", "keys"]
 
 
 def style_of(value: object) -> Style:
-    """Return how fields of a message are read: by key for JSON objects, otherwise by attribute."""
+    """Return the access to a message's fields: by key for JSON objects, otherwise by attribute."""
     return "keys" if isinstance(value, dict) else "attributes"
 
 
@@ -128,7 +128,7 @@ def _sparse(value: object) -> object:
 
 
 def from_protobuf_json(value: object, objects: str) -> object:
-    """Return a JSON message, possibly written by protobuf, with the fields of its definition.
+    """Return a JSON message with the fields of its definition, also if protobuf wrote the message.
 
     ProtoJSON renames fields and leaves out defaults (https://protobuf.dev/programming-guides/json/). So a
     copy of `frameId` is added as `frame_id`, missing coordinates as 0, and a missing list of objects as an
@@ -566,7 +566,7 @@ def elements_of(value: Any) -> Sequence[object]:
 
 
 def keys_of(value: Mapping[Any, object]) -> list[Any]:
-    """Return the keys of a protobuf map, or the keys with JSON objects as values of a JSON object."""
+    """Return all keys of a protobuf map, or the keys of a JSON object whose values are objects."""
     return [key for key, part in value.items() if not isinstance(value, dict) or isinstance(part, dict)]
 
 

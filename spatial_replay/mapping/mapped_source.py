@@ -275,7 +275,7 @@ class _CopiedMessages:
         )
         self._waiting = [waiting_rest] if len(waiting_rest) else []
         self._waiting_bytes = sum(map(len, waiting_rest.payloads))
-        # by channel, because a topic may also have a channel that a replay writes
+        # messages are selected by channel, because a topic may also have a channel that a replay writes
         copied_messages = select(
             ready_messages, np.flatnonzero(np.isin(ready_messages.channel, self._channel_numbers))
         )

@@ -327,7 +327,7 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
     value: Any = document.value
     shapes = value.get("shapes") or {}
     sampling = value.get("sample", {})
-    # the hash is of a canonical form, so that it does not depend on layout and comments
+    # the hash is computed from a canonical form, so that it does not depend on layout and comments
     canonical_text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
     topics = tuple(

@@ -107,7 +107,7 @@ _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
 _KNOWN = ("pedestrian", "bike", "car", "truck", "motorcycle", "other_vehicle", "barrier", "sign")
 _OBJECT_CLASSES = MappingProxyType({str(i): name for i, name in enumerate((*_UNKNOWN, *_KNOWN))})
 
-# names in successive versions of vision_msgs
+# names of the field in successive versions of vision_msgs
 _RESULT_CLASS = ("results[best].hypothesis.class_id", "results[best].id", "results[best].hypothesis.id")
 
 _POSE = MessageLayout(position=(("pose.position",),), orientation=("pose.orientation",))
@@ -154,8 +154,8 @@ _MARKER = MessageLayout(
 
 GEODETIC: Alternatives = ("latitude", "longitude")
 """Fields of a fix, in degrees."""
-# no frame: that of the receiver does not affect latitude and longitude
-# the status is negative without a fix (sensor_msgs/NavSatStatus)
+# the layout has no frame, because a receiver's frame does not affect latitude and longitude. The status is
+# negative without a fix (sensor_msgs/NavSatStatus).
 _FIX = MessageLayout(position=((*GEODETIC, "status.status"), GEODETIC), frame=())
 
 BUILT_IN: Table[str, MessageLayout] = MappingProxyType(

@@ -138,7 +138,7 @@ class Guess:
 
     @property
     def is_body(self) -> bool:
-        """Whether it has a name, and an orientation, a size or an outline; required of further lists."""
+        """Whether the object has a name and an extent or an orientation; required of further lists."""
         has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
         return bool(self.names) and has_extent and not self.is_plan
 
@@ -225,7 +225,7 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
     if guess.names == (INDEX,):
         return guess
     if isinstance(guess.position, tuple) and geodetic_order(guess.position):
-        # the frame of a fix is the name of its receiver
+        # the frame of a fix identifies its receiver
         guess = replace(guess, names=(*guess.names, "frame_id"))
     names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
     with suppress(FieldError):
@@ -463,7 +463,7 @@ def _object_in(value: object) -> Guess | None:
 
 
 def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
-    """Return the path of an outline and its corners; (None, []) without one."""
+    """Return the path of an outline and its corners; (None, []) without an outline."""
     for path in _paths_by_name(fields, _OUTLINES):
         value = fields[path]
         if not is_list(value) and "points" in field_names(value):
@@ -491,7 +491,7 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     for path in _paths_by_name(fields, _BOUNDS):
         if _numbers(fields[path], 4):
             return path
-    # reversed, so that the first field is used if several fields have one name
+    # the order is reversed, so that the first of several fields with one name is used
     path_by_name = {
         "_".join(_words(path.split(".")[-1])): path for path in reversed(fields) if _is_number(fields[path])
     }
@@ -518,7 +518,8 @@ def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]
 def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether bounds have width and height instead of a second corner.
 
-    Names decide. Without such names, a box whose second corner would be left of or below its first decides.
+    Names decide. Without such names, bounds have a size if the second corner of a box would be left of or
+    below its first corner.
     """
     bounds = guess.bounds
     if bounds is None or isinstance(bounds, tuple):
@@ -695,7 +696,7 @@ def _is_number(value: object) -> bool:
 
 
 def _has(value: object, names: str) -> bool:
-    """Return whether a message has a number in each of the fields with these one-letter names."""
+    """Return whether a message has numbers in all fields with the given one-letter names."""
     fields = field_names(value)
     if isinstance(value, Sparse):
         allowed_names = "xyz" if names == "xy" else names

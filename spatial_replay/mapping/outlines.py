@@ -43,7 +43,7 @@ def outlines_from_lists(
     An outline with too few corners gets one corner at NaN, which makes its object unknown.
 
     Args:
-        is_bounds: whether each list is two opposite corners of a box. They become four corners.
+        is_bounds: whether each list is two opposite corners of a box, to be expanded to four corners.
         have_size: whether bounds have width and height instead of the second corner.
     """
     corner_counts, points = points_from_lists(lists)
@@ -108,7 +108,7 @@ def read_rows(get: Get, elements: Sequence[object], width: int, style: Style) ->
     """
     element_count = len(elements)
     if style == "attributes":
-        # faster than np.array of a list of tuples, but np.fromiter refuses None
+        # np.fromiter is faster than np.array of a list of tuples, but refuses None
         with suppress(TypeError):
             numbers = chain.from_iterable(map(get, elements))
             return np.fromiter(numbers, np.float64, element_count * width).reshape(element_count, width)

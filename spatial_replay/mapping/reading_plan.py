@@ -34,7 +34,7 @@ from spatial_replay.mapping.transforms import HISTORY_NS
 from spatial_replay.text import nearest_hint, plural
 from spatial_replay.trace.trace import LONG_PAUSE
 
-# a bound, so that a window needs messages only up to 11 s after its end and 13 s before its start
+# with this bound, a window needs messages only up to 11 s after its end and 13 s before its start
 _LONGEST_SILENCE_NS: Final = 10 * 10**9
 """Silence of the sampled topic, nanoseconds, that is always a pause, even if messages are rare."""
 
@@ -186,7 +186,7 @@ class ReadingPlan:
     def lookback_ns(self, topic: str) -> int | None:
         """Return the time before a window in which a topic's messages affect the window, nanoseconds.
 
-        None means that all earlier messages affect it, for example static transforms.
+        None means that all earlier messages affect the window, for example static transforms.
         """
         lookbacks_ns = [self._lookback_ns(planned) for planned in self.planned if planned.topic == topic]
         return None if None in lookbacks_ns else max(filter(None, lookbacks_ns), default=0)
@@ -350,7 +350,7 @@ def _plan_of_topic(
     mapping: LogMapping, entry: TopicMapping | None, topic: Topic, entry_index: int, needs_frames: bool
 ) -> PlannedTopic:
     kind = short_type((entry.type if entry is not None else None) or topic.type)
-    # only the first entry of a topic adds its transforms
+    # only the first entry of a topic adds the topic's transforms
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and entry_index == 0
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
     layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None

@@ -79,7 +79,7 @@ _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "d
 """Last words of topic names that concern programs instead of objects."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of sensor frames, which are mounted on objects."""
-# PX4 publishes in this frame, see https://docs.px4.io/main/en/ros2/user_guide.html
+# PX4 publishes in the frame north, east, down (https://docs.px4.io/main/en/ros2/user_guide.html)
 _NORTH_EAST_DOWN = re.compile(
     r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position|vehicle_odometry)(?![a-z0-9])", re.IGNORECASE
 )
@@ -302,10 +302,9 @@ def _with_frame_remark(suggestion: TopicSuggestion) -> TopicSuggestion:
 
 
 def _with_prefix(suggestion: TopicSuggestion, prefix: str) -> TopicSuggestion:
-    """Return a suggestion with a prefix for its object names."""
     name = f"{prefix}_{suggestion.name}" if "{" in suggestion.name else prefix
     fields = {**(suggestion.fields or {}), "name": yaml_text(name)}
-    # `objects` first, then `name`, as in handwritten mappings
+    # `objects` comes first, then `name`, as in handwritten mappings
     ordered_fields = sorted(fields.items(), key=lambda field: {"objects": 0, "name": 1}.get(field[0], 2))
     further = tuple(_with_prefix(part, prefix) for part in suggestion.further)
     return replace(suggestion, fields=dict(ordered_fields), name=name, further=further)
@@ -452,7 +451,6 @@ def _of_guess(topic: Topic, guess: Guess, examples: Sequence[object]) -> TopicSu
 
 
 def _join_lists(suggestions: Sequence[TopicSuggestion]) -> TopicSuggestion:
-    """Join the suggestions for a topic's lists of objects into one suggestion."""
     first_suggestion, *other_suggestions = suggestions
     further_suggestions = [
         suggestion
@@ -673,13 +671,13 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
 def _choose_frame(
     suggestions: Sequence[TopicSuggestion], transforms: Sequence[object]
 ) -> tuple[list[str], dict[str, str]]:
-    """Choose the frame in which most topics can be placed as the fixed frame.
+    """Choose the fixed frame: the frame in which most topics can be placed.
 
     Args:
         transforms: messages with transforms.
 
     Returns:
-        Lines of the mapping, and by topic the reason why it cannot be placed.
+        Lines of the mapping, and reasons why topics cannot be placed, by topic.
     """
     frames = sorted(frozenset().union(*(suggestion.frames for suggestion in suggestions)))
     edges = sorted({edge for message in transforms for edge in _edges(message)})
@@ -796,7 +794,7 @@ def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, i
     topics = [suggestion.topic for suggestion in active]
     begin_times_ns = [first_ns.get(topic.name, FOREVER) for topic in topics]
     greatest_count = max(topic.count or 0 for topic in topics)
-    # topics with at least half as many messages as the most frequent one
+    # topics with at least half as many messages as the most frequent topic
     eligible_topics = [
         (begin_ns, topic)
         for begin_ns, topic in zip(begin_times_ns, topics, strict=True)

@@ -199,7 +199,7 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
 def _without_bodies(
     suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
 ) -> tuple[list[Suggestion], dict[str, str]]:
-    """Return the suggestions that are not bodies of the data set, and the names of the bodies by feature."""
+    """Return the suggestions that are not bodies of the data set, and the names of bodies by feature."""
     body_by_feature: dict[str, str] = {}
     for suggestion in suggestions:
         for body in bodies:
@@ -292,7 +292,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
         for start in range(width - 6)
     ]
     joint_starts: list[int] = []
-    # the most exact quaternions first, because numbers of two bodies do not overlap
+    # the most exact quaternions are taken first, because the numbers of two bodies do not overlap
     for start in np.argsort(length_errors, kind="stable").tolist():
         if length_errors[start] < _EXACT and all(
             abs(start - joint_start) >= 7 for joint_start in joint_starts

@@ -122,7 +122,7 @@ class Extractor:
         if mapping.has_zeros_left_out and mapping.position is not None:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
-        """Number of outlines with too few corners, whose objects are unknown."""
+        """Number of outlines with too few corners; their objects are unknown."""
         self.stamp_faults: list[str] = []
         """Reasons why fields with names of stamps are not times."""
         self.unset: Counter[str] = Counter()
@@ -206,7 +206,7 @@ class Extractor:
                 another form. Only a FieldError describes the difference.
         """
         values, message_indices, list_keys = self._flatten(messages)
-        # a list of changes, such as in moveit_msgs/PlanningScene
+        # `is_diff` marks a list of changes, as in moveit_msgs/PlanningScene
         if messages and "is_diff" in field_names(messages[0]):
             get = lenient_getter(style_of(messages[0]))
             self.differences += sum(bool(get(message, "is_diff")) for message in messages)
@@ -235,7 +235,7 @@ class Extractor:
             if any(leads_somewhere(path, element) for path in paths for element in objects.values):
                 self.unseen = ()
         if not is_early:
-            # set last, because the messages are read again one by one after a failure
+            # stamps are set last, because the messages are read again one by one after a failure
             self._scene_stamps_ns = scene_stamps_ns
         return chunk
 
@@ -346,7 +346,7 @@ class Extractor:
             )
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
-        """Return all objects, the indices of their messages, and their indices, or keys, in their lists."""
+        """Return all objects, each object's message index, and each object's index or key in its list."""
         if self._list_path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
         if self._get_list is None and messages:
@@ -593,8 +593,8 @@ class TopicReader:
     def advances_time(self) -> bool:
         """Whether the topic's times advance the time of the log.
 
-        Log times advance it. Stamps of transforms and of latched messages do not, because they may be in the
-        future or the past.
+        Log times advance the log's time. Stamps of transforms and of latched messages do not, because these
+        stamps may be in the future or the past.
         """
         if self.planned.clock == "log":
             return True
@@ -652,7 +652,7 @@ class TopicReader:
                 contents[begin : begin + chunk_size],
                 all_times_ns[begin : begin + chunk_size],
             )
-            # a view, so that clearing its flags also clears flags in `good`
+            # `is_chunk_good` is a view, so that clearing its flags clears the flags in `good`
             is_chunk_good = good[begin : begin + chunk_size]
             if not self.decodes_on_arrival:
                 messages = self.decode(messages, chunk_times_ns, is_chunk_good)
@@ -732,7 +732,7 @@ class TopicReader:
         except MISFITS:
             pass
 
-        # one message has another form, which reading each message alone finds
+        # one message has another form, and is found by reading each message alone
         def read(indexed_message: tuple[int, object]) -> DetectionChunk:
             index, message = indexed_message
             was_bound = extractor.is_bound
@@ -949,7 +949,7 @@ class PendingMessages:
     def _without_steps(
         self, times_ns: Integers, sequence_numbers: Integers, record_numbers: Integers, upto_ns: int
     ) -> Integers:
-        """Return times without steps back. Times stay unchanged if sequence numbers decrease at a step."""
+        """Return times without steps back; unchanged times unless all sequence numbers increase."""
         record_order = np.argsort(record_numbers, kind="stable")
         recorded_times_ns = times_ns[record_order]
         step_indices = np.flatnonzero(recorded_times_ns[1:] < recorded_times_ns[:-1] - LEAST_STEP_NS)
@@ -967,7 +967,7 @@ class PendingMessages:
         )
         if is_sorted:
             return times_ns
-        # strictly increasing, so that a message recorded later is valid later
+        # times increase strictly, so that a message recorded later is valid later
         message_numbers = np.arange(len(recorded_times_ns))
         moved_times_ns = np.empty_like(recorded_times_ns)
         moved_times_ns[record_order] = (

@@ -67,9 +67,9 @@ class Events:
         return select(self, np.flatnonzero(is_last & (self.row != LEFT)))
 
     def after(self, before: Events) -> Events:
-        """Return these events joined with earlier events of the same topic."""
+        """Return earlier events of the topic joined with these events."""
         joined = concatenate_tables([before, self])
-        # sorted, because events of a running system may be late
+        # events are sorted, because events of a running system may be late
         return select(joined, np.lexsort((joined.time_ns, joined.name)))
 
     def state(self, times_ns: Integers, max_age_ns: int) -> States:
@@ -308,7 +308,7 @@ def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
 
 
 def _radius(covariance: Floats) -> Floats:
-    """Return the longer half axis (R,) of each covariance's ellipse in the plane; shape of input (R, 3, 3).
+    """Return the longer half axis (R,) of the ellipse in the plane of each covariance (R, 3, 3).
 
     The result is NaN for a negative variance, because some programs mark an unknown covariance so.
     """
@@ -542,7 +542,7 @@ class Tracker:
         return np.asarray(is_judged)
 
     def forget(self, upto_ns: int) -> None:
-        """Drop old observations, except the last one of each object and signal."""
+        """Drop old observations, except the last observation of each object and signal."""
         if self._advances < _OLD_ADVANCES and len(self._rows) < _OLD_ROWS:
             return
         self._advances = 0
@@ -614,7 +614,7 @@ class Tracker:
         if repeated_indices:
             for repeated_index in repeated_indices:
                 report(repeated_index, " is there twice in one message; name each object once")
-            # unknown, because either of the two reports may be right
+            # the object is unknown, because either of the two reports may be right
             row_numbers[repeated_indices] = self._add(
                 ObservationRows.blank(detections.class_code[repeated_indices])
             )
@@ -718,7 +718,7 @@ class Tracker:
         transforms = Transforms.unknown(object_count)
         clock_ns, log_ns = times_ns[detections.message], log_times_ns[detections.message]
         stamp_ns = np.zeros(object_count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
-        # a stamp of 0 means a stamp that was not set
+        # a stamp of 0 was not set
         has_stamp = stamp_ns != 0
         following_indices = self._follows(reader, detections)
         # objects that move with frames are placed later, at the times of samples
@@ -780,7 +780,6 @@ class Tracker:
         return np.asarray((next_index > 0) & (next_ns - before_ns > max_gap_ns) & (times_ns > before_ns))
 
     def _states(self, times_ns: Integers, newest_ns: int) -> States:
-        """Return the states of the objects of all topics at some times."""
         states = []
         for topic, events in self._events.items():
             state = events.state(times_ns, self.readers[topic].planned.max_age_ns)

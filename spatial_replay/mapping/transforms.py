@@ -5,7 +5,7 @@ linearly and rotation along the shorter arc, as in tf2. There is no extrapolatio
 until another static transform replaces it.
 
 A step back of the stamps begins a new run, such as a restarted simulation. Only static transforms hold across
-runs. Rotations are arrays: quaternions (x, y, z, w) and matrices.
+runs. Rotations are quaternions (x, y, z, w) or matrices, in arrays.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def matrices_from_quaternions(quaternions: Floats) -> tuple[Floats, Floats]:
     matrices[:, 2, 0] = 2 * (x * z - y * w)
     matrices[:, 2, 1] = 2 * (y * z + x * w)
     matrices[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    # exactly the identity, also for norms between 0 and the limit
+    # the matrix is exactly the identity, also for norms between 0 and the limit
     matrices[is_zero] = np.eye(3)
     return matrices, np.where(is_zero, np.nan, yaw_of(matrices))
 
@@ -178,7 +178,7 @@ class Transforms(NamedTuple):
         )
 
     def inverse(self) -> Transforms:
-        """Return b_from_a for a_from_b."""
+        """Return b_from_a for a_from_b (self)."""
         rotation = np.swapaxes(self.rotation, 1, 2)
         return Transforms(rotation, -np.einsum("nij,nj->ni", rotation, self.translation), self.known)
 
@@ -265,7 +265,7 @@ class FrameTree:
         log_ns: int,
         is_static: bool,
     ) -> None:
-        """Add one transform, or count it if tf2 would ignore it.
+        """Add one transform. A transform that tf2 would ignore is only counted.
 
         A static transform holds from its stamp on. A frame's first static transform also holds before its
         stamp. A static transform holds from its clock time on if it has no stamp, or a stamp older than its
@@ -453,7 +453,7 @@ class FrameTree:
         next_indices = np.searchsorted(series.times_ns, times_ns, "left")
         is_inside = next_indices <= last_index
         next_indices = np.minimum(next_indices, last_index)
-        # at the time of a transform nothing is interpolated
+        # nothing is interpolated at the time of a transform
         previous_indices = np.where(
             is_inside & (series.times_ns[next_indices] == times_ns), next_indices, next_indices - is_inside
         )
@@ -473,7 +473,7 @@ class FrameTree:
         is_held = question.holds & ~is_between & (times_ns - start_ns <= question.longest_ns)
         is_known &= is_between | is_held
         span_ns = np.where(end_ns > start_ns, end_ns - start_ns, 1)
-        # no interpolation between poses in different parents; the earlier pose holds
+        # poses in different parents are not interpolated; the earlier pose holds
         is_moving = (
             is_between
             & (end_ns > start_ns)
@@ -545,7 +545,7 @@ class FrameTree:
         poses = np.array([entry.pose for entry in entries])
 
         def apart(first: Floats, second: Floats) -> Floats:
-            # absolute value, because q and -q are the same rotation
+            # the absolute value is taken, because q and -q are the same rotation
             cosine = np.abs(np.einsum("ij,ij->i", first[:, 3:], second[:, 3:]))
             turns = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turns)

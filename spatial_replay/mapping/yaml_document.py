@@ -202,7 +202,7 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
     except (OSError, ValueError) as error:
         raise MissingFileError.of(path, error) from None
     try:
-        # without the byte order mark that some editors write
+        # utf-8-sig drops the byte order mark that some editors write
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
@@ -283,7 +283,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
         for violation in error.context:
             violations_by_branch.setdefault(violation.schema_path[0], []).append(violation)
         for violations in violations_by_branch.values():
-            # violations of an alternative for another type would not help
+            # violations of an alternative for another type are skipped, because they would not help
             if not any(
                 violation.validator == "type" and len(violation.absolute_path) == len(place)
                 for violation in violations
@@ -322,7 +322,6 @@ def _around(error: Any) -> str:
 
 
 def _in_words(value: object) -> str:
-    """Return a short text for a value."""
     if isinstance(value, dict):
         return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
     return cut(json.dumps(value, ensure_ascii=False, default=str), 60)

@@ -1,4 +1,4 @@
-"""Logs of any format: open one, or list its contents.
+"""Open logs of any format, or list their contents.
 
 Modules are imported at the first use of their names.
 """

@@ -189,7 +189,7 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
 
 
 def _refuse_data_set(path: Path) -> None:
-    """Refuse a data set of episodes, because only each episode is a log.
+    """Refuse a data set of episodes, because a log is one episode.
 
     Raises:
         UsageError: the path is a data set.
@@ -285,7 +285,7 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
         # the server gives the version, so that this fails if there is no such file
         _ = file.version
     except MissingFileError:
-        # a folder's address without the slash at its end
+        # the address may be a folder's, without the slash at its end
         metadata = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
         with suppress(MissingFileError, RemoteError):
             _ = metadata.version
@@ -409,7 +409,6 @@ def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 
 def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
-    """Open an external log of messages."""
     if options.mapping is None:
         if isinstance(path, Path) and path.is_dir() and not (path / BAG_METADATA).exists():
             first_name = min(entry.name for entry in path.iterdir() if _BAG_FILE.search(entry.name))
@@ -423,7 +422,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
             " does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "
             f"{shlex.quote(str(path))} --suggest-mapping"
         )
-    # imported here, because readers of external logs are slow to import
+    # the import is here, because readers of external logs are slow to import
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping
 

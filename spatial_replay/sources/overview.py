@@ -166,7 +166,8 @@ class Regularity:
     def of(cls, times_ns: Integers, start_ns: int, end_ns: int) -> Regularity:
         gaps_ns = np.diff(times_ns, prepend=start_ns, append=end_ns)
         duration_s = max(end_ns - start_ns, 1) / 1e9
-        # rounded to the log's disadvantage, so that a printed figure never meets a limit that the log misses
+        # figures are rounded to the log's disadvantage, so that no printed figure meets a limit that the log
+        # misses
         return cls(
             len(times_ns),
             math.floor(100.0 * (len(times_ns) - 1) / duration_s) / 100.0,
@@ -383,7 +384,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
                 facts += block.facts
                 advance(len(block.trace))
         except UsageError as error:
-            # a scenario without objects is not an error; a mapping that does not fit is one
+            # a scenario without objects is valid; a mapping that does not fit is the user's mistake
             if not isinstance(source, TrackSource):
                 raise
             remarks.append(str(error))

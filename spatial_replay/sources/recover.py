@@ -87,7 +87,7 @@ class Recovery:
 
     @property
     def losses(self) -> str:
-        """The missing parts, in a clause."""
+        """Clause on the missing parts, such as `3 messages are missing`."""
         sample_count = sum(gap.last - gap.first + 1 for gap in self.samples)
         message_count = sum(self.missing.values())
         if message_count and sample_count:
