@@ -431,15 +431,19 @@ def ns_from_json(value: Any) -> int:
     The value is an object with seconds and nanoseconds, a text such as `1.5s`, or a number of nanoseconds.
 
     Raises:
-        ContentError, TypeError, ValueError: the value is none of these.
+        ContentError, TypeError, ValueError: the value is none of these, or outside the times of a log.
     """
     if isinstance(value, dict):
         seconds, nanoseconds = (
             next((value[name] for name in names if name in value), 0)
             for names in zip(*_TIME_FIELDS, strict=True)
         )
-        return int(seconds) * _SECOND_NS + int(nanoseconds)
-    return ns_from_text(value, 1) if isinstance(value, str) else int(value or 0)
+        time_ns = int(seconds) * _SECOND_NS + int(nanoseconds)
+    else:
+        time_ns = ns_from_text(value, 1) if isinstance(value, str) else int(value or 0)
+    if abs(time_ns) > LATEST_NS:
+        raise ContentError(f"the time or duration of {time_ns} ns lies outside the times of a log")
+    return time_ns
 
 
 def _is_numeral(value: object) -> bool:

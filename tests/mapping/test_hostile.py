@@ -125,6 +125,14 @@ def test_a_damaged_message_affects_no_other(kind: str, head: str, data: st.DataO
     assert all(fault.startswith("test.bag: /a at ") for fault in made.faults)
 
 
+def test_a_lifetime_beyond_the_times_of_a_log_is_reported() -> None:
+    marker = {**MARKER, "lifetime": {"sec": 2**63 // 10**9 + 1, "nanosec": 0}}
+    kind = "visualization_msgs/msg/Marker"
+    log = make("topics: {/a: {}}", Feed(types={"/a": kind}).add("/a", 0, marker).add("/a", 1, MARKER))
+    assert "outside the times of a log" in " ".join(log.faults)
+    assert log.trace.names == ("cup_1",)
+
+
 @pytest.mark.parametrize("kind", EXAMPLES)
 @examples(20)
 @given(data=st.data())
