@@ -390,16 +390,27 @@ class FootprintBatch:
             object.__setattr__(self, name, read_only_integers(getattr(self, name)))
         for name in ("vertices", "radius", "bottom", "top"):
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
-        rows, parts, vertices = len(self.part_start) - 1, len(self.vertex_start) - 1, len(self.vertices)
-        expected = {"vertices": (vertices, 2), "radius": (parts,), "bottom": (rows,), "top": (rows,)}
-        for name, shape in expected.items():
+        row_count, part_count, vertex_count = (
+            len(self.part_start) - 1,
+            len(self.vertex_start) - 1,
+            len(self.vertices),
+        )
+        expected_shapes = {
+            "vertices": (vertex_count, 2),
+            "radius": (part_count,),
+            "bottom": (row_count,),
+            "top": (row_count,),
+        }
+        for name, shape in expected_shapes.items():
             if getattr(self, name).shape != shape:
                 actual = getattr(self, name).shape
-                raise GeometryError(f"{name} is {actual}; {rows} rows of {parts} parts need {shape}")
-        for name, end in (("part_start", parts), ("vertex_start", vertices)):
-            start = getattr(self, name)
-            if start[0] != 0 or start[-1] != end or (start[1:] < start[:-1]).any():
-                raise GeometryError(f"{name} must rise from 0 to {end}; it is {start}")
+                raise GeometryError(
+                    f"{name} is {actual}; {row_count} rows of {part_count} parts need {shape}"
+                )
+        for name, end in (("part_start", part_count), ("vertex_start", vertex_count)):
+            starts = getattr(self, name)
+            if starts[0] != 0 or starts[-1] != end or (starts[1:] < starts[:-1]).any():
+                raise GeometryError(f"{name} must rise from 0 to {end}; it is {starts}")
 
     @classmethod
     def without_checks(cls, **columns: Floats | Integers) -> FootprintBatch:
@@ -418,13 +429,13 @@ class FootprintBatch:
 
     def slice(self, begin: int, end: int) -> FootprintBatch:
         """Return the rows from `begin` to before `end`, as views."""
-        parts = slice(*self.part_start[[begin, end]].tolist())
-        vertices = slice(*self.vertex_start[[parts.start, parts.stop]].tolist())
+        part_slice = slice(*self.part_start[[begin, end]].tolist())
+        vertex_slice = slice(*self.vertex_start[[part_slice.start, part_slice.stop]].tolist())
         return FootprintBatch.without_checks(
-            part_start=self.part_start[begin : end + 1] - parts.start,
-            vertex_start=self.vertex_start[parts.start : parts.stop + 1] - vertices.start,
-            vertices=self.vertices[vertices],
-            radius=self.radius[parts],
+            part_start=self.part_start[begin : end + 1] - part_slice.start,
+            vertex_start=self.vertex_start[part_slice.start : part_slice.stop + 1] - vertex_slice.start,
+            vertices=self.vertices[vertex_slice],
+            radius=self.radius[part_slice],
             bottom=self.bottom[begin:end],
             top=self.top[begin:end],
         )
@@ -432,8 +443,11 @@ class FootprintBatch:
     @property
     def sizes(self) -> Floats:
         """Size of each footprint (R,): diagonal of its vertices' box plus twice the greatest radius."""
-        start = self.vertex_start[self.part_start[:-1]]
-        spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in self.vertices.T]
+        first_vertices = self.vertex_start[self.part_start[:-1]]
+        spans = [
+            np.maximum.reduceat(x, first_vertices) - np.minimum.reduceat(x, first_vertices)
+            for x in self.vertices.T
+        ]
         sizes: Floats = np.hypot(*spans) + 2.0 * np.maximum.reduceat(self.radius, self.part_start[:-1])
         return sizes
 
@@ -497,14 +511,14 @@ class FootprintBatch:
             return self
         first_part = self.part_start[rows]
         part_counts = self.part_start[rows + 1] - first_part
-        parts = flat_index(first_part, part_counts)
-        first_vertex = self.vertex_start[parts]
-        vertex_counts = self.vertex_start[parts + 1] - first_vertex
+        part_indices = flat_index(first_part, part_counts)
+        first_vertex = self.vertex_start[part_indices]
+        vertex_counts = self.vertex_start[part_indices + 1] - first_vertex
         return FootprintBatch.without_checks(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
             vertices=self.vertices.take(flat_index(first_vertex, vertex_counts), axis=0),
-            radius=self.radius[parts],
+            radius=self.radius[part_indices],
             bottom=self.bottom[rows],
             top=self.top[rows],
         )

@@ -196,15 +196,15 @@ def _distance_by_edges(
     nearest = min(a_nearest, b_nearest)
     if nearest <= separation:
         return nearest
-    squared = np.inf
+    least_squared = np.inf
     for a_vertex in range(a_start, a_stop):
         for b_vertex in range(b_start, b_stop):
             dx, dy = (
                 vertices[a_vertex, 0] - vertices[b_vertex, 0],
                 vertices[a_vertex, 1] - vertices[b_vertex, 1],
             )
-            squared = min(squared, dx * dx + dy * dy)
-    return min(nearest, math.sqrt(squared))
+            least_squared = min(least_squared, dx * dx + dy * dy)
+    return min(nearest, math.sqrt(least_squared))
 
 
 @reference_free
@@ -597,10 +597,10 @@ def _nearest(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: 
         next_vertex = edge + 1 if edge + 1 < a_stop else a_start
         x, y = vertices[edge, 0], vertices[edge, 1]
         ax, ay = vertices[next_vertex, 0] - x, vertices[next_vertex, 1] - y
-        squared = ax * ax + ay * ay
+        squared_length = ax * ax + ay * ay
         for vertex in range(b_start, b_stop):
             dx, dy = vertices[vertex, 0] - x, vertices[vertex, 1] - y
-            share = min(max((dx * ax + dy * ay) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+            share = min(max((dx * ax + dy * ay) / squared_length, 0.0), 1.0) if squared_length > 0.0 else 0.0
             gx, gy = dx - share * ax, dy - share * ay
             distance = math.sqrt(gx * gx + gy * gy)
             if distance < best_line[4]:

@@ -69,13 +69,13 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
         return Outlines(
             np.array(vertex_start, dtype=np.int64), tidy_vertices, np.full(len(counts), SOUND, np.int8)
         )
-    fault = np.empty(len(counts), dtype=np.int8)
+    faults = np.empty(len(counts), dtype=np.int8)
     raw_start = np.array(vertex_start, dtype=np.int64)
-    vertex_count = _normalise_all(raw_start, tidy_vertices, counts, fault)
-    _limit_corners(counts, fault)
+    vertex_count = _normalise_all(raw_start, tidy_vertices, counts, faults)
+    _limit_corners(counts, faults)
     tidy_start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=tidy_start[1:])
-    return Outlines(tidy_start, tidy_vertices[:vertex_count], fault)
+    return Outlines(tidy_start, tidy_vertices[:vertex_count], faults)
 
 
 def _are_normal(counts: Integers, vertices: Floats) -> bool:
@@ -93,16 +93,18 @@ def _are_normal(counts: Integers, vertices: Floats) -> bool:
         return True
     corners = vertices if not is_point.any() else vertices[np.repeat(~is_point, counts)]
     x, y = corners.reshape(-1, corner_count, 2).transpose(2, 1, 0)
-    extent = np.maximum(np.ptp(x, axis=0), np.ptp(y, axis=0))
-    magnitude = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
-    tolerance = np.maximum(_FLATNESS * extent, np.maximum(_ROUNDING * magnitude, _SMALLEST))
+    extents = np.maximum(np.ptp(x, axis=0), np.ptp(y, axis=0))
+    magnitudes = np.maximum(np.abs(x).max(axis=0), np.abs(y).max(axis=0))
+    tolerances = np.maximum(_FLATNESS * extents, np.maximum(_ROUNDING * magnitudes, _SMALLEST))
     # the test of `_winding` for all corners at once
     next_x, next_y = np.roll(x, -1, axis=0), np.roll(y, -1, axis=0)
     edge_x, edge_y = next_x - x, next_y - y
     previous_x, previous_y = np.roll(edge_x, 1, axis=0), np.roll(edge_y, 1, axis=0)
     chord_x, chord_y = next_x - np.roll(x, 1, axis=0), next_y - np.roll(y, 1, axis=0)
-    cross = previous_x * edge_y - previous_y * edge_x
-    is_left = (cross > 0.0) & (cross * cross > tolerance * tolerance * (chord_x**2 + chord_y**2))
+    turn_area = previous_x * edge_y - previous_y * edge_x
+    is_left = (turn_area > 0.0) & (
+        turn_area * turn_area > tolerances * tolerances * (chord_x**2 + chord_y**2)
+    )
     if not is_left.all():
         return False
     is_upper = (next_y > y) | ((next_y == y) & (next_x > x))
@@ -237,9 +239,9 @@ def _tidy(vertices: Floats, count: int, tolerance: float) -> int:
     for vertex in range(count):
         is_flat = is_flat and _strays(vertices, vertex, head, tail) <= tolerance
     if is_flat:
-        first, second = min(head, tail), max(head, tail)
-        _copy(vertices, first, vertices, 0, 1)
-        _copy(vertices, second, vertices, 1, 1)
+        first_end, second_end = min(head, tail), max(head, tail)
+        _copy(vertices, first_end, vertices, 0, 1)
+        _copy(vertices, second_end, vertices, 1, 1)
         return 1 if _distance(vertices, 0, 1) <= tolerance else 2
     # dropping a vertex can make its neighbours collinear, so the loop repeats until nothing changes
     has_changed = True

@@ -96,26 +96,26 @@ class _Assembling:
         self._doubts: list[Doubt] = []
         self._tree = FrameTree()
         self._knows_static = False
-        names, classes = Codes(), Codes()
+        name_codes, class_codes = Codes(), Codes()
         self._readers = {
             topic.name: TopicReader(
                 topic,
                 plan.mapping,
                 decoder,
-                names,
-                classes,
+                name_codes,
+                class_codes,
                 decodes_early=self._is_live,
                 report=self._add_fault,
             )
             for topic in plan.planned
         }
         topics = dict.fromkeys(reader.planned.topic for reader in self._readers.values())
-        self._number_of_topic = {topic: number for number, topic in enumerate(topics)}
+        self._number_of_topic = {topic: topic_number for topic_number, topic in enumerate(topics)}
         self._tracker = Tracker(
             plan,
             self._readers,
-            names,
-            classes,
+            name_codes,
+            class_codes,
             self._tree,
             self._remarks,
             window_ns=self._window_ns,
@@ -201,16 +201,16 @@ class _Assembling:
     def _check_fixed_frame(self) -> None:
         """Raise UsageError if a whole log has frames, but lacks the fixed frame."""
         mapping = self._plan.mapping
-        is_whole = not self._is_live and self._window_ns == (0, FOREVER) and self.jump is None
-        if mapping.fixed_frame is None or not is_whole or self._plan.lost:
+        has_whole_log = not self._is_live and self._window_ns == (0, FOREVER) and self.jump is None
+        if mapping.fixed_frame is None or not has_whole_log or self._plan.lost:
             return
         extractors = (reader.extractor for reader in self._readers.values())
-        noted_frames = (extractor.noted_frames for extractor in extractors if extractor is not None)
-        frames = sorted(self._tree.names.union(*noted_frames) - {""})
-        if frames and mapping.fixed_frame not in frames:
-            hint = nearest_hint(mapping.fixed_frame, frames)
-            first_frames = ", ".join(frames[:20]) + (
-                f" and {len(frames) - 20} more" if len(frames) > 20 else ""
+        noted_names = (extractor.noted_frames for extractor in extractors if extractor is not None)
+        frame_names = sorted(self._tree.names.union(*noted_names) - {""})
+        if frame_names and mapping.fixed_frame not in frame_names:
+            hint = nearest_hint(mapping.fixed_frame, frame_names)
+            first_frames = ", ".join(frame_names[:20]) + (
+                f" and {len(frame_names) - 20} more" if len(frame_names) > 20 else ""
             )
             raise UsageError(
                 f"{mapping.name}: fixed_frame: the log has no frame {mapping.fixed_frame!r};"
@@ -290,7 +290,7 @@ class _Assembling:
 
         The messages are decoded if the reader `decodes_on_arrival`, for example for stamps or transforms.
         """
-        contents: list[Any] = [messages.payloads[place] for place in message_indices.tolist()]
+        contents: list[Any] = [messages.payloads[message_index] for message_index in message_indices.tolist()]
         clock = reader.planned.clock
         times_ns = (messages.publish_time_ns if clock == "publish" else messages.log_time_ns)[message_indices]
         if reader.decodes_on_arrival:
@@ -380,7 +380,7 @@ class _Assembling:
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers
     ) -> tuple[Integers, Booleans]:
         """Return the time from which each message is valid, and whether the message is used."""
-        # a late message is valid after the samples that are final
+        # a late message is valid right after the final samples
         return np.maximum(times_ns, self._settled_ns + 1), np.ones(len(times_ns), np.bool_)
 
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
@@ -775,7 +775,7 @@ def rehearse() -> None:
     contents: dict[str, Any] = {
         "/boxes": {
             "frame_id": "map",
-            "of": [{"id": number, "x": number, "y": 0, "yaw": number} for number in (1, 2)],
+            "of": [{"id": box_id, "x": box_id, "y": 0, "yaw": box_id} for box_id in (1, 2)],
         },
         "/discs": {"x": 0, "y": 0},
         "/rings": {"corners": [{"x": x, "y": y} for x, y in ring_corners]},
@@ -1030,7 +1030,9 @@ class LiveAssembler(_Assembling):
         if self._held and self._are_transforms_new:
             self._are_transforms_new = False
             self._held = [
-                waiting for waiting, can_be in zip(self._held, self._placeable(), strict=True) if not can_be
+                waiting
+                for waiting, is_placeable in zip(self._held, self._placeable(), strict=True)
+                if not is_placeable
             ]
         overdue = [waiting for waiting in self._held if waiting.until_s <= now_s]
         if overdue:

@@ -53,8 +53,8 @@ class Assumption:
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
     """Yield contradictions of the assumptions: doubts, or remarks if the data may be unusual but sound.
 
-    One sentence covers a contradiction in many topics. Accepted names without a contradiction are also
-    remarks.
+    One sentence covers a contradiction in many topics. An accepted name without a contradiction also gives a
+    remark.
     """
     uncontradicted = dict.fromkeys(mapping.accept)
     for evidence in log.values():
@@ -148,11 +148,11 @@ def _year(time_ns: int) -> int | None:
 
 def _times_never_set(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, clock = evidence.arrivals, evidence.planned.clock
-    varies = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
-    varying_clocks = [name for name, is_varying in varies.items() if is_varying and name != clock]
+    varies_by_clock = {"log": arrivals.log_varies, "publish": arrivals.publish_varies}
+    varying_clocks = [name for name, is_varying in varies_by_clock.items() if is_varying and name != clock]
     # latched messages may all arrive at the same time
     is_latched = evidence.planned.is_latched or evidence.planned.is_lasting
-    if varies.get(clock, True) or arrivals.messages < _FEW or not varying_clocks or is_latched:
+    if varies_by_clock.get(clock, True) or arrivals.messages < _FEW or not varying_clocks or is_latched:
         return None
     return (
         f"its {arrivals.messages:,} messages have one {clock} time, and different {varying_clocks[0]} times"
@@ -189,9 +189,9 @@ def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
     if not (evidence.uses_stamps and evidence.has_moving_stamps and passed_s > 0 and log_s > 0):
         return None
     # a simulation may run at any rate, but a rate that equals a factor between units shows a wrong unit
-    factor = passed_s / log_s
+    stamp_factor = passed_s / log_s
     if not any(
-        abs(factor * unit_factor - 1) < _UNIT_ERROR or abs(factor / unit_factor - 1) < _UNIT_ERROR
+        abs(stamp_factor * unit_factor - 1) < _UNIT_ERROR or abs(stamp_factor / unit_factor - 1) < _UNIT_ERROR
         for unit_factor in _FACTORS
     ):
         return None
@@ -215,10 +215,10 @@ def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
     if not (evidence.uses_stamps and evidence.has_moving_stamps):
         return None
     usual_s = medians_s[(len(medians_s) - 1) // 2]
-    off_s = late_s.median - usual_s
+    offset_s = late_s.median - usual_s
     # results of long computations are also late, but with varying delays
     is_steady = late_s.quantile(0.9) - late_s.quantile(0.1) < _STEADY_S
-    if abs(off_s) < _OTHER_CLOCK_S or (0 < off_s < _SLOWEST_S and not is_steady):
+    if abs(offset_s) < _OTHER_CLOCK_S or (0 < offset_s < _SLOWEST_S and not is_steady):
         return None
     return (
         f"its stamps lie {_signed_s(late_s.median)} the log's clock, and those of other topics"
@@ -342,20 +342,26 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
     read_course = courses.pop("read")
     if abs(read_course) > _STEADY and abs(phase(read_course)) < _ASKEW:
         return None
-    fits = {keys: mean for keys, mean in courses.items() if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG}
-    keys = max(fits, key=lambda keys: fits[keys].real, default=None)
+    fitting_courses = {
+        heading_keys: mean
+        for heading_keys, mean in courses.items()
+        if abs(mean) > _CLOSE and abs(phase(mean)) < _ALONG
+    }
+    heading_keys = max(
+        fitting_courses, key=lambda heading_keys: fitting_courses[heading_keys].real, default=None
+    )
     # a straight path is no evidence, because a robot may go sideways. A heading next to satellite fixes
     # counts from north.
     is_straight = abs(motions.course) > _STRAIGHT
     is_compass = evidence.planned.is_geodetic and evidence.is_called_heading
-    if keys is None or (is_straight and not ("north" in keys and is_compass)):
+    if heading_keys is None or (is_straight and not ("north" in heading_keys and is_compass)):
         return None
     deviation = (
         f"{degrees(phase(read_course)):.0f} degrees" if abs(read_course) > _STEADY else "by changing angles"
     )
     return (
         f"its objects move {deviation} off their yaw, and along it with"
-        f" `yaw: {{field: {evidence.turn_path}, {keys}}}`"
+        f" `yaw: {{field: {evidence.turn_path}, {heading_keys}}}`"
     )
 
 
@@ -583,8 +589,8 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     if leftward_count < box_count / 5 and not box_count / 5 < downward_count < box_count * 4 / 5:
         return None
     # corners in the other order reach as far as the first corners, but sizes do not
-    reach = extractor.corner_high - extractor.corner_low
-    if min(leftward_count, downward_count) == box_count and (reach[1] > reach[0] / 2).all():
+    corner_reach = extractor.corner_high - extractor.corner_low
+    if min(leftward_count, downward_count) == box_count and (corner_reach[1] > corner_reach[0] / 2).all():
         return None
     return (
         f"in {leftward_count:,} of {box_count:,} boxes the second corner lies left of the first: these may be"

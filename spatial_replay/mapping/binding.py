@@ -163,8 +163,8 @@ class Namer:
             self._get = lambda _, index, message: index
         elif len(template_fields) == 1 and len(template_fields[0]) == 1:
             (path,) = template_fields[0]
-            value = walk(path, message if path.from_message else example, index)
-            if not isinstance(value, str | int | float) and not _is_uuid(value):
+            field_value = walk(path, message if path.from_message else example, index)
+            if not isinstance(field_value, str | int | float) and not _is_uuid(field_value):
                 return
             *list_steps, last_step = path.steps
             if path.from_message and isinstance(last_step, Place) and list_steps:
@@ -366,7 +366,7 @@ class TimeGetter:
             FieldError: a time lies outside the times of a log.
             TypeError, ValueError, OverflowError: a value is not a time.
         """
-        times = map(self.get, values)
+        raw_times = map(self.get, values)
         if not self.is_pair:
             unit_ns = self.unit_ns
             return [
@@ -377,9 +377,9 @@ class TimeGetter:
                     if isinstance(time, str)
                     else round(float(time) * unit_ns)
                 )
-                for time in times
+                for time in raw_times
             ]
-        pairs = np.fromiter(chain.from_iterable(times), np.int64, 2 * len(values))
+        pairs = np.fromiter(chain.from_iterable(raw_times), np.int64, 2 * len(values))
         seconds, nanoseconds = pairs[::2], pairs[1::2]
         if len(nanoseconds) and nanoseconds.max() >= _SECOND_NS:
             raise FieldError(
@@ -487,9 +487,11 @@ class _Columns:
             return tuple(self.add(below(path, name)) for name in names if name in existing_names)
         if is_list(value) and 2 <= len(value) <= len(names):
             return tuple(self.add(below(path, index)) for index in range(len(value)))
-        fields = f"; its fields are {', '.join(existing_names)}" if existing_names else ""
-        zeros = "; if zeros are left out, add `missing: 0`" if isinstance(value, dict) else ""
-        raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}{zeros}")
+        fields_hint = f"; its fields are {', '.join(existing_names)}" if existing_names else ""
+        zeros_hint = "; if zeros are left out, add `missing: 0`" if isinstance(value, dict) else ""
+        raise FieldError(
+            f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields_hint}{zeros_hint}"
+        )
 
     def measure(self, measure: Measure) -> float | int:
         """Return a column (int) for a path, or the number itself (float)."""
@@ -531,12 +533,14 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
     outer_frames = [path for path in layout.frame if FieldPath.of(path).from_message]
     outer_frame = None if frame is None or frame[1] else _frame(outer_frames, example, message, False)
     own_stamps = (Stamp(layout.own_stamp), Stamp(layout.own_stamp)) if layout.own_stamp else ()
-    lifetime = bind_time((Stamp("lifetime"),), example, message) if layout.stays and style != "keys" else None
-    paths = columns.paths
+    lifetime_getter = (
+        bind_time((Stamp("lifetime"),), example, message) if layout.stays and style != "keys" else None
+    )
+    column_paths = columns.paths
     return Binding(
         style=style,
-        numbers=tuple_getter(paths, example) if paths else None,
-        width=len(paths),
+        numbers=tuple_getter(column_paths, example) if column_paths else None,
+        width=len(column_paths),
         position=position,
         orientation=orientation,
         yaw=yaw,
@@ -552,10 +556,10 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         frame=frame,
         outer_frame=None if outer_frame is None else outer_frame[0],
         own_stamp=bind_time(own_stamps, example, message),
-        lifetime=lifetime,
+        lifetime=lifetime_getter,
         unset=tuple(
             (column, path, _default(path, example))
-            for column, path in enumerate(paths)
+            for column, path in enumerate(column_paths)
             # an unset quaternion of zeros means no rotation. An unset z stays 0, because few specifications
             # need z.
             if column not in (*orientation, *position[2:]) and may_be_unset(path, example)

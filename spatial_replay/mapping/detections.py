@@ -137,9 +137,9 @@ def _with_boxes(solids: Solids) -> Solids:
     is_unequal = size[:, 0] != size[:, 1]
     is_boxed_cylinder = (kind == CYLINDER) & (is_unequal | ~is_upright(solids.rotation[round_indices]))
     is_boxed_sphere = (kind == SPHERE) & (is_unequal | (size[:, 0] != size[:, 2]))
-    kinds = solids.kind.copy()
-    kinds[round_indices[is_boxed_cylinder | is_boxed_sphere]] = BOX
-    return replace(solids, kind=kinds)
+    boxed_kinds = solids.kind.copy()
+    boxed_kinds[round_indices[is_boxed_cylinder | is_boxed_sphere]] = BOX
+    return replace(solids, kind=boxed_kinds)
 
 
 def _rectangles(solids: Solids, box_indices: Integers) -> Floats:
@@ -257,8 +257,11 @@ def solids_of_marker(marker: Any, get: GetField) -> list[Solid]:
         return [Solid(element_kind, position, quaternion, scale, (point,)) for point in points]
     if marker_type == 11 and len(points) >= 3:
         # the points of a triangle list are in units of the marker's scale
-        scaled = [tuple(a * b for a, b in zip(point, scale, strict=True)) for point in points]
-        return _triangles((position, quaternion), scaled)
+        scaled_points = [
+            tuple(coordinate * factor for coordinate, factor in zip(point, scale, strict=True))
+            for point in points
+        ]
+        return _triangles((position, quaternion), scaled_points)
     return []
 
 
@@ -278,7 +281,7 @@ def solids_of_entity(entity: Any, get: GetField) -> list[Solid]:
     for primitive in get(entity, "triangles") or ():
         points = [_vector(point, get) for point in get(primitive, "points") or ()]
         corner_indices = list(get(primitive, "indices") or range(len(points)))
-        corners = [points[i] for i in corner_indices if i < len(points)]
+        corners = [points[index] for index in corner_indices if index < len(points)]
         solids += _triangles(_pose(get(primitive, "pose"), get), corners)
     return solids
 
@@ -293,13 +296,13 @@ def solids_of_perceived_object(perceived_object: Any, get: GetField) -> list[Sol
     # https://github.com/ros2/common_interfaces/blob/humble/shape_msgs/msg/SolidPrimitive.msg
     pose = _pose(get(perceived_object, "pose"), get)
     shape = get(perceived_object, "shape")
-    kind = get(shape, "type")
+    shape_type = get(shape, "type")
     sizes = [float(size) for size in get(shape, "dimensions")]
-    if kind == 1 and len(sizes) >= 3:
+    if shape_type == 1 and len(sizes) >= 3:
         return [Solid(BOX, *pose, tuple(sizes[:3]))]
-    if kind == 2 and sizes:
+    if shape_type == 2 and sizes:
         return [Solid(SPHERE, *pose, (2 * sizes[0],) * 3)]
-    if kind in (3, 4) and len(sizes) >= 2:
+    if shape_type in (3, 4) and len(sizes) >= 2:
         return [Solid(CYLINDER, *pose, (2 * sizes[1], 2 * sizes[1], sizes[0]))]
     corners = [_vector(point, get) for point in get(get(perceived_object, "polygon"), "points") or ()]
     if len(corners) >= 3:
@@ -409,17 +412,17 @@ class Detections:
 
     def repeat(self, index: int, count: int) -> Detections:
         """Return `count` copies of one object, each in a separate message, without frame and stamp."""
-        rows = np.full(count, index, np.int64)
+        row_indices = np.full(count, index, np.int64)
         poses = self.poses
         return Detections(
             message=np.arange(count, dtype=np.int64),
-            name=self.name[rows],
-            class_code=self.class_code[rows],
-            poses=select(poses, rows),
+            name=self.name[row_indices],
+            class_code=self.class_code[row_indices],
+            poses=select(poses, row_indices),
             solids=self.solids.repeat(index, count),
-            height=None if self.height is None else self.height[rows],
-            uncertainty=self.uncertainty[rows],
-            covariance=None if self.covariance is None else self.covariance[rows],
+            height=None if self.height is None else self.height[row_indices],
+            uncertainty=self.uncertainty[row_indices],
+            covariance=None if self.covariance is None else self.covariance[row_indices],
         )
 
 
@@ -467,13 +470,13 @@ def detections_from_chunks(
             messages.
     """
     good_number = np.cumsum(good) - 1
-    deleted = [
+    deletions = [
         (int(good_number[chunk.places[message]]), name) for chunk in chunks for message, name in chunk.deleted
     ]
     skipped = sum(chunk.skipped for chunk in chunks)
     chunks = [chunk for chunk in chunks if chunk.name]
     if binding is None or not chunks:
-        return _no_detections(deleted, skipped)
+        return _no_detections(deletions, skipped)
     name = _join_columns(chunk.name for chunk in chunks)
     numbers = np.empty((len(name), 0))
     if binding.numbers is not None:
@@ -493,7 +496,7 @@ def detections_from_chunks(
         else:
             solids = solids_of_shape(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
-    locked = list(chain.from_iterable(chunk.locked for chunk in chunks))
+    locked_flags = list(chain.from_iterable(chunk.locked for chunk in chunks))
     chunk_covariances = [chunk.covariance for chunk in chunks if chunk.covariance is not None]
     return Detections(
         message=np.concatenate([good_number[chunk.places[chunk.message]] for chunk in chunks]),
@@ -507,8 +510,8 @@ def detections_from_chunks(
         uncertainty=radii_from_numbers(binding, numbers, len(name)),
         covariance=np.concatenate(chunk_covariances) if chunk_covariances else None,
         lifetime_ns=_join_columns(chunk.lifetimes for chunk in chunks) if layout.stays else None,
-        is_locked=np.array(locked, np.bool_) if any(locked) else None,
-        deleted=deleted,
+        is_locked=np.array(locked_flags, np.bool_) if any(locked_flags) else None,
+        deleted=deletions,
         skipped=skipped,
         numbers=numbers,
     )
@@ -565,9 +568,11 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     def to_earth_frame(degrees: Floats) -> Floats:
         latitude, longitude = np.radians(degrees[:, :2]).T
         radius = _EQUATOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
-        level = radius * np.cos(latitude)
-        up = radius * (1 - _ECCENTRICITY_SQUARED) * np.sin(latitude)
-        return np.stack([level * np.cos(longitude), level * np.sin(longitude), up], axis=1)
+        axis_distance = radius * np.cos(latitude)
+        polar_distance = radius * (1 - _ECCENTRICITY_SQUARED) * np.sin(latitude)
+        return np.stack(
+            [axis_distance * np.cos(longitude), axis_distance * np.sin(longitude), polar_distance], axis=1
+        )
 
     latitude, longitude = np.radians(origin)
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
@@ -577,8 +582,8 @@ def local_metres(fixes: Floats, origin: tuple[float, float]) -> Floats:
     offsets_m = to_earth_frame(fixes) - to_earth_frame(np.array([origin]))
     metres: Floats = offsets_m @ np.stack([east, north], axis=1)
     # longitudes may go up to 360 degrees
-    is_off = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
-    metres[np.flatnonzero(is_off)] = np.nan
+    has_no_fix = np.any(np.abs(fixes[:, :2]) > (90.0, 360.0), axis=1) | np.any(fixes[:, 2:] < 0, axis=1)
+    metres[np.flatnonzero(has_no_fix)] = np.nan
     return metres
 
 
@@ -606,11 +611,13 @@ def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> 
     if binding.covariance is None or layout.uncertainty is None:
         return None
     covariance_rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)
-    size = {4: 2, 9: 3, 36: 6}[covariance_rows.shape[1]]
+    matrix_size = {4: 2, 9: 3, 36: 6}[covariance_rows.shape[1]]
     # a 6 x 6 covariance begins with the position, as in geometry_msgs/PoseWithCovariance
-    used_size = min(size, 3)
+    used_size = min(matrix_size, 3)
     matrices = np.zeros((len(objects), 3, 3))
-    matrices[:, :used_size, :used_size] = covariance_rows.reshape(-1, size, size)[:, :used_size, :used_size]
+    matrices[:, :used_size, :used_size] = covariance_rows.reshape(-1, matrix_size, matrix_size)[
+        :, :used_size, :used_size
+    ]
     return matrices * layout.uncertainty.sigmas**2
 
 

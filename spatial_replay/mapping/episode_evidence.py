@@ -32,13 +32,13 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     if len(trace) < 3 or not len(trace.footprints.radius):
         return None
     shapes, rows = trace.footprints, trace.rows.T
-    is_points = len(shapes.vertices) == len(shapes.part_start) - 1
-    centres = shapes.vertices if is_points else extents(shapes)[0]
-    places = np.column_stack([centres, shapes.bottom])
+    are_points = len(shapes.vertices) == len(shapes.part_start) - 1
+    centres = shapes.vertices if are_points else extents(shapes)[0]
+    positions = np.column_stack([centres, shapes.bottom])
     # (N, T, 3): x and y of each object's centre, and its bottom
-    places = np.where((rows >= 0)[:, :, None], places[np.maximum(rows, 0)], np.nan)
-    places[:, :, 2][np.isnan(places[:, :, 2])] = 0.0
-    displacements = np.diff(places, axis=1)
+    positions = np.where((rows >= 0)[:, :, None], positions[np.maximum(rows, 0)], np.nan)
+    positions[:, :, 2][np.isnan(positions[:, :, 2])] = 0.0
+    displacements = np.diff(positions, axis=1)
     step_lengths = np.sqrt(np.einsum("ijk,ijk->ij", displacements, displacements))
     # the longer of the steps before and after each step
     neighbour_lengths = np.zeros_like(step_lengths)
@@ -50,7 +50,9 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
         is_jump = (step_lengths > _SUDDEN * neighbour_lengths) & (step_lengths > fall_distance)
     if not is_jump.any():
         return None
-    extent = np.nan_to_num(np.fmax.reduce(places, axis=(0, 1)) - np.fmin.reduce(places, axis=(0, 1))).max()
+    extent = np.nan_to_num(
+        np.fmax.reduce(positions, axis=(0, 1)) - np.fmin.reduce(positions, axis=(0, 1))
+    ).max()
     is_jump &= step_lengths > _FAR * extent
     if not is_jump.any():
         return None

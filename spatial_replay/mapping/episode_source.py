@@ -277,7 +277,7 @@ class _Frames(NamedTuple):
         )
         name_order = sorted(range(len(names)), key=names.__getitem__)
         classes = class_order(self.class_of.values())
-        codes = np.array([classes.index(self.class_of[name]) for name in names], np.int64)
+        class_codes = np.array([classes.index(self.class_of[name]) for name in names], np.int64)
         return Trace(
             times_ns=times_ns,
             names=tuple(names[index] for index in name_order),
@@ -285,7 +285,7 @@ class _Frames(NamedTuple):
             footprints=rows.shapes,
             yaw=rows.yaw,
             uncertainty=rows.uncertainty,
-            class_code=np.repeat(codes, len(times_ns)),
+            class_code=np.repeat(class_codes, len(times_ns)),
             classes=classes,
             signals=self.signals,
         )
@@ -344,8 +344,8 @@ def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
     episodes: dict[int, ReadEpisode] = {}
     if frame_shape is not None and len(joinable_columns) > 1:
         with suppress(Exception):
-            parts = [(sources[index], columns) for index, columns in joinable_columns.items()]
-            episodes = dict(zip(joinable_columns, _read_parts(parts), strict=True))
+            episode_columns = [(sources[index], columns) for index, columns in joinable_columns.items()]
+            episodes = dict(zip(joinable_columns, _read_parts(episode_columns), strict=True))
     for index, source in enumerate(sources):
         yield replace(source, episode=episodes.get(index))
 
@@ -357,21 +357,21 @@ def _shape_of(columns: EpisodeColumns) -> tuple[object, ...] | None:
     return tuple(sorted((name, values.shape[1:]) for name, values in columns.features.items()))
 
 
-def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
+def _read_parts(episodes: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[ReadEpisode]:
     """Read episodes together; their features must have equal shapes."""
-    first_frames = [0, *accumulate(len(columns.times_ns) for _, columns in parts)]
+    first_frames = [0, *accumulate(len(columns.times_ns) for _, columns in episodes)]
     features = {
-        name: np.concatenate([columns.features[name] for _, columns in parts])
-        for name in parts[0][1].features
+        name: np.concatenate([columns.features[name] for _, columns in episodes])
+        for name in episodes[0][1].features
     }
-    fault_lists = [FaultList() for _ in parts]
-    for (source, columns), faults in zip(parts, fault_lists, strict=True):
+    fault_lists = [FaultList() for _ in episodes]
+    for (source, columns), faults in zip(episodes, fault_lists, strict=True):
         for fault in columns.faults:
             faults.add(f"{source.name}: {fault}")
 
     def report(name: str, frame: int, fault: str) -> None:
         part_index = bisect_right(first_frames, frame) - 1
-        source, columns = parts[part_index]
+        source, columns = episodes[part_index]
         source._report(
             name,
             frame - first_frames[part_index],
@@ -381,11 +381,11 @@ def _read_parts(parts: Sequence[tuple[EpisodeSource, EpisodeColumns]]) -> list[R
         )
 
     frame_numbers = np.arange(first_frames[-1], dtype=np.int64)
-    frames = parts[0][0]._frames(EpisodeColumns(frame_numbers, features), report)
+    frames = episodes[0][0]._frames(EpisodeColumns(frame_numbers, features), report)
     return [
         ReadEpisode(columns, frames_of_part.trace(columns.times_ns), faults.take(last=True))
         for (_, columns), faults, frames_of_part in zip(
-            parts, fault_lists, frames.divide(first_frames), strict=True
+            episodes, fault_lists, frames.divide(first_frames), strict=True
         )
     ]
 

@@ -306,68 +306,75 @@ class Motions:
         self._last_reports = reports[later_count < _MOST_LEAPS].copy()
         self._last_reports[:, _IS_NEW] = 0.0
         if len(self._last_reports) > _MOST_ROWS:
-            message = self._last_reports[:, _MESSAGE]
+            message_numbers = self._last_reports[:, _MESSAGE]
             self._last_reports = self._last_reports[
-                message >= np.partition(message, -_MOST_ROWS)[-_MOST_ROWS]
+                message_numbers >= np.partition(message_numbers, -_MOST_ROWS)[-_MOST_ROWS]
             ]
         new_indices = np.flatnonzero(is_same_object & (reports[1:, _IS_NEW] > 0)) + 1
         if not len(new_indices):
             return
-        earlier, later = reports[new_indices - 1], reports[new_indices]
-        self._add_steps(earlier, later, turns_back=turns_back, zero=zero, scale=scale)
+        earlier_reports, later_reports = reports[new_indices - 1], reports[new_indices]
+        self._add_steps(earlier_reports, later_reports, turns_back=turns_back, zero=zero, scale=scale)
         self._add_returns(reports, new_indices)
-        message_gaps = np.clip(later[:, _MESSAGE] - earlier[:, _MESSAGE], 0, _LONGEST_GAP).astype(np.int64)
+        message_gaps = np.clip(
+            later_reports[:, _MESSAGE] - earlier_reports[:, _MESSAGE], 0, _LONGEST_GAP
+        ).astype(np.int64)
         self.gaps += np.bincount(message_gaps, minlength=_LONGEST_GAP + 1)
-        for change_index in np.flatnonzero(earlier[:, _CLASS] != later[:, _CLASS]).tolist():
+        for change_index in np.flatnonzero(earlier_reports[:, _CLASS] != later_reports[:, _CLASS]).tolist():
             self.change_count += 1
             if len(self.changes) < _MOST_CHANGES:
                 class_before, class_after = (
-                    self._classes.by_code[int(row[change_index, _CLASS])] for row in (earlier, later)
+                    self._classes.by_code[int(report_rows[change_index, _CLASS])]
+                    for report_rows in (earlier_reports, later_reports)
                 )
                 self.changes.append(
                     ClassChange(
-                        self._name(later[change_index]),
+                        self._name(later_reports[change_index]),
                         class_before,
                         class_after,
-                        self._time_ns(later[change_index]),
+                        self._time_ns(later_reports[change_index]),
                     )
                 )
 
     def _add_steps(
-        self, earlier: Floats, later: Floats, *, turns_back: bool, zero: float, scale: float
+        self, earlier_reports: Floats, later_reports: Floats, *, turns_back: bool, zero: float, scale: float
     ) -> None:
-        seconds = later[:, _SECONDS] - earlier[:, _SECONDS]
-        step_xy = later[:, _X : _Y + 1] - earlier[:, _X : _Y + 1]
+        step_s = later_reports[:, _SECONDS] - earlier_reports[:, _SECONDS]
+        step_xy = later_reports[:, _X : _Y + 1] - earlier_reports[:, _X : _Y + 1]
         distance = np.hypot(step_xy[:, 0], step_xy[:, 1])
-        times_ns = self._begin_ns + (later[:, _SECONDS] * 1e9).astype(np.int64)
-        self.speed.add(np.where(seconds > 0, distance / seconds, nan), times_ns)
-        turn_step = np.fmax.reduce(np.abs(later[:, _TURN] - earlier[:, _TURN]))
+        times_ns = self._begin_ns + (later_reports[:, _SECONDS] * 1e9).astype(np.int64)
+        self.speed.add(np.where(step_s > 0, distance / step_s, nan), times_ns)
+        turn_step = np.fmax.reduce(np.abs(later_reports[:, _TURN] - earlier_reports[:, _TURN]))
         self.turn_step = max(self.turn_step, float(np.nan_to_num(turn_step)))
         # the turn by the shorter way
-        turn = np.abs((later[:, _YAW] - earlier[:, _YAW] + pi) % (2 * pi) - pi)
-        self.turn_rate.add(np.where(seconds > 0, turn / seconds, nan), times_ns)
+        turn = np.abs((later_reports[:, _YAW] - earlier_reports[:, _YAW] + pi) % (2 * pi) - pi)
+        self.turn_rate.add(np.where(step_s > 0, turn / step_s, nan), times_ns)
         longest_index = int(np.nan_to_num(distance, nan=0.0).argmax())
         if distance[longest_index] > (self.jump.amount if self.jump is not None else 0.0):
             self.jump = Moment(
-                self._name(later[longest_index]), int(times_ns[longest_index]), float(distance[longest_index])
+                self._name(later_reports[longest_index]),
+                int(times_ns[longest_index]),
+                float(distance[longest_index]),
             )
-            self.jump_s = float(seconds[longest_index])
-        is_absence = (later[:, _MESSAGE] - earlier[:, _MESSAGE] > 1) & (seconds >= 1.0)
+            self.jump_s = float(step_s[longest_index])
+        is_absence = (later_reports[:, _MESSAGE] - earlier_reports[:, _MESSAGE] > 1) & (step_s >= 1.0)
         if is_absence.any():
-            self._add_comeback(later, np.where(is_absence, np.nan_to_num(distance, nan=0.0), 0.0), seconds)
-        is_zero = ~later[:, _X : _Y + 1].any(axis=1)
+            self._add_comeback(
+                later_reports, np.where(is_absence, np.nan_to_num(distance, nan=0.0), 0.0), step_s
+            )
+        is_zero = ~later_reports[:, _X : _Y + 1].any(axis=1)
         if is_zero.any():
-            is_far = distance > FAR_LEAP * later[:, _SIZE]
+            is_far = distance > FAR_LEAP * later_reports[:, _SIZE]
             self.zeros += int(np.count_nonzero(is_zero & is_far & ~is_absence))
-        moves = (distance > 0) & np.isfinite(later[:, _TURN])
-        if not moves.any():
+        is_moving = (distance > 0) & np.isfinite(later_reports[:, _TURN])
+        if not is_moving.any():
             return
         # short steps are ignored, because the course of noise is random
-        moves &= distance >= self.speed.median / 2 * seconds
-        if not moves.any():
+        is_moving &= distance >= self.speed.median / 2 * step_s
+        if not is_moving.any():
             return
-        course = np.arctan2(step_xy[moves, 1], step_xy[moves, 0])
-        yaw, raw_angle = earlier[moves, _YAW], earlier[moves, _TURN]
+        course = np.arctan2(step_xy[is_moving, 1], step_xy[is_moving, 0])
+        yaw, raw_angle = earlier_reports[is_moving, _YAW], earlier_reports[is_moving, _TURN]
         sign = -1.0 if turns_back else 1.0
         # an interpretation differs from the yaw by the differences of its zero and scale
         readings = (
@@ -377,17 +384,17 @@ class Motions:
         angles = [yaw, *(yaw + sign * reading for reading in readings)]
         offsets = [np.exp(1j * (course - angle)).sum() for angle in angles]
         self._courses += np.array([*offsets, np.exp(1j * course).sum()])
-        self._steps += int(np.count_nonzero(moves))
+        self._steps += int(np.count_nonzero(is_moving))
 
-    def _add_comeback(self, later: Floats, distance: Floats, seconds: Floats) -> None:
+    def _add_comeback(self, later_reports: Floats, distance: Floats, step_s: Floats) -> None:
         longest_index = int(distance.argmax())
         if distance[longest_index] > (self.comeback.amount if self.comeback is not None else 0.0):
             self.comeback = Moment(
-                self._name(later[longest_index]),
-                self._time_ns(later[longest_index]),
+                self._name(later_reports[longest_index]),
+                self._time_ns(later_reports[longest_index]),
                 float(distance[longest_index]),
             )
-            self.comeback_s = float(seconds[longest_index])
+            self.comeback_s = float(step_s[longest_index])
 
     def _add_returns(self, reports: Floats, new_indices: Integers) -> None:
         """Count returns of objects to an earlier place after leaps.
@@ -396,25 +403,29 @@ class Motions:
             reports: reports, grouped by object.
             new_indices: indices of new reports, except the first report of each object.
         """
-        position, name = reports[:, _X : _Y + 1], reports[:, _NAME]
+        position, name_codes = reports[:, _X : _Y + 1], reports[:, _NAME]
         step_xy = np.diff(position, axis=0, prepend=position[:1])
-        leap = np.hypot(step_xy[:, 0], step_xy[:, 1])
+        leap_lengths = np.hypot(step_xy[:, 0], step_xy[:, 1])
         step_s = np.diff(reports[:, _SECONDS], prepend=0.0)
-        leap = np.where(leap > np.fmax(reports[:, _SIZE], 0.0), leap, 0.0)
+        leap_lengths = np.where(leap_lengths > np.fmax(reports[:, _SIZE], 0.0), leap_lengths, 0.0)
         self.chances += int(
-            np.count_nonzero((new_indices > 1) & (name[new_indices] == name[new_indices - 2]))
+            np.count_nonzero((new_indices > 1) & (name_codes[new_indices] == name_codes[new_indices - 2]))
         )
-        if not leap[new_indices].any():
+        if not leap_lengths[new_indices].any():
             return
-        least_leap, is_back = leap[new_indices], np.zeros(len(new_indices), np.bool_)
-        for steps in range(2, _MOST_LEAPS + 1):
-            earlier_indices = np.maximum(new_indices - steps, 0)
-            least_leap = np.minimum(least_leap, leap[earlier_indices + 1])
+        least_leap, is_back = leap_lengths[new_indices], np.zeros(len(new_indices), np.bool_)
+        for step_count in range(2, _MOST_LEAPS + 1):
+            earlier_indices = np.maximum(new_indices - step_count, 0)
+            least_leap = np.minimum(least_leap, leap_lengths[earlier_indices + 1])
             offset = position[new_indices] - position[earlier_indices]
-            is_same = (name[earlier_indices] == name[new_indices]) & (new_indices >= steps)
+            is_same_object = (name_codes[earlier_indices] == name_codes[new_indices]) & (
+                new_indices >= step_count
+            )
             # back means within a quarter of the shortest leap since then
-            is_back |= is_same & (np.hypot(offset[:, 0], offset[:, 1]) < least_leap / 4)
-        is_slow = is_back & (step_s[new_indices] >= 1.0) & (leap[new_indices] < _FAST * step_s[new_indices])
+            is_back |= is_same_object & (np.hypot(offset[:, 0], offset[:, 1]) < least_leap / 4)
+        is_slow = (
+            is_back & (step_s[new_indices] >= 1.0) & (leap_lengths[new_indices] < _FAST * step_s[new_indices])
+        )
         self.returns += int(np.count_nonzero(is_back))
         self.slow_returns += int(np.count_nonzero(is_slow))
         if self.return_moment is None and is_back.any():
@@ -422,7 +433,7 @@ class Motions:
             self.return_moment = Moment(
                 self._name(reports[return_index]),
                 self._time_ns(reports[return_index - 1]),
-                float(leap[return_index - 1]),
+                float(leap_lengths[return_index - 1]),
             )
 
     @property
@@ -518,9 +529,9 @@ class TopicEvidence:
         self._reports: list[Floats] = []
         self._reports_rows = 0
         mapping = reader.planned.mapping
-        signals = 0 if mapping is None else len(mapping.signals)
-        self.signal_chances, self.signal_returns = 0, np.zeros(signals, np.int64)
-        self._last_values = np.empty((0, signals))
+        signal_count = 0 if mapping is None else len(mapping.signals)
+        self.signal_chances, self.signal_returns = 0, np.zeros(signal_count, np.int64)
+        self._last_values = np.empty((0, signal_count))
         self._waiting_signals: list[Floats] = []
         self._waiting_values = 0
 
@@ -633,9 +644,11 @@ class TopicEvidence:
             return
         waiting_objects, self._waiting, self._waiting_rows = self._waiting, [], 0
         detections = [objects.detections for objects in waiting_objects]
-        name = np.concatenate([detected.name for detected in detections])
+        name_codes = np.concatenate([detected.name for detected in detections])
         class_code = np.concatenate([detected.class_code for detected in detections])
-        message = np.concatenate([objects.first + objects.detections.message for objects in waiting_objects])
+        message_numbers = np.concatenate(
+            [objects.first + objects.detections.message for objects in waiting_objects]
+        )
         yaw, uncertainty = (
             np.concatenate(columns)
             for columns in zip(
@@ -643,12 +656,12 @@ class TopicEvidence:
             )
         )
         shapes = FootprintBatch.concatenate([objects.shapes for objects in waiting_objects])
-        self.objects += len(name)
-        message_starts = np.flatnonzero(np.diff(message, prepend=-1))
-        self.most_at_once = max(self.most_at_once, int(np.diff(message_starts, append=len(name)).max()))
-        self.name_codes.update(name.tolist())
+        self.objects += len(name_codes)
+        message_starts = np.flatnonzero(np.diff(message_numbers, prepend=-1))
+        self.most_at_once = max(self.most_at_once, int(np.diff(message_starts, append=len(name_codes)).max()))
+        self.name_codes.update(name_codes.tolist())
         self.class_codes.update(class_code.tolist())
-        numbers = self._measure_numbers(detections, message)
+        numbers = self._measure_numbers(detections, message_numbers)
         self.uncertainty.add(uncertainty)
         for detected in detections:
             if detected.covariance is not None:
@@ -656,25 +669,25 @@ class TopicEvidence:
                 is_set = detected.covariance.reshape(len(detected.name), -1).any(axis=1)
                 self.zero_covariances += int(np.count_nonzero(~is_set))
         centre, sides = extents(shapes)
-        longer = sides.max(axis=1)
-        self.size.add(longer)
+        longer_sides = sides.max(axis=1)
+        self.size.add(longer_sides)
         self.shorter.add(sides.min(axis=1))
-        self.pointlike += int(np.count_nonzero(longer == 0.0))
+        self.pointlike += int(np.count_nonzero(longer_sides == 0.0))
         self.bottom.add(shapes.bottom)
         self.top.add(shapes.top)
-        passed_ns = np.concatenate(
+        report_times_ns = np.concatenate(
             [objects.times_ns[objects.detections.message] for objects in waiting_objects]
         )
-        reports = np.empty((len(name), _IS_NEW + 1))
-        reports[:, _NAME] = name
-        reports[:, _MESSAGE] = message
-        reports[:, _SECONDS] = (passed_ns - (self.arrivals.first_ns or 0)) / 1e9
+        reports = np.empty((len(name_codes), _IS_NEW + 1))
+        reports[:, _NAME] = name_codes
+        reports[:, _MESSAGE] = message_numbers
+        reports[:, _SECONDS] = (report_times_ns - (self.arrivals.first_ns or 0)) / 1e9
         reports[:, _X : _Y + 1] = centre
         reports[:, _YAW] = yaw
         reports[:, _TURN] = nan
         if numbers is not None and self._binding is not None and self._binding.yaw is not None:
             reports[:, _TURN] = numbers[:, self._binding.yaw]
-        reports[:, _SIZE] = longer
+        reports[:, _SIZE] = longer_sides
         reports[:, _CLASS] = class_code
         reports[:, _IS_NEW] = 1.0
         self._reports.append(reports)
@@ -719,7 +732,7 @@ class TopicEvidence:
         self.signal_chances += len(is_back)
         self.signal_returns[: values.shape[1]] += np.where(is_switch, 0, is_back.sum(axis=0))
 
-    def _measure_numbers(self, detections: Sequence[Detections], message: Integers) -> Floats | None:
+    def _measure_numbers(self, detections: Sequence[Detections], message_numbers: Integers) -> Floats | None:
         """Measure the raw numbers of messages; return these numbers, or None without a binding."""
         binding = self._binding
         number_arrays = [detected.numbers for detected in detections if detected.numbers is not None]
@@ -737,7 +750,7 @@ class TopicEvidence:
                 self.turn.add(raw_angles)
                 is_finite = np.isfinite(raw_angles)
                 if not self.first_turn >= 0 and is_finite.any():
-                    is_first = message == message[is_finite.argmax()]
+                    is_first = message_numbers == message_numbers[is_finite.argmax()]
                     self.first_turn = float(np.fmax.reduce(np.abs(raw_angles[is_first])))
             if binding.position:
                 positions = numbers[:, list(binding.position[:3])]
@@ -762,12 +775,12 @@ class TopicEvidence:
         return numbers
 
     def _measure_quaternions(self, quaternions: Floats) -> None:
-        length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
-        is_set = length > 0
-        quaternions, length = quaternions[is_set], length[is_set]
-        self.quaternion_length.add(length)
-        self.quaternions += len(length)
-        x, y, z, w = (quaternions / length[:, None]).T
+        lengths = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))
+        is_set = lengths > 0
+        quaternions, lengths = quaternions[is_set], lengths[is_set]
+        self.quaternion_length.add(lengths)
+        self.quaternions += len(lengths)
+        x, y, z, w = (quaternions / lengths[:, None]).T
         # the tilt of an object's z axis has the cosine 1 - 2 (x * x + y * y)
         self.upright += int(np.count_nonzero(x * x + y * y < _LEVEL))
         layout = self.planned.layout
@@ -790,14 +803,14 @@ _TURNED: Final = 0.174
 def extents(shapes: FootprintBatch) -> tuple[Floats, Floats]:
     """Return centres and sides (R, 2) of the boxes around footprints; NaN for unknown footprints."""
     footprint_count = len(shapes.part_start) - 1
-    parts, vertices = shapes.part_start, shapes.vertex_start[shapes.part_start]
-    has_parts = vertices[1:] > vertices[:-1]
+    part_starts, first_vertices = shapes.part_start, shapes.vertex_start[shapes.part_start]
+    has_parts = first_vertices[1:] > first_vertices[:-1]
     low, high = np.full((footprint_count, 2), nan), np.full((footprint_count, 2), nan)
     if has_parts.any():
         # footprints without vertices are skipped, because reduceat would return a vertex of the next
         # footprint
-        vertex_starts = vertices[:-1][has_parts]
-        radius = np.maximum.reduceat(shapes.radius, parts[:-1][has_parts])[:, None]
+        vertex_starts = first_vertices[:-1][has_parts]
+        radius = np.maximum.reduceat(shapes.radius, part_starts[:-1][has_parts])[:, None]
         low[has_parts] = np.minimum.reduceat(shapes.vertices, vertex_starts, axis=0) - radius
         high[has_parts] = np.maximum.reduceat(shapes.vertices, vertex_starts, axis=0) + radius
     # coordinates of a log may be infinite

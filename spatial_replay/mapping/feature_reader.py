@@ -71,7 +71,7 @@ class BoundObject:
     quaternion: tuple[NumberPlace, ...] = ()
 
     def detections(self, columns: Columns, times: int, mapping_name: str, episode: str) -> Detections:
-        """Return the object in each of T frames, with 0 as the code of its name and class.
+        """Return the object in each of T = `times` frames, with 0 as the code of its name and class.
 
         Raises:
             UsageError: the four numbers of the orientation are not a quaternion.
@@ -101,9 +101,9 @@ class BoundObject:
             np.fmin.reduce(quaternions[:, widest_column]),
             np.fmax.reduce(quaternions[:, widest_column]),
         )
-        names = listing([place.name for place in self.quaternion])
+        number_names = listing([place.name for place in self.quaternion])
         raise UsageError(
-            f"{mapping_name}: {self.key}.orientation: {names} have the length"
+            f"{mapping_name}: {self.key}.orientation: {number_names} have the length"
             f" {number_text(float(lengths[frame]))} in frame {frame} of {episode}, so they are no quaternion"
             f" ({self.quaternion[widest_column].name} goes from {number_text(float(least))} to"
             f" {number_text(float(greatest))}); give its four numbers, or leave `orientation` out"
@@ -118,7 +118,7 @@ class BoundSignal(NamedTuple):
     invalid: tuple[float, ...]
 
     def values(self, columns: Columns, times: int, episode: str) -> Floats:
-        """Return the signal's value in each of T frames (T,)."""
+        """Return the signal's value (T,) in each of T = `times` frames."""
         values = column_of(columns, self.place, times, episode)
         if self.invalid:
             return np.where(np.isin(values, with_single_precision(self.invalid)), nan, values)
@@ -154,19 +154,21 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
     """
     objects: dict[str, BoundObject] = {}
     signals: dict[str, BoundSignal] = {}
-    absent, faults = [], []
+    absent_features, faults = [], []
     entry_count_of: dict[str, int] = {}
     for entry in mapping.features:
         entry_number = entry_count_of[entry.topic] = entry_count_of.get(entry.topic, -1) + 1
         key = f"features.{entry.topic}" + (f"[{entry_number}]" if entry_number else "")
         feature = data_set.feature(entry.topic)
         if feature is None and entry.optional:
-            absent.append(entry.topic)
+            absent_features.append(entry.topic)
             continue
         try:
             if feature is None:
-                names = [feature.name for feature in data_set.features]
-                hint = nearest_hint(entry.topic, names) or f"its features are {listing(names)}"
+                feature_names = [feature.name for feature in data_set.features]
+                hint = (
+                    nearest_hint(entry.topic, feature_names) or f"its features are {listing(feature_names)}"
+                )
                 raise UsageError(f"{key}: {data_set.name} has no such feature; {hint}")
             places = _Places(data_set, feature, key)
             for signal in entry.signals:
@@ -180,7 +182,7 @@ def bind_features(mapping: LogMapping, data_set: DataSet) -> FeatureReading:
             faults.append(f"{mapping.name}: {error}")
     if faults:
         raise UsageError("\n".join(faults))
-    return FeatureReading(tuple(objects.values()), tuple(signals.values()), tuple(absent))
+    return FeatureReading(tuple(objects.values()), tuple(signals.values()), tuple(absent_features))
 
 
 def _claim(by_name: Mapping[str, object], name: str, key: str, kind: str) -> None:
@@ -325,7 +327,7 @@ def detections_of_body(body: Body, shape: ShapeMapping) -> Detections:
 
 
 def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) -> Floats:
-    """Return the numbers at a place in each of T frames (T,); NaN in the last frame for actions.
+    """Return the numbers (T,) at a place in T = `times` frames; NaN in the last frame for actions.
 
     Data sets have one fewer action than states, because no action follows the last state.
 
@@ -335,10 +337,10 @@ def column_of(columns: Columns, place: NumberPlace, times: int, episode: str) ->
     values = columns.get(place.feature)
     if values is None:
         raise LogError(f"{episode}: its files have no numbers of {place.feature}; download them again")
-    rows = values.reshape(len(values), -1)
-    if place.number >= rows.shape[1]:
-        raise LogError(f"{episode}: {place.feature} has {rows.shape[1]} numbers a frame in its files")
-    column: Floats = rows[:, place.number]
+    value_rows = values.reshape(len(values), -1)
+    if place.number >= value_rows.shape[1]:
+        raise LogError(f"{episode}: {place.feature} has {value_rows.shape[1]} numbers a frame in its files")
+    column: Floats = value_rows[:, place.number]
     if len(column) == times - 1:
         return np.append(column, nan)
     if len(column) != times:
@@ -365,10 +367,10 @@ class _Places:
         path_texts = (texts,) if isinstance(texts, str) else texts
         places = tuple(place for text in path_texts for place in self._places(key, text))
         if len(places) not in counts:
-            need = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
+            needed_text = f"{' or '.join(map(str, counts))} {'is' if counts == (1,) else 'are'} needed"
             raise UsageError(
                 f"{self.key}.{key}: {listing(list(path_texts))} has {plural(len(places), 'number')}, and"
-                f" {need}; write {self._example(counts[-1])}"
+                f" {needed_text}; write {self._example(counts[-1])}"
             )
         return places
 
@@ -400,7 +402,9 @@ class _Places:
         if slice_match is None or source is None:
             raise UsageError(f"{self.key}.{key}: {feature.name} has no place {text!r}; {self._hint(text)}")
         if slice_match[2] is None:
-            begin, end = (None if part is None else int(part) for part in slice_match.groups()[2:])
+            begin, end = (
+                None if bound_text is None else int(bound_text) for bound_text in slice_match.groups()[2:]
+            )
             yield from (_place(source, index) for index in range(*slice(begin, end).indices(source.width)))
             return
         index = int(slice_match[2])
@@ -413,8 +417,8 @@ class _Places:
 
     def _hint(self, text: str) -> str:
         places, width = self.feature.places, self.feature.width
-        names = [*places, *(feature.name for feature in self.data_set.features)]
-        if hint := nearest_hint(text, names):
+        known_names = [*places, *(feature.name for feature in self.data_set.features)]
+        if hint := nearest_hint(text, known_names):
             return hint
         if places:
             return f"its places are {listing(list(places))}"

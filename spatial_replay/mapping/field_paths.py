@@ -78,12 +78,12 @@ def _is_free(value: object) -> bool:
 def _plain(value: Any) -> Any:
     """Return a `google.protobuf.Struct` and its parts as JSON values, but other values unchanged."""
     descriptor = getattr(value, "DESCRIPTOR", None)
-    kind = "" if descriptor is None else descriptor.full_name
-    if kind == _FREE:
+    full_name = "" if descriptor is None else descriptor.full_name
+    if full_name == _FREE:
         return {key: _plain(element) for key, element in value.fields.items()}
-    if kind == "google.protobuf.ListValue":
+    if full_name == "google.protobuf.ListValue":
         return list(map(_plain, value.values))
-    if kind != "google.protobuf.Value":
+    if full_name != "google.protobuf.Value":
         return value
     field = value.WhichOneof("kind")
     return None if field in (None, "null_value") else _plain(getattr(value, field))
@@ -160,11 +160,11 @@ def _message_from_json(value: object) -> object:
         return value
     if value.keys() <= {"x", "y", "z", "w"}:
         return {**_POINT, **value}
-    fields = {key: _message_from_json(part) for key, part in value.items()}
+    fields = {key: _message_from_json(field_value) for key, field_value in value.items()}
     if "position" in fields:
         # a missing orientation becomes a quaternion of zeros, as in protobuf's binary encoding
         fields.setdefault("orientation", {**_POINT, "w": 0.0})
-    return {_snake_case(key): part for key, part in fields.items()} | fields
+    return {_snake_case(key): field_value for key, field_value in fields.items()} | fields
 
 
 @lru_cache(4096)
@@ -389,8 +389,8 @@ def leads_somewhere(path: FieldPath, value: object) -> bool:
 def _field_at(path: FieldPath, value: object, name: str) -> object:
     names = field_names(value)
     if name not in names:
-        dotted = next((key for key in names if "." in key and _in_quotes(key) not in path.text), None)
-        hint = f"a key with a dot stands in quotes: {_in_quotes(dotted)}" if dotted else ""
+        dotted_key = next((key for key in names if "." in key and _in_quotes(key) not in path.text), None)
+        hint = f"a key with a dot stands in quotes: {_in_quotes(dotted_key)}" if dotted_key else ""
         hint = hint or nearest_hint(name, names)
         raise FieldError(
             f"{path.text}: {type_name(value)} has no field {name!r}"

@@ -447,8 +447,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
                 faults.append(((*place, other_key), f"there is {key!r} already; give one of the two"))
         is_feature = place[0] == "features"
         faults += [
-            ((*place, *inner_place), text)
-            for inner_place, text in _contradictions_of_turns(entry, is_feature)
+            ((*place, *inner_place), duration_text)
+            for inner_place, duration_text in _contradictions_of_turns(entry, is_feature)
         ]
     tables_with_durations: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),
@@ -457,9 +457,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     ]
     tables_with_durations += [(place, entry, "max_age") for _, place, entry in entries]
     for place, table, key in tables_with_durations:
-        text = table.get(key) if isinstance(table, dict) else None
-        if isinstance(text, str) and _NO_TIME.fullmatch(text):
-            faults.append(((*place, key), f"{text!r} is not a time; give a duration above 0"))
+        duration_text = table.get(key) if isinstance(table, dict) else None
+        if isinstance(duration_text, str) and _NO_TIME.fullmatch(duration_text):
+            faults.append(((*place, key), f"{duration_text!r} is not a time; give a duration above 0"))
     return faults
 
 
@@ -490,9 +490,9 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
     frame = entry.get("frame")
     position, orientation, height = entry.get("position"), entry.get("orientation"), entry.get("height")
     shape = _shape(entry.get("shape"), shapes)
-    bounds, form = entry.get("bounds"), "xyxy"
+    bounds, bounds_form = entry.get("bounds"), "xyxy"
     if isinstance(bounds, dict):
-        bounds, form = bounds["field"], bounds["form"]
+        bounds, bounds_form = bounds["field"], bounds["form"]
     return TopicMapping(
         topic=topic,
         reads_objects="signals" not in entry or not entry.keys() <= _SIGNAL_KEYS,
@@ -507,7 +507,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         yaw=_angle(entry.get("yaw")),
         polygon=entry.get("polygon"),
         bounds=tuple(bounds) if isinstance(bounds, list) else bounds,
-        bounds_have_size=form == "xywh",
+        bounds_have_size=bounds_form == "xywh",
         shape=shape,
         height=_height(height) if height or shape is None else shape.height,
         uncertainty=_uncertainty(entry.get("uncertainty")),

@@ -151,7 +151,7 @@ class Guess:
     @property
     def score(self) -> int:
         """Number of fields of an object; a position, an outline or bounds counts ten."""
-        parts = (
+        part_fields = (
             self.polygon or self.bounds,
             self.size,
             self.names,
@@ -159,7 +159,7 @@ class Guess:
             self.class_name,
         )
         has_place = any(place is not None for place in (self.polygon, self.bounds, self.position))
-        return 10 * has_place + sum(map(bool, parts))
+        return 10 * has_place + sum(map(bool, part_fields))
 
 
 def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
@@ -227,7 +227,7 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
     if isinstance(guess.position, tuple) and geodetic_order(guess.position):
         # the frame of a fix identifies its receiver
         guess = replace(guess, names=(*guess.names, "frame_id"))
-    names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
+    distinguishing_names = tuple(name for name in guess.names if _distinguishes(name, guess, messages))
     with suppress(FieldError):
         guess = replace(guess, bounds_have_size=_have_size(guess, messages))
     if guess.size and not any(_values_at(guess.size[:2], guess, messages)):
@@ -239,16 +239,16 @@ def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
             value for value in _values_at((guess.plane,), guess, messages) if isinstance(value, str)
         }
         guess = replace(guess, plane=guess.plane if len(plane_names) > 1 else None)
-    return replace(guess, names=names or tuple(_names_beside(guess, messages)))
+    return replace(guess, names=distinguishing_names or tuple(_names_beside(guess, messages)))
 
 
 def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
     """Yield the paths of neighbouring lists that hold a name for each object."""
     if guess.objects is None or guess.objects.count("[*]") > 1:
         return
-    prefix = guess.objects.rpartition(".")[0]
+    path_prefix = guess.objects.rpartition(".")[0]
     for name in _NAMES_BESIDE:
-        path = FieldPath.of(f"{prefix}.{name}" if prefix else name)
+        path = FieldPath.of(f"{path_prefix}.{name}" if path_prefix else name)
         objects = FieldPath.of(guess.objects)
         try:
             names_and_counts = [
@@ -413,24 +413,24 @@ def _table_of_objects(value: object) -> list[object]:
     """
     if not isinstance(value, Mapping):
         return []
-    keys = keys_of(value)
-    objects = [value[key] for key in keys]
+    object_keys = keys_of(value)
+    objects = [value[key] for key in object_keys]
     if not isinstance(value, dict):
         return objects
     field_sets = {frozenset(field_names(element)) for element in objects}
-    is_table = len(objects) > 1 and len(field_sets) == 1 and _PARTS.isdisjoint(keys)
-    return objects if is_table and not any(map(_is_no_place, keys)) else []
+    is_table = len(objects) > 1 and len(field_sets) == 1 and _PARTS.isdisjoint(object_keys)
+    return objects if is_table and not any(map(_is_no_place, object_keys)) else []
 
 
 def _object_in(value: object) -> Guess | None:
     """Find the fields of one object in a message, or in an element of a list; None without a position."""
-    fields = dict(_iter_fields(value))
-    position, orientation = _pose_in(fields)
-    polygon, corners = _outline_in(fields)
-    bounds = _bounds_in(fields)
+    field_values = dict(_iter_fields(value))
+    position, orientation = _pose_in(field_values)
+    polygon, corners = _outline_in(field_values)
+    bounds = _bounds_in(field_values)
     is_in_object_frame = False
     if polygon is not None and orientation is not None and isinstance(position, str):
-        origin = _point(fields[position]) or (0.0, 0.0)
+        origin = _point(field_values[position]) or (0.0, 0.0)
         is_in_object_frame = not _is_around(corners, origin) and _is_around(corners, (0.0, 0.0))
         if not is_in_object_frame and not _is_around(corners, origin):
             # the outline does not belong to the pose, such as pixels next to a pose in metres
@@ -443,21 +443,21 @@ def _object_in(value: object) -> Guess | None:
     if bounds is not None:
         corners = [_box_at(bounds, value)]
     elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
-        corners = [_point(fields[position]) or ()]
+        corners = [_point(field_values[position]) or ()]
     return Guess(
         position=position if is_posed else None,
         orientation=orientation if is_posed else None,
-        has_order=is_posed and orientation is not None and is_list(fields[orientation]),
-        yaw=_first(fields, _YAWS, _is_number) if is_posed and not orientation else None,
+        has_order=is_posed and orientation is not None and is_list(field_values[orientation]),
+        yaw=_first(field_values, _YAWS, _is_number) if is_posed and not orientation else None,
         polygon=polygon,
         is_own=is_in_object_frame,
         bounds=bounds,
-        size=_size_in(fields) if polygon is None else (),
-        names=_names_in(fields),
+        size=_size_in(field_values) if polygon is None else (),
+        names=_names_in(field_values),
         class_name=_first(
-            fields, _CLASSES, lambda value: isinstance(value, str) and value not in _GEOMETRIES
+            field_values, _CLASSES, lambda value: isinstance(value, str) and value not in _GEOMETRIES
         ),
-        plane=_first(fields, _PLANES, lambda value: isinstance(value, str) and value != ""),
+        plane=_first(field_values, _PLANES, lambda value: isinstance(value, str) and value != ""),
         is_in_pixels=not is_in_object_frame and _are_pixels(corners),
     )
 
@@ -497,9 +497,9 @@ def _bounds_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
     }
     for names in _FOUR_BOUNDS:
         if all(name in path_by_name for name in names):
-            left, low, right, top = (float(fields[path_by_name[name]]) for name in names)  # type: ignore[arg-type]
+            left, bottom, right, top = (float(fields[path_by_name[name]]) for name in names)  # type: ignore[arg-type]
             # numbers in another order are the ends of a line, not corners of a box
-            return tuple(path_by_name[name] for name in names) if left <= right and low <= top else None
+            return tuple(path_by_name[name] for name in names) if left <= right and bottom <= top else None
     return None
 
 
@@ -529,7 +529,7 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
         return True
     boxes = [_box_at(bounds, element) for message in messages for element in _objects_in(guess, message)]
     return "xyxy" not in last_name and any(
-        right < left or top < low for left, low, right, top in filter(None, boxes)
+        right < left or top < bottom for left, bottom, right, top in filter(None, boxes)
     )
 
 
@@ -582,8 +582,8 @@ def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -
     low, high = (
         tuple(extremum(corner[axis] for corner in corners) for axis in (0, 1)) for extremum in (min, max)
     )
-    size = sum(high) - sum(low)
-    return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
+    half_perimeter = sum(high) - sum(low)
+    return all(low[axis] - half_perimeter <= place[axis] <= high[axis] + half_perimeter for axis in (0, 1))
 
 
 _PIXELS = 50
@@ -600,16 +600,18 @@ def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
 
 def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
     for path in _paths_by_name(fields, _SIZES):
-        for names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
+        for size_names in (("length", "width", "height"), ("x", "y", "z"), ("size_x", "size_y", "size_z")):
             inner_names = field_names(fields[path])
-            if all(name in inner_names and _is_number(get_field(fields[path], name)) for name in names[:2]):
-                return tuple(f"{path}.{name}" for name in names if name in inner_names)
+            if all(
+                name in inner_names and _is_number(get_field(fields[path], name)) for name in size_names[:2]
+            ):
+                return tuple(f"{path}.{name}" for name in size_names if name in inner_names)
         numbers = () if path.endswith("bbox") else _numbers(fields[path], 3) or _numbers(fields[path], 2)
         if numbers:
             return tuple(f"{path}[{index}]" for index in range(len(numbers)))
-    for names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
-        if all(_is_number(fields.get(name)) for name in names[:2]):
-            return tuple(name for name in names if name in fields)
+    for size_names in (("length", "width", "height"), ("size_x", "size_y", "size_z")):
+        if all(_is_number(fields.get(name)) for name in size_names[:2]):
+            return tuple(name for name in size_names if name in fields)
     return ("radius",) if _is_number(fields.get("radius")) else ()
 
 
@@ -620,19 +622,19 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         for path in fields
         if (words := _words(path.split(".")[-1]))[-1] in ("id", "uuid") and not _NO_IDENTITIES & {*words}
     ]
-    names: list[str] = []
+    name_paths: list[str] = []
     for path in dict.fromkeys(
         [*_paths_by_name(fields, _NAMES), *sorted(other_paths, key=lambda path: path.count("."))]
     ):
         value = fields[path]
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
-            names.append(path)
+            name_paths.append(path)
         elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
             # a list with one id, or with the bytes of a UUID
-            names.append(path)
+            name_paths.append(path)
         elif inner_name := next((name for name in ("value", "uuid") if name in field_names(value)), None):
-            names.append(f"{path}.{inner_name}")
-    return tuple(dict.fromkeys(names))
+            name_paths.append(f"{path}.{inner_name}")
+    return tuple(dict.fromkeys(name_paths))
 
 
 def _words(name: str) -> list[str]:

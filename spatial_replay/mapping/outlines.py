@@ -58,10 +58,10 @@ def outlines_from_lists(
         if have_size:
             # NaN instead of a negative size makes the object unknown
             box_corners[1] = box_corners[0] + np.where(box_corners[1] < 0, np.nan, box_corners[1])
-        (left, low, _), (right, high, _) = box_corners.min(axis=0).T, box_corners.max(axis=0).T
+        (left, bottom, _), (right, top, _) = box_corners.min(axis=0).T, box_corners.max(axis=0).T
         box_xs, box_ys = (
             np.stack([left, right, right, left], axis=1),
-            np.stack([low, low, high, high], axis=1),
+            np.stack([bottom, bottom, top, top], axis=1),
         )
         boxes = np.stack([box_xs, box_ys, np.zeros_like(box_xs)], axis=2).reshape(-1, 3)
         corner_counts, points = np.where(is_faulty, 0, 4), boxes
@@ -142,15 +142,17 @@ def path_of_rings(path: FieldPath, example: object) -> FieldPath | None:
 
     A neighbouring field identifies rings: `type` next to `coordinates`, or `inner` next to `outer`.
     """
-    for length, step in enumerate(path.steps):
-        owner_path = FieldPath(path.text, path.steps[:length])
-        names = field_names(walk(owner_path, example))
-        if (step == _OUTER and _INNER in names) or (step == "coordinates" and "type" in names):
+    for step_count, step in enumerate(path.steps):
+        owner_path = FieldPath(path.text, path.steps[:step_count])
+        neighbour_names = field_names(walk(owner_path, example))
+        if (step == _OUTER and _INNER in neighbour_names) or (
+            step == "coordinates" and "type" in neighbour_names
+        ):
             return owner_path
     value = walk(path, example) if leads_somewhere(path, example) else None
-    names = field_names(value)
+    neighbour_names = field_names(value)
     # corners are lists in a list; rings are one level deeper
-    has_rings = _INNER in names or "coordinates" in names or _depth(value) > 2
+    has_rings = _INNER in neighbour_names or "coordinates" in neighbour_names or _depth(value) > 2
     return path if has_rings else None
 
 
@@ -177,12 +179,12 @@ def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Flo
 
 def _polygons_in(holder: Any) -> list[Any]:
     """Return the polygons of an object, each as a list of rings."""
-    names = field_names(holder)
-    if _OUTER in names:
+    holder_fields = field_names(holder)
+    if _OUTER in holder_fields:
         rings = [get_field(holder, _OUTER), *get_field(holder, _INNER)]  # type: ignore[misc]
         return [[get_field(ring, "points") if "points" in field_names(ring) else ring for ring in rings]]
-    if "type" in names:
-        coordinates = get_field(holder, "coordinates") if "coordinates" in names else ()
+    if "type" in holder_fields:
+        coordinates = get_field(holder, "coordinates") if "coordinates" in holder_fields else ()
         # points and lines cover no area
         polygons_by_type: dict[object, Any] = {"Polygon": [coordinates], "MultiPolygon": coordinates}
         return list(polygons_by_type.get(get_field(holder, "type"), ()))

@@ -249,16 +249,16 @@ def _faults_of(mapping: LogMapping, by_name: dict[str, Topic]) -> list[str]:
         topic_text = _topics_in_words(by_name)
         faults.append(f"topics: the log has none of these optional topics; its topics are {topic_text}")
     for entry in mapping.topics:
-        kind = short_type(entry.type or (by_name[entry.topic].type if entry.topic in by_name else ""))
+        type_name = short_type(entry.type or (by_name[entry.topic].type if entry.topic in by_name else ""))
         if (
-            kind in GEODETIC_TYPES
+            type_name in GEODETIC_TYPES
             and entry.reads_objects
             and entry.position is None
             and entry.polygon is None
             and mapping.origin is None
         ):
             faults.append(
-                f"topics.{entry.topic}: {kind} holds degrees; give the file an"
+                f"topics.{entry.topic}: {type_name} holds degrees; give the file an"
                 " `origin: [latitude, longitude]`, and positions are metres east and north of it"
             )
         if entry.type is not None and short_type(entry.type) not in BUILT_IN:
@@ -278,11 +278,15 @@ def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
     is sampled.
     """
     existing_entries = [entry for entry in mapping.topics if entry.topic in by_name]
-    names = [entry.topic for entry in existing_entries if entry.reads_objects] or [
+    candidate_names = [entry.topic for entry in existing_entries if entry.reads_objects] or [
         entry.topic for entry in existing_entries
     ]
-    message_counts = [by_name[name].count for name in names]
-    return names[0] if None in message_counts else max(names, key=lambda name: by_name[name].count or 0)
+    message_counts = [by_name[name].count for name in candidate_names]
+    return (
+        candidate_names[0]
+        if None in message_counts
+        else max(candidate_names, key=lambda name: by_name[name].count or 0)
+    )
 
 
 def _fallback_topics(planned: Sequence[PlannedTopic], sampled: str | None) -> frozenset[str]:
@@ -349,7 +353,7 @@ def doubts_of(
 def _plan_of_topic(
     mapping: LogMapping, entry: TopicMapping | None, topic: Topic, entry_index: int, needs_frames: bool
 ) -> PlannedTopic:
-    kind = short_type((entry.type if entry is not None else None) or topic.type)
+    type_name = short_type((entry.type if entry is not None else None) or topic.type)
     # only the first entry of a topic adds the topic's transforms
     is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES and entry_index == 0
     is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
@@ -378,7 +382,7 @@ def _plan_of_topic(
         is_transforms=is_transforms,
         is_static=is_static,
         is_latched=topic.latched,
-        is_protobuf_json=topic.encoding == "json" and kind.startswith("foxglove/"),
+        is_protobuf_json=topic.encoding == "json" and type_name.startswith("foxglove/"),
         is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
     )
 

@@ -287,11 +287,17 @@ def _first_that_fit(texts: Sequence[tuple[str, str]], byte_limit: int) -> list[t
 
 def _with_distinct_names(suggestions: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
     """Return suggestions with the topic as a prefix of names that several topics share."""
-    parts_by_topic = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in suggestions}
-    name_counts = Counter(part.name for parts in parts_by_topic.values() for part in parts)
+    lists_by_topic = {suggestion.topic.name: (suggestion, *suggestion.further) for suggestion in suggestions}
+    name_counts = Counter(
+        list_suggestion.name
+        for list_suggestions in lists_by_topic.values()
+        for list_suggestion in list_suggestions
+    )
     return [
         _with_prefix(suggestion, _topic_words(suggestion.topic.name))
-        if any(name_counts[part.name] > 1 for part in parts_by_topic[suggestion.topic.name])
+        if any(
+            name_counts[list_suggestion.name] > 1 for list_suggestion in lists_by_topic[suggestion.topic.name]
+        )
         else suggestion
         for suggestion in suggestions
     ]
@@ -410,19 +416,19 @@ def _suggestions(topic: Topic, examples: Sequence[object]) -> list[TopicSuggesti
     is_ours = has_our_type(Channel(topic.name, topic.encoding, topic.schema))
     if is_ours or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return [TopicSuggestion(topic)]
-    kind = short_type(topic.type)
+    type_name = short_type(topic.type)
     if topic.unreadable is not None:
         return [TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))]
-    if kind in TRANSFORM_TYPES:
+    if type_name in TRANSFORM_TYPES:
         return [_of_transforms(topic, examples)]
-    if kind in BUILT_IN:
-        return [_of_known_type(topic, BUILT_IN[kind], examples)]
+    if type_name in BUILT_IN:
+        return [_of_known_type(topic, BUILT_IN[type_name], examples)]
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
         return [TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())]
-    bodies = [body for body in guess.others if body.is_body and not share_places(guess, body, examples)]
-    other_guesses = tuple(other_guess for other_guess in guess.others if other_guess not in bodies)
-    guesses = [replace(guess, others=other_guesses), *bodies]
+    body_guesses = [body for body in guess.others if body.is_body and not share_places(guess, body, examples)]
+    other_guesses = tuple(other_guess for other_guess in guess.others if other_guess not in body_guesses)
+    guesses = [replace(guess, others=other_guesses), *body_guesses]
     return [_of_guess(topic, guess, examples) for guess in guesses[:_MOST_LISTS]]
 
 
@@ -657,9 +663,9 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
             f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes",
         )
     if guess.plane is not None:
-        floors = f"{guess.plane} names floors or maps; objects on all of them are in one plane here"
-        one_floor = f"frame: {{field: {guess.plane}}} with `fixed_frame: FLOOR` evaluates one of them"
-        object_remarks = (*object_remarks, floors, one_floor)
+        floors_remark = f"{guess.plane} names floors or maps; objects on all of them are in one plane here"
+        floor_remark = f"frame: {{field: {guess.plane}}} with `fixed_frame: FLOOR` evaluates one of them"
+        object_remarks = (*object_remarks, floors_remark, floor_remark)
     if guess.has_compass:
         object_remarks = (
             *object_remarks,
@@ -684,11 +690,11 @@ def _choose_frame(
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) < 2:
         fixed_frame = yaml_text((roots or frames or ["map"])[0])
-        lines = [
+        mapping_lines = [
             "# without a fixed frame, coordinates are taken as they are",
             f"# fixed_frame: {fixed_frame}",
         ]
-        return (lines if edges else []), {}
+        return (mapping_lines if edges else []), {}
     frames_by_root = {root: _below(root, edges).intersection(frames) for root in (*roots, *frames)}
 
     def rank(root: str) -> tuple[int, int]:
@@ -704,13 +710,13 @@ def _choose_frame(
         for suggestion in suggestions
         if suggestion.frames and not frames_by_root[fixed_frame] & suggestion.frames
     }
-    lines = [f"# coordinates are in the frames {_comment(', '.join(frames))}"]
+    mapping_lines = [f"# coordinates are in the frames {_comment(', '.join(frames))}"]
     if other_frames:
-        lines.append(
+        mapping_lines.append(
             f"# no transforms join {_comment(', '.join(other_frames))} with {fixed_frame}: what is in these"
             " is unknown or left out; `frame` of a topic overrides its frame"
         )
-    return [*lines, f"fixed_frame: {yaml_text(fixed_frame)}"], reason_by_topic
+    return [*mapping_lines, f"fixed_frame: {yaml_text(fixed_frame)}"], reason_by_topic
 
 
 def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
@@ -727,11 +733,11 @@ def _edges(message: object) -> Iterator[tuple[str, str]]:
     if isinstance(message, dict):
         transforms = message.get("transforms")
     for transform in [message] if transforms is None else transforms:
-        names = field_names(transform)
+        transform_fields = field_names(transform)
         parent = frame_of(transform) or (
-            "parent_frame_id" in names and get_field(transform, "parent_frame_id")
+            "parent_frame_id" in transform_fields and get_field(transform, "parent_frame_id")
         )
-        child = "child_frame_id" in names and get_field(transform, "child_frame_id")
+        child = "child_frame_id" in transform_fields and get_field(transform, "child_frame_id")
         if isinstance(parent, str) and isinstance(child, str) and parent and child:
             yield parent.removeprefix("/"), child.removeprefix("/")
 

@@ -179,14 +179,14 @@ def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) 
 
 def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, Floats], list[Body]]:
     """Return the numbers of some episodes by feature, and the bodies of the first episode."""
-    names = [feature.name for feature in features]
+    feature_names = [feature.name for feature in features]
     # any frame rate will do, because only the numbers are read
     reading = AS_STORED._replace(fps=data_set.fps or 1.0)
-    value_arrays: dict[str, list[Floats]] = {name: [] for name in names}
+    value_arrays: dict[str, list[Floats]] = {name: [] for name in feature_names}
     bodies: list[Body] = []
     for episode_index, episode in enumerate(data_set.episodes[:_MOST_EPISODES]):
         try:
-            columns = data_set.columns(episode.number, reading, names)
+            columns = data_set.columns(episode.number, reading, feature_names)
         except UsageError:
             # the data set cannot be read without keys of a mapping, such as `order`
             break
@@ -298,10 +298,10 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
             abs(start - joint_start) >= 7 for joint_start in joint_starts
         ):
             joint_starts.append(start)
-    for number, start in enumerate(sorted(joint_starts)):
+    for body_number, start in enumerate(sorted(joint_starts)):
         yield Suggestion(
             feature.name,
-            f"body_{number}",
+            f"body_{body_number}",
             (f"[{start}:{start + 3}]",),
             (f"[{start + 3}:{start + 7}]",),
             "wxyz",

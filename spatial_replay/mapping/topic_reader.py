@@ -205,7 +205,7 @@ class Extractor:
             FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message has
                 another form. Only a FieldError describes the difference.
         """
-        values, message_indices, list_keys = self._flatten(messages)
+        object_values, message_indices, list_keys = self._flatten(messages)
         # `is_diff` marks a list of changes, as in moveit_msgs/PlanningScene
         if messages and "is_diff" in field_names(messages[0]):
             get = lenient_getter(style_of(messages[0]))
@@ -215,24 +215,26 @@ class Extractor:
             if self.namer.needs_messages
             else None
         )
-        objects = _Objects(values, message_indices, self.namer.codes(values, list_keys, message_of_object))
-        deleted: list[tuple[int, int]] = []
+        objects = _Objects(
+            object_values, message_indices, self.namer.codes(object_values, list_keys, message_of_object)
+        )
+        deletions: list[tuple[int, int]] = []
         scene_stamps_ns = self._scene_stamps_ns
         if self.layout.solids == "marker":
-            objects, deleted = _split_deleted_markers(objects)
+            objects, deletions = _split_deleted_markers(objects)
         elif self.layout.solids == "scene":
-            deleted, scene_stamps_ns = self._deleted_entities(messages, objects)
+            deletions, scene_stamps_ns = self._deleted_entities(messages, objects)
         if self.namer.is_filtering:
             objects = objects.where(self.namer.select(objects.name))
-        chunk = DetectionChunk(places, deleted)
+        chunk = DetectionChunk(places, deletions)
         if objects.values:
             if self._binding is None:
                 example, message = objects.values[0], messages[objects.message[0]]
                 self._binding = bind(self.layout, example, message, needs_frame=self._needs_frame)
                 self._bind_time(example, message)
             self._fill(chunk, self._binding, messages, objects)
-            paths = list(map(FieldPath.of, self.unseen))
-            if any(leads_somewhere(path, element) for path in paths for element in objects.values):
+            unseen_paths = list(map(FieldPath.of, self.unseen))
+            if any(leads_somewhere(path, element) for path in unseen_paths for element in objects.values):
                 self.unseen = ()
         if not is_early:
             # stamps are set last, because the messages are read again one by one after a failure
@@ -353,15 +355,15 @@ class Extractor:
             # the first message is read step by step, because errors of the fast getter do not name the fields
             list(iter_elements(self._list_path, messages[0]))
             self._get_list = list_getter(self._list_path, messages[0]) or self._elements
-        lists = list(map(self._get_list, messages)) if self._get_list is not None else []
-        keys = (
+        object_lists = list(map(self._get_list, messages)) if self._get_list is not None else []
+        keys_by_list = (
             map(str, keys_of(holder)) if isinstance(holder, Mapping) else range(len(holder))
-            for holder in lists
+            for holder in object_lists
         )
-        list_keys: list[int | str] = list(chain.from_iterable(keys))
-        lists = list(map(elements_of, lists))
-        message_indices = np.repeat(np.arange(len(lists)), list(map(len, lists))).tolist()
-        return list(chain.from_iterable(lists)), message_indices, list_keys
+        list_keys: list[int | str] = list(chain.from_iterable(keys_by_list))
+        object_lists = list(map(elements_of, object_lists))
+        message_indices = np.repeat(np.arange(len(object_lists)), list(map(len, object_lists))).tolist()
+        return list(chain.from_iterable(object_lists)), message_indices, list_keys
 
     def _elements(self, message: object) -> list[object]:
         return [message] if self._list_path is None else list(iter_elements(self._list_path, message))
@@ -375,9 +377,9 @@ class Extractor:
         (https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion). A message's entities are added
         after its deletions.
         """
-        deleted: list[tuple[int, int]] = []
+        deletions: list[tuple[int, int]] = []
         stamps_ns = dict(self._scene_stamps_ns)
-        starts = np.searchsorted(entities.message, np.arange(len(messages) + 1)).tolist()
+        entity_starts = np.searchsorted(entities.message, np.arange(len(messages) + 1)).tolist()
         stamps = [_stamp_of_scene(entity) for entity in entities.values]
         for message_index, message in enumerate(messages):
             get = lenient_getter(style_of(message))
@@ -385,16 +387,16 @@ class Extractor:
                 # a deletion without a timestamp concerns all earlier entities
                 stamp_ns = _stamp_of_scene(deletion) or LATEST_NS
                 if get(deletion, "type") in DELETE_ALL_ENTITIES:
-                    names = list(stamps_ns)
+                    candidate_names = list(stamps_ns)
                 else:
-                    names = self.namer.codes([deletion], [0], [message])
-                deleted_names = [name for name in names if stamps_ns.get(name, 0) <= stamp_ns]
+                    candidate_names = self.namer.codes([deletion], [0], [message])
+                deleted_names = [name for name in candidate_names if stamps_ns.get(name, 0) <= stamp_ns]
                 for name in deleted_names:
                     stamps_ns.pop(name, None)
-                deleted += [(message_index, name) for name in deleted_names]
-            message_entities = slice(starts[message_index], starts[message_index + 1])
+                deletions += [(message_index, name) for name in deleted_names]
+            message_entities = slice(entity_starts[message_index], entity_starts[message_index + 1])
             stamps_ns.update(zip(entities.name[message_entities], stamps[message_entities], strict=True))
-        return deleted, stamps_ns
+        return deletions, stamps_ns
 
     def _bind_time(self, example: object, message: object) -> None:
         if not self._is_time_bound:
@@ -444,8 +446,8 @@ class Extractor:
             chunk.noted_stamps = list(zip(chunk.places.tolist(), stamps, strict=True))
         else:
             chunk.stamps = self._time.nanoseconds(objects.values)
-            places = chunk.places[objects.message].tolist()
-            chunk.noted_stamps = list(zip(places, chunk.stamps, strict=True))
+            batch_indices = chunk.places[objects.message].tolist()
+            chunk.noted_stamps = list(zip(batch_indices, chunk.stamps, strict=True))
 
 
 def _stamp_of_scene(entity: Any) -> int:
@@ -521,7 +523,7 @@ class TopicReader:
 
     Args:
         names, classes: codes that all topics share.
-        decodes_early: whether messages whose objects have frames are decoded on arrival.
+        decodes_early: whether messages with frames of objects are decoded on arrival.
         report: receiver of lost messages.
     """
 
@@ -558,15 +560,15 @@ class TopicReader:
             )
         self._mapping_name = mapping.name
         self._report = report
-        reads = self.is_mapped or self.decodes_on_arrival
-        self._decode: Decoder = decoder(planned.topic) if reads else _skip
+        is_decoded = self.is_mapped or self.decodes_on_arrival
+        self._decode: Decoder = decoder(planned.topic) if is_decoded else _skip
         decode = self._decode
-        if reads and planned.layout is not None and planned.layout.is_geojson:
+        if is_decoded and planned.layout is not None and planned.layout.is_geojson:
             self._decode = lambda payload: features_in(decode(payload))
-        elif reads and planned.is_protobuf_json:
-            objects = planned.layout.objects if planned.layout is not None else ""
-            self._decode = lambda payload: from_protobuf_json(decode(payload), objects)
-        if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
+        elif is_decoded and planned.is_protobuf_json:
+            objects_path = planned.layout.objects if planned.layout is not None else ""
+            self._decode = lambda payload: from_protobuf_json(decode(payload), objects_path)
+        if is_decoded and planned.mapping is not None and planned.mapping.has_zeros_left_out:
             decode_fully = self._decode
             self._decode = lambda payload: sparse(decode_fully(payload))
         self._time: TimeGetter | None = None
@@ -644,7 +646,7 @@ class TopicReader:
         """
         good = np.ones(len(contents), np.bool_)
         chunks: list[DetectionChunk] = []
-        signals: list[list[float]] = []
+        signal_rows: list[list[float]] = []
         all_times_ns = log_times_ns.tolist()
         chunk_size = _chunk_size(contents)
         for begin in range(0, len(contents), chunk_size):
@@ -663,11 +665,11 @@ class TopicReader:
             )
             if self.extractor is not None:
                 chunks += self._read_objects(self.extractor, messages, begin, chunk_times_ns, is_chunk_good)
-            signals += compress(chunk_signals, is_chunk_good.tolist())
+            signal_rows += compress(chunk_signals, is_chunk_good.tolist())
         return TopicColumns(
             good=good,
             detections=None if self.extractor is None else self.extractor.detections(chunks, good),
-            signals=np.array(signals, np.float64).reshape(int(good.sum()), len(self._signal_fields)),
+            signals=np.array(signal_rows, np.float64).reshape(int(good.sum()), len(self._signal_fields)),
             stamps=np.array([stamp for chunk in chunks for stamp in chunk.noted_stamps], np.int64).reshape(
                 -1, 2
             ),
@@ -789,9 +791,9 @@ class TopicReader:
             if not (number_by_name and isinstance(value, str)):
                 return _number(value)
             if value not in number_by_name:
-                texts = self.unnamed.setdefault(signal.name, {})
-                if len(texts) < _MOST_UNNAMED:
-                    texts.setdefault(value[:_LONGEST_UNNAMED])
+                unnamed_texts = self.unnamed.setdefault(signal.name, {})
+                if len(unnamed_texts) < _MOST_UNNAMED:
+                    unnamed_texts.setdefault(value[:_LONGEST_UNNAMED])
             return number_by_name.get(value, nan)
 
         return number_of
@@ -932,7 +934,10 @@ class PendingMessages:
                 sequence_numbers[time_order],
                 log_times_ns[time_order],
             )
-            record_numbers, contents = record_numbers[time_order], [contents[i] for i in time_order.tolist()]
+            record_numbers, contents = (
+                record_numbers[time_order],
+                [contents[index] for index in time_order.tolist()],
+            )
         end = int(np.searchsorted(times_ns, upto_ns, "right"))
         self._columns = [
             (

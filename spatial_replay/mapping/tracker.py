@@ -82,9 +82,11 @@ class Events:
             )
             columns = self._standing(event_indices, object_starts, times_ns, max_age_ns)
             return States(self.name[object_starts], *(column[None] for column in columns))
-        ends = np.append(object_starts[1:], len(self.name))[: len(object_starts)]
+        object_ends = np.append(object_starts[1:], len(self.name))[: len(object_starts)]
         state_columns = np.zeros((3, len(times_ns), len(object_starts)), np.int64)
-        for object_index, (start, end) in enumerate(zip(object_starts.tolist(), ends.tolist(), strict=True)):
+        for object_index, (start, end) in enumerate(
+            zip(object_starts.tolist(), object_ends.tolist(), strict=True)
+        ):
             event_indices = np.searchsorted(self.time_ns[start:end], times_ns, "right") - 1 + start
             state_columns[:, :, object_index] = self._standing(event_indices, start, times_ns, max_age_ns)
         return States(self.name[object_starts], *state_columns)
@@ -104,8 +106,8 @@ class Events:
         event_rows = self.row[event_indices]
         is_old = times_ns - self.time_ns[event_indices] > max_age_ns
         is_absent = ~has_appeared | (event_rows == LEFT) | (times_ns >= self.expires_ns[event_indices])
-        rows = np.where(is_absent, ABSENT, np.where(is_old, STALE, event_rows))
-        return rows, self.class_code[event_indices], self.time_ns[event_indices]
+        row_numbers = np.where(is_absent, ABSENT, np.where(is_old, STALE, event_rows))
+        return row_numbers, self.class_code[event_indices], self.time_ns[event_indices]
 
 
 class States(NamedTuple):
@@ -271,11 +273,11 @@ def rows_from_detections(
     uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
     # each detection is checked as a separate sample, so that an invalid detection does not affect others
-    indices = np.arange(object_count, dtype=np.int64)
+    object_indices = np.arange(object_count, dtype=np.int64)
     is_readable, footprints, faults = check_observations(
         Observations(
-            times_ns=indices,
-            sample=indices,
+            times_ns=object_indices,
+            sample=object_indices,
             name=np.zeros(object_count, np.int64),
             names=("",),
             class_code=detections.class_code,
@@ -296,7 +298,7 @@ def rows_from_detections(
     is_unknown[list(faults)] = True
     rows_and_blanks = concatenate_tables([rows, ObservationRows.blank(detections.class_code)])
     return replace(
-        select(rows_and_blanks, np.where(is_unknown, object_count + indices, indices)),
+        select(rows_and_blanks, np.where(is_unknown, object_count + object_indices, object_indices)),
         is_valid=is_readable & ~is_unknown,
     )
 
@@ -312,15 +314,17 @@ def _radius(covariance: Floats) -> Floats:
 
     The result is NaN for a negative variance, because some programs mark an unknown covariance so.
     """
-    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    # the larger eigenvalue of [[a, b], [b, d]]
-    largest_variance = (a + d) / 2 + np.hypot((a - d) / 2, b)
-    return np.asarray(np.where((a < 0) | (d < 0), np.nan, np.sqrt(np.maximum(largest_variance, 0.0))))
+    variance_x, covariance_xy, variance_y = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # the larger eigenvalue of [[variance_x, covariance_xy], [covariance_xy, variance_y]]
+    largest_variance = (variance_x + variance_y) / 2 + np.hypot((variance_x - variance_y) / 2, covariance_xy)
+    return np.asarray(
+        np.where((variance_x < 0) | (variance_y < 0), np.nan, np.sqrt(np.maximum(largest_variance, 0.0)))
+    )
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
-"""Limits of calls of `advance`, and of stored observations, from which old observations are dropped. Dropping
-after each call would be slow, because a call may process a single message."""
+"""Old observations are dropped after this many calls of `advance`, or from this many stored observations.
+Dropping after each call would be slow, because a call may process a single message."""
 
 _FAR_NS = 366 * 86_400 * 10**9
 """Least difference between stamp and log time that shows another clock or unit, nanoseconds."""
@@ -416,12 +420,15 @@ class Tracker:
                     self._count_replacements(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 if columns.signals.size:
                     self.evidence[name].add_signals(columns.signals)
-                for signal_index, values in enumerate(columns.signals.T if len(times_ns) else ()):
+                for signal_index, signal_values in enumerate(columns.signals.T if len(times_ns) else ()):
                     earlier_ns, earlier_values = self._signals.get(
-                        (name, signal_index), (times_ns[:0], values[:0])
+                        (name, signal_index), (times_ns[:0], signal_values[:0])
                     )
-                    series = np.concatenate([earlier_ns, times_ns]), np.concatenate([earlier_values, values])
-                    self._signals[name, signal_index] = series
+                    signal_series = (
+                        np.concatenate([earlier_ns, times_ns]),
+                        np.concatenate([earlier_values, signal_values]),
+                    )
+                    self._signals[name, signal_index] = signal_series
             if reader.is_mapped and len(times_ns):
                 self._note_messages(reader.planned, times_ns, is_placed)
             if self.plan.sampled_topic in (None, name):
@@ -435,18 +442,18 @@ class Tracker:
         """Note the times of a topic's messages, and whether transforms place the objects of each message."""
         name = planned.name
         self._begun_ns.setdefault(name, int(times_ns[0]))
-        latest_ns, latest_placed = (
+        latest_ns, was_placed = (
             self._reported_ns.get(name, times_ns[:0])[-1:],
             self._placed_messages.get(name),
         )
         self._reported_ns[name] = np.concatenate([latest_ns, times_ns])
         self._placed_messages[name] = np.concatenate(
-            [is_placed[:0] if latest_placed is None else latest_placed[-1:], is_placed]
+            [is_placed[:0] if was_placed is None else was_placed[-1:], is_placed]
         )
         if planned.max_age_ns >= FOREVER_NS:
-            is_kept = planned.layout is not None and planned.layout.stays
+            stays_valid = planned.layout is not None and planned.layout.stays
             reason = (
-                "since the topic is latched" if planned.is_latched else "as markers do" if is_kept else ""
+                "since the topic is latched" if planned.is_latched else "as markers do" if stays_valid else ""
             )
             self.remarks.lasting[name] = reason or "by its `max_age: forever`"
         if not planned.is_static:
@@ -465,7 +472,9 @@ class Tracker:
         self._store_additions()
         names = [self.names.by_code[code] for code in name_codes.tolist()]
         has_appeared = (rows != ABSENT).any(axis=0).tolist()
-        name_order = sorted((i for i in range(len(names)) if has_appeared[i]), key=names.__getitem__)
+        name_order = sorted(
+            (index for index in range(len(names)) if has_appeared[index]), key=names.__getitem__
+        )
         rows, classes, reported_ns = rows[:, name_order], classes[:, name_order], reported_ns[:, name_order]
         stored_rows, is_stale = self._rows, rows == STALE
         # unknown rows have the numbers -2, -3 and so on
@@ -477,26 +486,28 @@ class Tracker:
             blank_rows = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
             stored_rows = concatenate_tables([stored_rows, blank_rows])
         # class codes depend on the order of messages, but a trace must not depend on that order
-        by_code = self.classes.by_code
-        classes_of = class_order(by_code)
-        class_places = {name: place for place, name in enumerate(classes_of)}
-        class_rank = np.array([class_places[name] for name in by_code], np.int64)
+        class_by_code = self.classes.by_code
+        sorted_classes = class_order(class_by_code)
+        class_places = {name: class_place for class_place, name in enumerate(sorted_classes)}
+        class_rank = np.array([class_places[name] for name in class_by_code], np.int64)
         used_rows, row_numbers = renumber_rows(row_numbers)
         stored_rows = select(stored_rows, used_rows)
         signals, signals_reported_ns = self._signal_columns(times_ns, newest_ns)
         return Trace(
             times_ns=times_ns,
-            names=tuple(names[i] for i in name_order),
+            names=tuple(names[index] for index in name_order),
             rows=row_numbers,
             footprints=stored_rows.shapes,
             yaw=stored_rows.yaw,
             uncertainty=stored_rows.uncertainty,
             class_code=class_rank[stored_rows.class_code] if len(class_rank) else stored_rows.class_code,
-            classes=classes_of,
+            classes=sorted_classes,
             signals=signals,
             reported_ns=None if (reported_ns == times_ns[:, None])[rows >= 0].all() else reported_ns,
             signals_reported_ns=signals_reported_ns,
-            lasting=frozenset(names[i] for i in name_order if self._is_lasting(int(name_codes[i]))),
+            lasting=frozenset(
+                names[index] for index in name_order if self._is_lasting(int(name_codes[index]))
+            ),
             spans=self._spans(times_ns) if self.plan.mapping.trims_ends else (),
         )
 
@@ -558,10 +569,15 @@ class Tracker:
         self._rows = select(self._rows, last_rows)
         for name, last_events in self._events.items():
             self._events[name] = replace(last_events, row=new_numbers[last_events.row])
-        self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
-        rows_left = set(last_rows.tolist())
+        self._signals = {
+            signal_key: (times_ns[-1:], values[-1:])
+            for signal_key, (times_ns, values) in self._signals.items()
+        }
+        remaining_rows = set(last_rows.tolist())
         self._following = {
-            int(new_numbers[row]): following for row, following in self._following.items() if row in rows_left
+            int(new_numbers[row]): following
+            for row, following in self._following.items()
+            if row in remaining_rows
         }
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
@@ -570,18 +586,18 @@ class Tracker:
             self._begun_ns.pop(topic, None)
             last_events = self._events[topic].last()
             last_events = select(last_events, np.flatnonzero(last_events.expires_ns > time_ns))
-            rows = self._add(ObservationRows.blank(last_events.class_code))
-            lost_ns = np.full(len(rows), time_ns, np.int64)
-            expires_ns = np.full(len(rows), FOREVER_NS, np.int64)
+            blank_rows = self._add(ObservationRows.blank(last_events.class_code))
+            lost_ns = np.full(len(blank_rows), time_ns, np.int64)
+            expires_ns = np.full(len(blank_rows), FOREVER_NS, np.int64)
             self._events[topic] = Events(
-                last_events.name, lost_ns, rows, expires_ns, last_events.class_code
+                last_events.name, lost_ns, blank_rows, expires_ns, last_events.class_code
             ).after(last_events)
             # without reports, the loss is neither a pause nor a silence of the topic
             self._reported_ns.pop(topic, None)
         self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {
-            key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
-            for key, series in self._signals.items()
+            signal_key: (np.array([time_ns]), np.array([np.nan])) if signal_key[0] in topics else series
+            for signal_key, series in self._signals.items()
         }
         self._store_additions()
 
@@ -800,10 +816,10 @@ class Tracker:
         self, times_ns: Integers, newest_ns: int
     ) -> tuple[dict[str, Floats], dict[str, Integers]]:
         """Return the signals, and the report times of signals that are older than a sample."""
-        columns: dict[str, Floats] = {}
+        values_by_signal: dict[str, Floats] = {}
         report_times_ns: dict[str, Integers] = {}
         stale_signals: list[tuple[str, str, Booleans, Booleans]] = []
-        for (topic, index), (reported_ns, values) in self._signals.items():
+        for (topic, signal_index), (reported_ns, values) in self._signals.items():
             planned = self.readers[topic].planned
             if planned.mapping is None:
                 continue
@@ -811,25 +827,27 @@ class Tracker:
             is_old = times_ns - reported_ns[report_indices] > planned.max_age_ns
             in_gap = self._in_gap(topic, times_ns, newest_ns)
             signal_values = np.where((report_indices < 0) | is_old | in_gap, np.nan, values[report_indices])
-            name = planned.mapping.signals[index].name
+            name = planned.mapping.signals[signal_index].name
             is_stale = (
                 (report_indices >= 0) & (is_old | in_gap) & (times_ns >= self._lost_until_ns.get(topic, 0))
             )
             stale_signals.append((topic, name, is_stale, in_gap))
             # if several topics report one signal, the first topic with a value is used
-            earlier_values = columns.get(name, np.full(len(times_ns), np.nan))
+            earlier_values = values_by_signal.get(name, np.full(len(times_ns), np.nan))
             report_times_ns[name] = np.where(
                 np.isnan(earlier_values), reported_ns[report_indices], report_times_ns.get(name, times_ns)
             )
-            columns[name] = np.where(np.isnan(earlier_values), signal_values, earlier_values)
+            values_by_signal[name] = np.where(np.isnan(earlier_values), signal_values, earlier_values)
         for topic, name, is_stale, in_gap in stale_signals:
-            self.remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
+            self.remarks.count_stale(
+                topic, name, times_ns, is_stale & np.isnan(values_by_signal[name]), in_gap
+            )
         earlier_reports = {
-            name: times
-            for name, times in report_times_ns.items()
-            if (times != times_ns)[~np.isnan(columns[name])].any()
+            name: times_before_ns
+            for name, times_before_ns in report_times_ns.items()
+            if (times_before_ns != times_ns)[~np.isnan(values_by_signal[name])].any()
         }
-        return columns, earlier_reports
+        return values_by_signal, earlier_reports
 
 
 class _Counts(dict[Any, tuple[int, int]]):
@@ -935,7 +953,7 @@ class Remarks:
 
     def _missing_texts(self) -> Iterator[Sentence]:
         fixed_frame = self._mapping.fixed_frame
-        for (topic, frame, is_known), (count, first_ns) in sorted(self.missing.items()):
+        for (topic, frame, is_known), (observation_count, first_ns) in sorted(self.missing.items()):
             reason = f"no transform from {frame!r} to {fixed_frame!r} at that time"
             if not frame:
                 reason = "its messages name no frame; give one with `frame`"
@@ -943,16 +961,18 @@ class Remarks:
                 reason = f"no transform to {fixed_frame!r} names the frame {frame!r}"
             elif topic in self.stamps:
                 reason += _doubt_of_stamp(*self.stamps[topic])
-            subject = "observation is" if count == 1 else "observations are"
+            subject = "observation is" if observation_count == 1 else "observations are"
             yield Sentence(
-                f"{topic}: {count} {subject} unknown, the first at ", Instant(first_ns, 0), f": {reason}"
+                f"{topic}: {observation_count} {subject} unknown, the first at ",
+                Instant(first_ns, 0),
+                f": {reason}",
             )
 
     def _stale_texts(self) -> Iterator[Sentence]:
-        by_topic: dict[tuple[str, bool], list[tuple[str, int, int]]] = {}
-        for (topic, is_gap, name), (count, first_ns) in sorted(self.stale.items()):
-            by_topic.setdefault((topic, is_gap), []).append((name, count, first_ns))
-        for (topic, is_gap), stale_counts in by_topic.items():
+        counts_by_topic: dict[tuple[str, bool], list[tuple[str, int, int]]] = {}
+        for (topic, is_gap, name), (sample_count, first_ns) in sorted(self.stale.items()):
+            counts_by_topic.setdefault((topic, is_gap), []).append((name, sample_count, first_ns))
+        for (topic, is_gap), stale_counts in counts_by_topic.items():
             reason = "the topic was silent for longer than `max_gap`"
             if not is_gap:
                 # the reason does not call the topic silent, because other objects may have been reported
@@ -962,8 +982,8 @@ class Remarks:
                 f" and {len(stale_counts) - _MOST_NAMES} more" if len(stale_counts) > _MOST_NAMES else ""
             )
             verb = "is" if len(stale_counts) == 1 else "are"
-            most_samples = max(count for _, count, _ in stale_counts)
-            first_ns = min(first for _, _, first in stale_counts)
+            most_samples = max(sample_count for _, sample_count, _ in stale_counts)
+            first_ns = min(first_stale_ns for _, _, first_stale_ns in stale_counts)
             yield Sentence(
                 (
                     f"{topic}: {names}{more_text} {verb} unknown in up to {plural(most_samples, 'sample')},"

@@ -346,8 +346,8 @@ class FrameTree:
         """Names of all frames that are the child or parent of a transform."""
         parents = {entry.parent for child in self._children.values() for entry in child.entries}
         # frames of ignored transforms are frames of the log, too
-        ignored = {name for _, entry, child in self._ignored.values() for name in (child, entry.parent)}
-        return frozenset(self._children) | parents | ignored
+        ignored_names = {name for _, entry, child in self._ignored.values() for name in (child, entry.parent)}
+        return frozenset(self._children) | parents | ignored_names
 
     def between(
         self,
@@ -385,10 +385,10 @@ class FrameTree:
             return [question]
         runs = np.searchsorted([restart.new.log_ns for restart in self._restarts], log_ns, "right")
         if question.by_stamp:
-            for number, (old, new) in enumerate(self._restarts, 1):
+            for run, (old, new) in enumerate(self._restarts, 1):
                 # an observation may come before the first transform of its run
                 is_early = np.abs(times_ns - new.stamp_ns) < np.abs(times_ns - old.stamp_ns)
-                runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = number
+                runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = run
         # even numbers: stamps near the times of recording; odd numbers: stamps far from these times
         run_kinds = 2 * runs + (question.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
         return [
@@ -533,10 +533,13 @@ class FrameTree:
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
         """Count a child's jumps: transforms far from both neighbours, while the neighbours agree."""
-        kinds = [(entry.parent, self._run_of(entry)) for entry in entries]
-        for kind in dict.fromkeys(kinds):
+        parent_runs = [(entry.parent, self._run_of(entry)) for entry in entries]
+        for parent_run in dict.fromkeys(parent_runs):
             self._look_for_jumps_in(
-                name, sorted(compress(entries, (kind_of_entry == kind for kind_of_entry in kinds)))
+                name,
+                sorted(
+                    compress(entries, (entry_parent_run == parent_run for entry_parent_run in parent_runs))
+                ),
             )
 
     def _look_for_jumps_in(self, name: str, entries: list[_Entry]) -> None:
@@ -586,9 +589,9 @@ class FrameTree:
         for name, child in self._children.items():
             self._look_for_jumps(name, child.moving)
         texts: list[str] = []
-        for reason, (entry_count, first_entry, owner) in self._ignored.items():
+        for reason, (entry_count, first_entry, child_name) in self._ignored.items():
             subject = "transform was" if entry_count == 1 else "transforms were"
-            clause = f", the first of {owner!r} in {first_entry.parent!r} at "
+            clause = f", the first of {child_name!r} in {first_entry.parent!r} at "
             texts.append(
                 Sentence(
                     f"{entry_count} {subject} left out{clause}",
@@ -623,12 +626,12 @@ class FrameTree:
             )
         for loop in self._loops:
             texts.append(f"frames form a loop, {' in '.join(map(repr, loop))}: what they place is unknown")
-        for name, (longest_ns, at_ns) in sorted(self._holes.items()):
+        for name, (longest_ns, hole_ns) in sorted(self._holes.items()):
             remedy = "; a larger `max_age` interpolates over it" if longest_ns <= HISTORY_NS else ""
             texts.append(
                 Sentence(
                     f"the transforms of {name!r} pause for up to {longest_ns / 1e9:.3f} s, longest from ",
-                    Instant(at_ns, 0),
+                    Instant(hole_ns, 0),
                     f" on, longer than max_age: what they place is unknown there{remedy}",
                 )
             )

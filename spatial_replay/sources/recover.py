@@ -242,7 +242,7 @@ def _spans(faults: Sequence[str]) -> tuple[tuple[int, int], ...]:
         for fault in faults
         if isinstance(fault, Sentence)
     ]
-    return tuple(sorted({(min(times), max(times)) for times in times_of_faults if times}))
+    return tuple(sorted({(min(times_ns), max(times_ns)) for times_ns in times_of_faults if times_ns}))
 
 
 class _Samples:
@@ -257,7 +257,9 @@ class _Samples:
     ) -> None:
         self._name = name
         self._faults = faults
-        self._sample_channels = [number for number, channel in channels.items() if is_samples(channel)]
+        self._sample_channels = [
+            channel_number for channel_number, channel in channels.items() if is_samples(channel)
+        ]
         # only recordings number samples from 0; a replay of a part of a log keeps the log's numbers
         is_recording = metadata.get(METADATA, {}).get("written_by") == "record"
         self._last_number = -1 if is_recording else None
