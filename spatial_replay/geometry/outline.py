@@ -351,7 +351,7 @@ def _turn(corners: Sequence[_Corner], a: int, b: int, c: int) -> float:
 def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring]:
     """Join counter-clockwise triangles across shared edges while the result is convex."""
     rings = dict(enumerate(triangles))
-    ring_of_edge = {edge: name for name, merged_ring in rings.items() for edge in _edges(merged_ring)}
+    ring_of_edge = {edge: name for name, ring in rings.items() for edge in _edges(ring)}
     shared_edges = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
     for i, j in sorted(shared_edges, key=lambda edge: (-_squared_length(corners, *edge), edge)):
         left_ring, right_ring = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]

@@ -746,12 +746,12 @@ def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
             raise FieldError(f"{path.text}: seconds and nanoseconds have to be numbers")
         return TimeGetter(path, tuple_getter(paths, root), True, 1)
     existing_names = field_names(value)
-    quantifier = any if isinstance(value, Sparse) else all
+    any_or_all = any if isinstance(value, Sparse) else all
     for part_names in _TIME_FIELDS:
-        if quantifier(name in existing_names for name in part_names):
+        if any_or_all(name in existing_names for name in part_names):
             pair = tuple_getter([below(path, name) for name in part_names], root)
             return TimeGetter(path, pair, True, 1)
-    if is_list(value) and len(value) == 2 and all(type(part_path) is int for part_path in value):
+    if is_list(value) and len(value) == 2 and all(type(part) is int for part in value):
         return TimeGetter(path, getter(path, root), True, 1)
     if isinstance(value, str):
         ns_from_text(value, stamp.unit_ns)

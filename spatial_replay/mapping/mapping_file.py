@@ -447,8 +447,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
                 faults.append(((*place, other_key), f"there is {key!r} already; give one of the two"))
         is_feature = place[0] == "features"
         faults += [
-            ((*place, *inner_place), duration_text)
-            for inner_place, duration_text in _contradictions_of_turns(entry, is_feature)
+            ((*place, *inner_place), fault)
+            for inner_place, fault in _contradictions_of_turns(entry, is_feature)
         ]
     tables_with_durations: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),

@@ -808,9 +808,7 @@ class Tracker:
             self._place_following(topic, times_ns, state)
             states.append(state)
         names, *columns = zip(*states, strict=True)
-        return States(
-            np.concatenate(names), *(np.concatenate(object_index, axis=1) for object_index in columns)
-        )
+        return States(np.concatenate(names), *(np.concatenate(column, axis=1) for column in columns))
 
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int
@@ -843,9 +841,9 @@ class Tracker:
                 topic, name, times_ns, is_stale & np.isnan(values_by_signal[name]), in_gap
             )
         earlier_reports = {
-            name: times_before_ns
-            for name, times_before_ns in report_times_ns.items()
-            if (times_before_ns != times_ns)[~np.isnan(values_by_signal[name])].any()
+            name: report_ns
+            for name, report_ns in report_times_ns.items()
+            if (report_ns != times_ns)[~np.isnan(values_by_signal[name])].any()
         }
         return values_by_signal, earlier_reports
 

@@ -373,8 +373,8 @@ class FrameTree:
             return Transforms.identity(count)
         question = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
         transforms = Transforms.unknown(count)
-        for run in self._by_run(question):
-            for part_question in self._by_parents(run):
+        for run_question in self._by_run(question):
+            for part_question in self._by_parents(run_question):
                 transforms.put(part_question.places, self._in_one_tree(target, source, part_question))
         return transforms
 
