@@ -134,7 +134,7 @@ class Automaton(Displayed):
         """Whether samples lead back to the initial state, so that runs can end in it."""
         initial_place = ~self.initial
         return initial_place in self.entries or any(
-            initial_place in (low, high) for _, low, high in self.decisions
+            initial_place in (if_false, if_true) for _, if_false, if_true in self.decisions
         )
 
     @cached_property
@@ -164,8 +164,8 @@ class Automaton(Displayed):
         self._check(state, symbol)
         place = self.entries[state]
         while place >= 0:
-            proposition, low, high = self.decisions[place]
-            place = high if symbol[proposition] else low
+            proposition, if_false, if_true = self.decisions[place]
+            place = if_true if symbol[proposition] else if_false
         return ~place
 
     def step_set(self, states: Collection[int], symbol: Sequence[bool | None]) -> frozenset[int]:
@@ -188,9 +188,9 @@ class Automaton(Displayed):
             if place < 0:
                 next_states.add(~place)
                 continue
-            proposition, low, high = self.decisions[place]
+            proposition, if_false, if_true = self.decisions[place]
             value = symbol[proposition]
-            for next_place in (low, high) if value is None else (high,) if value else (low,):
+            for next_place in (if_false, if_true) if value is None else (if_true,) if value else (if_false,):
                 if next_place not in visited_places:
                     visited_places.add(next_place)
                     pending_places.append(next_place)
@@ -563,7 +563,7 @@ def digraph_text(automaton: Automaton, legend: Sequence[str] = ()) -> str:
         colour, tooltip = state_colour(automaton, state), _quote(state_words(automaton, state))
         lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={tooltip}];')
     for transition in (move for moves in moves_by_state.values() for move in moves):
-        label = "\\n".join(map(_escape, _broken(_guard_text(automaton, transition))))
+        label = "\\n".join(map(_escape, _wrap_guard(_guard_text(automaton, transition))))
         lines.append(f'  {transition.source} -> {transition.target} [label="{label}"];')
     return "\n".join([*lines, "}", ""])
 
@@ -606,7 +606,7 @@ def _hoa_guard(transition: Transition) -> str:
     return " | ".join("&".join(cube) or "t" for cube in cube_literals)
 
 
-def _broken(text: str) -> list[str]:
+def _wrap_guard(text: str) -> list[str]:
     """Wrap a sentence before `and` and `or`."""
     lines = [""]
     for word in text.split(" "):

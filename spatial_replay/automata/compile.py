@@ -477,9 +477,9 @@ class _Progression:
     def _accepts(self, node: int) -> bool:
         """Return whether a run that ends in a state satisfies the formula."""
         while node not in (NO, YES):
-            variable, low, high = self._diagrams[node]
+            variable, if_false, if_true = self._diagrams[node]
             # at the end of a run, strong obligations fail and weak obligations hold
-            node = high if self._obligations.chain(variable).strong else low
+            node = if_true if self._obligations.chain(variable).strong else if_false
         return node == YES
 
 

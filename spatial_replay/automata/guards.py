@@ -140,9 +140,9 @@ def node_copier(
 
     def copy(node: int) -> int:
         if node not in copies:
-            variable, low, high = source[node]
+            variable, if_false, if_true = source[node]
             if variable < variables:
-                copies[node] = target.decide(variable, copy(low), copy(high))
+                copies[node] = target.decide(variable, copy(if_false), copy(if_true))
             else:
                 copies[node] = target.leaf(leaf(node))
         return copies[node]
@@ -374,11 +374,11 @@ class Covers:
         stack: list[tuple[int, Cube]] = [(node, ())]
         while stack and len(cubes) < FEW_CUBES:
             current_node, cube = stack.pop()
-            variable, low, high = self._diagrams[current_node]
+            variable, if_false, if_true = self._diagrams[current_node]
             if current_node == YES:
                 cubes.append(cube)
             elif current_node != NO:
-                stack += ((high, (*cube, (variable, True))), (low, (*cube, (variable, False))))
+                stack += ((if_true, (*cube, (variable, True))), (if_false, (*cube, (variable, False))))
         return tuple(cubes)
 
     def _between(self, lower: int, upper: int) -> _Cover:
@@ -494,8 +494,8 @@ class Moves:
         def node(place: int) -> int:
             return self._diagrams.leaf(~place) if place < 0 else decision_nodes[place]
 
-        for proposition, low, high in decisions:
-            decision_nodes.append(self._diagrams.decide(proposition, node(low), node(high)))
+        for proposition, if_false, if_true in decisions:
+            decision_nodes.append(self._diagrams.decide(proposition, node(if_false), node(if_true)))
         self._nodes = tuple(node(place) for place in entries)
         self._successors: dict[int, tuple[int, ...]] = {}
         self._conditions: dict[int, dict[int, int]] = {}
@@ -528,11 +528,11 @@ class Moves:
         states = set()
         stack = [node]
         while stack:
-            variable, low, high = self._diagrams[stack.pop()]
+            variable, if_false, if_true = self._diagrams[stack.pop()]
             if variable == LEAF:
-                states.add(low)
+                states.add(if_false)
                 continue
-            for branch in (low, high):
+            for branch in (if_false, if_true):
                 if branch not in visited_nodes:
                     visited_nodes.add(branch)
                     stack.append(branch)
@@ -541,11 +541,11 @@ class Moves:
     def _to(self, target: int, node: int, conditions: dict[int, int]) -> int:
         """Return the condition under which a node leads to a state."""
         if node not in conditions:
-            variable, low, high = self._diagrams[node]
+            variable, if_false, if_true = self._diagrams[node]
             if variable == LEAF:
-                conditions[node] = YES if low == target else NO
+                conditions[node] = YES if if_false == target else NO
             else:
-                branches = self._to(target, low, conditions), self._to(target, high, conditions)
+                branches = self._to(target, if_false, conditions), self._to(target, if_true, conditions)
                 conditions[node] = self._diagrams.decide(variable, *branches)
         return conditions[node]
 

@@ -44,12 +44,12 @@ def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[boo
     places_by_node: list[int] = []
     decision_rows: list[tuple[int, int, int]] = []
     for node in range(len(diagrams)):
-        variable, low, high = diagrams[node]
+        variable, if_false, if_true = diagrams[node]
         if variable == LEAF:
-            places_by_node.append(~low)
+            places_by_node.append(~if_false)
         else:
             places_by_node.append(len(decision_rows))
-            decision_rows.append((variable, places_by_node[low], places_by_node[high]))
+            decision_rows.append((variable, places_by_node[if_false], places_by_node[if_true]))
     return _machine([places_by_node[node] for node in moves], decision_rows, accepting, places_by_node[start])
 
 
@@ -106,8 +106,8 @@ def _reachable(machine: Machine) -> list[int]:
                 states.append(~place)
         elif not visited_rows[place]:
             visited_rows[place] = True
-            _, low, high = decision_rows[place]
-            stack += (high, low)
+            _, if_false, if_true = decision_rows[place]
+            stack += (if_true, if_false)
         if not stack and expanded_count < len(states):
             stack.append(moves[states[expanded_count]])
             expanded_count += 1
@@ -129,8 +129,8 @@ def _select_states(machine: Machine, states: Sequence[int]) -> Machine:
             return ~new_numbers[~old_place]
         new_place = new_places.get(old_place)
         if new_place is None:
-            variable, low, high = decision_rows[old_place]
-            row = (variable, place(low), place(high))
+            variable, if_false, if_true = decision_rows[old_place]
+            row = (variable, place(if_false), place(if_true))
             new_place = new_places[old_place] = len(decisions)
             decisions.append(row)
         return new_place
@@ -155,18 +155,18 @@ def _relabel(machine: Machine, new_numbers: Integers) -> tuple[Integers, Integer
     # rows of later propositions first, because rows of earlier propositions refer to them
     for level_rows in _levels(decisions):
         variable = decisions[level_rows[0], 0]
-        low, high = places[decisions[level_rows, 1]], places[decisions[level_rows, 2]]
-        places[level_rows] = low
-        is_needed = low != high
+        if_false, if_true = places[decisions[level_rows, 1]], places[decisions[level_rows, 2]]
+        places[level_rows] = if_false
+        is_needed = if_false != if_true
         # each pair of places becomes one integer; the span shifts the negative places of states
-        pair_keys = (low[is_needed] + place_span) * (2 * place_span) + high[is_needed] + place_span
+        pair_keys = (if_false[is_needed] + place_span) * (2 * place_span) + if_true[is_needed] + place_span
         distinct_keys, first_rows, key_ranks = np.unique(pair_keys, return_index=True, return_inverse=True)
         places[level_rows[is_needed]] = decision_count + key_ranks.ravel()
         level = np.empty((len(distinct_keys), 3), np.int64)
         level[:, 0], level[:, 1], level[:, 2] = (
             variable,
-            low[is_needed][first_rows],
-            high[is_needed][first_rows],
+            if_false[is_needed][first_rows],
+            if_true[is_needed][first_rows],
         )
         levels.append(level)
         decision_count += len(distinct_keys)
@@ -204,8 +204,8 @@ def _split_classes(machine: Machine) -> list[int]:
             if place < 0:
                 return diagrams.leaf(classes[~place])
             if place not in copies:
-                variable, low, high = decision_rows[place]
-                copies[place] = diagrams.decide(variable, copy(low), copy(high))
+                variable, if_false, if_true = decision_rows[place]
+                copies[place] = diagrams.decide(variable, copy(if_false), copy(if_true))
             return copies[place]
 
         for state in pending_states:
@@ -246,9 +246,9 @@ def _split(
 def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
     """Return the parents of each place: decisions by index, and ~q for a state q whose moves begin there."""
     parents: dict[int, list[int]] = {}
-    for row_number, (_, low, high) in enumerate(rows):
-        parents.setdefault(low, []).append(row_number)
-        parents.setdefault(high, []).append(row_number)
+    for row_number, (_, if_false, if_true) in enumerate(rows):
+        parents.setdefault(if_false, []).append(row_number)
+        parents.setdefault(if_true, []).append(row_number)
     for state, place in enumerate(moves):
         parents.setdefault(place, []).append(~state)
     return parents

@@ -205,10 +205,10 @@ def explain(
     limit_counts = np.bincount(free_limits[free_limits >= 0], minlength=len(layers.conjuncts)).tolist()
     target_cell = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
     for index, text in enumerate(layers.conjuncts):
-        at_target = None if target_cell is None else float(layers.robustness[index][target_cell])
+        target_robustness = None if target_cell is None else float(layers.robustness[index][target_cell])
         words = demand_of(text, bans, is_required=layers.required[index])
         message.conjuncts.append(
-            PlanConjunct(text=text, limits=limit_counts[index], at_target=at_target, words=words)
+            PlanConjunct(text=text, limits=limit_counts[index], at_target=target_robustness, words=words)
         )
     for cause in layers.causes:
         kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")

@@ -152,16 +152,16 @@ def _simplify(
     Args:
         ignored: cubes that the union may include, but need not.
     """
-    names = tuple(dict.fromkeys(name for cube in (*cubes, *ignored) for name in cube))
+    propositions = tuple(dict.fromkeys(name for cube in (*cubes, *ignored) for name in cube))
     simplified = [dict(cube) for cube in cubes]
-    if len(names) <= _MOST_PROPOSITIONS:
-        union = np.zeros((2,) * len(names), bool)
+    if len(propositions) <= _MOST_PROPOSITIONS:
+        union = np.zeros((2,) * len(propositions), bool)
         for cube in (*cubes, *ignored):
-            union[_part_of_table(cube, names)] = True
+            union[_part_of_table(cube, propositions)] = True
         for cube in simplified:
             for name in tuple(cube):
                 value = cube.pop(name)
-                if not union[_part_of_table(cube, names)].all():
+                if not union[_part_of_table(cube, propositions)].all():
                     cube[name] = value
     return list({frozenset(cube.items()): cube for cube in simplified}.values())
 

@@ -200,8 +200,8 @@ class Observer:
 
     def symbol(self, sample: Sample) -> Symbol:
         """Return the value of each proposition in a sample."""
-        values = self._leaves.fill_room(sample).measure()
-        lower, upper = values[0, :, 0].tolist(), values[min(1, len(values) - 1), :, 0].tolist()
+        leaf_bounds = self._leaves.fill_room(sample).measure()
+        lower, upper = leaf_bounds[0, :, 0].tolist(), leaf_bounds[min(1, len(leaf_bounds) - 1), :, 0].tolist()
         bounds = zip(lower, upper, strict=True)
         return tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in bounds)
 
@@ -589,16 +589,18 @@ class Attempts:
             sample: newest sample after the motion.
             is_stopped: whether the planner stopped the motion. If so, the object counts as moved.
         """
-        before, settings = self._begin
-        is_refused = before is sample and not outcome.succeeded
+        start_sample, settings = self._begin
+        is_refused = start_sample is sample and not outcome.succeeded
         self.motions += not is_refused
         is_there = outcome.succeeded and _is_at(target, sample, settings)
         self.planned = aim.motions[1:] if is_there else ()
         if not outcome.succeeded:
             reasons = (outcome.reason, "no sample came during the motion" if is_refused else "")
             self._last_failures[aim.edge] = "; ".join(filter(None, reasons))
-            has_stayed = not is_stopped and _stands(target.name, before, sample, settings)
-            self._failed_motions.append(FailedMotion(target, before, has_stayed, is_refused, outcome.at))
+            has_stayed = not is_stopped and _stands(target.name, start_sample, sample, settings)
+            self._failed_motions.append(
+                FailedMotion(target, start_sample, has_stayed, is_refused, outcome.at)
+            )
             # a motion that failed at its target may succeed at another place
             if outcome.at in (None, "place") and not (settings.skill == "push" and has_stayed):
                 self._failed_places[target.name] = (*self.places_of(target.name), (target.x, target.y))
@@ -666,20 +668,20 @@ def _count_text(count: int) -> str:
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
     """Return whether no object has moved since a failed motion; for a push, only near objects count."""
-    moved_name, before = motion.target.name, motion.before
-    tracked = before.objects[moved_name]
-    names = list(dict.fromkeys([moved_name, *before.objects, *sample.objects]))
+    moved_name, start_sample = motion.target.name, motion.before
+    tracked = start_sample.objects[moved_name]
+    scene_names = list(dict.fromkeys([moved_name, *start_sample.objects, *sample.objects]))
     if settings.skill == "push":
         if not motion.stayed:
             return False
         near_distance = BESIDE * radius_of(tracked)
-        names = [
+        scene_names = [
             neighbour
-            for neighbour in names
-            if min(_away(tracked, scene.objects.get(neighbour)) for scene in (before, sample))
+            for neighbour in scene_names
+            if min(_away(tracked, scene.objects.get(neighbour)) for scene in (start_sample, sample))
             <= near_distance
         ]
-    return all(_stands(name, before, sample, settings) for name in names)
+    return all(_stands(name, start_sample, sample, settings) for name in scene_names)
 
 
 def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
@@ -690,9 +692,9 @@ def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
     return centre_distance - radius_of(tracked) - radius_of(other)
 
 
-def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
+def _stands(name: str, earlier_sample: Sample, sample: Sample, settings: Settings) -> bool:
     """Return whether an object has not moved since an earlier sample; True for a missing object."""
-    earlier, newest = before.objects.get(name), sample.objects.get(name)
+    earlier, newest = earlier_sample.objects.get(name), sample.objects.get(name)
     if earlier is None or newest is None:
         return earlier is newest
     moved_distance = math.dist(centre_of(earlier.footprint), centre_of(newest.footprint))

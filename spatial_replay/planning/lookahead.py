@@ -399,51 +399,57 @@ class Arranger:
         conflicts = {}
         # turns without possible cells are not measured
         used_turns = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
-        for first, second in combinations(group, 2):
-            if (stencil := self._stencil(first, second, group, used_turns)) is not None:
+        for first_name, second_name in combinations(group, 2):
+            if (stencil := self._stencil(first_name, second_name, group, used_turns)) is not None:
                 # both objects may be off the centres of their cells, so the slack is doubled
-                conflicts[first, second] = is_conflict = stencil < -2.0 * self._slack
+                conflicts[first_name, second_name] = is_conflict = stencil < -2.0 * self._slack
                 # seen from the second object, the vector has the opposite sign
-                conflicts[second, first] = is_conflict.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
+                conflicts[second_name, first_name] = is_conflict.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
         return conflicts
 
     def _stencil(
-        self, first: str, second: str, group: tuple[str, ...], used_turns: Mapping[str, Booleans]
+        self, first_name: str, second_name: str, group: tuple[str, ...], used_turns: Mapping[str, Booleans]
     ) -> Floats | None:
         """Return the least surplus of the demands on two objects; -inf for turns that are not measured."""
         demands = [
             demand
             for demand in self._demands
-            if set(self._names_by_demand[demand]) & set(group) == {first, second}
-            and _is_of(demand.formula, (first, second))
+            if set(self._names_by_demand[demand]) & set(group) == {first_name, second_name}
+            and _is_of(demand.formula, (first_name, second_name))
         ]
-        first_object, second_object = self._movable[first], self._movable[second]
+        first_object, second_object = self._movable[first_name], self._movable[second_name]
         cell_size, grid = self._grid.cell_size, self._grid
         supports = self._settings.workspace.supports
-        must_be_apart = first not in supports and second not in supports
+        must_be_apart = first_name not in supports and second_name not in supports
         reach_cells = (
             radius_of(first_object) + radius_of(second_object) + self._settings.workspace.clearance
         ) / cell_size + 1.0
         # without demands only contact matters, so the stencil ends where the objects cannot touch
         half_side = max(grid.shape) - 1 if demands else min(math.ceil(reach_cells), max(grid.shape) - 1)
-        turns, side = self._fields[first].turns, 2 * half_side + 1
-        cell_count = side * side * int(used_turns[first].sum()) * int(used_turns[second].sum())
+        turns, side = self._fields[first_name].turns, 2 * half_side + 1
+        cell_count = side * side * int(used_turns[first_name].sum()) * int(used_turns[second_name].sum())
         if not (demands or must_be_apart) or cell_count > _WIDEST:
             return None
-        stencil_key = first, second, *demands, used_turns[first].tobytes(), used_turns[second].tobytes()
+        stencil_key = (
+            first_name,
+            second_name,
+            *demands,
+            used_turns[first_name].tobytes(),
+            used_turns[second_name].tobytes(),
+        )
         if stencil_key in self._stencils:
             return self._stencils[stencil_key]
         local_grid = Grid(
             -(half_side + 0.5) * cell_size, -(half_side + 0.5) * cell_size, cell_size, side, side
         )
         formulas = [demand.formula for demand in demands]
-        workspace, turn_indices = self._turned_in(local_grid, used_turns[second])
-        stencil = np.full((len(turns), len(used_turns[second]), side, side), -np.inf)
-        for turn_index in np.flatnonzero(used_turns[first]).tolist():
+        workspace, turn_indices = self._turned_in(local_grid, used_turns[second_name])
+        stencil = np.full((len(turns), len(used_turns[second_name]), side, side), -np.inf)
+        for turn_index in np.flatnonzero(used_turns[first_name]).tolist():
             turn = float(turns[turn_index])
-            objects = {first: moved_object(first_object, 0.0, 0.0, turn), second: second_object}
+            objects = {first_name: moved_object(first_object, 0.0, 0.0, turn), second_name: second_object}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
-            maps = proposition_maps(formulas, self._regions, sample, second, workspace)
+            maps = proposition_maps(formulas, self._regions, sample, second_name, workspace)
             surpluses = list(map(surplus, maps.lower, maps.upper, demands))
             if must_be_apart:
                 surpluses.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
@@ -551,7 +557,7 @@ class Arranger:
         }
         sample = with_objects(self._sample, obstacles)
         obstacle_names = [name for name in sample.objects if name not in workspace.supports]
-        pairs = {
+        name_pairs = {
             frozenset((name, neighbour))
             for name in poses
             for neighbour in obstacle_names
@@ -560,7 +566,7 @@ class Arranger:
         # sorted, because the order of a set of texts differs between processes, and plans must be equal
         apart_demands = [
             Demand(distance_between(*sorted(pair)), True, workspace.clearance)
-            for pair in sorted(pairs, key=sorted)
+            for pair in sorted(name_pairs, key=sorted)
             if len(pair) == 2
         ]
         demands = [*self._demands, *apart_demands]
@@ -594,12 +600,12 @@ class Arranger:
     ) -> tuple[Floats, Floats]:
         """Return the surplus of demands (D,) with objects at places (N, 2), and the slopes (D, N, 2)."""
         # slopes are forward differences
-        step = 1e-4 * self._grid.cell_size
+        nudge_length = 1e-4 * self._grid.cell_size
         objects: dict[str, TrackedObject] = {}
         nudges: list[tuple[str, TrackedObject]] = []
         for name, place in zip(poses, places, strict=True):
             objects[name], *nudged_copies = moved_copies(
-                sample.objects[name], place + step * _NUDGES, poses[name][2]
+                sample.objects[name], place + nudge_length * _NUDGES, poses[name][2]
             )
             nudges += ((name, tracked) for tracked in nudged_copies)
         scene = with_objects(sample, objects)
@@ -617,7 +623,9 @@ class Arranger:
             [leaves[0][row] if demand.wanted else -leaves[-1][row] for row, demand in enumerate(demands)]
         )
         surpluses -= np.array([[demand.least] for demand in demands])
-        return surpluses[:, 0], ((surpluses[:, 1:] - surpluses[:, :1]) / step).reshape(-1, *places.shape)
+        return surpluses[:, 0], ((surpluses[:, 1:] - surpluses[:, :1]) / nudge_length).reshape(
+            -1, *places.shape
+        )
 
     def meets(self, sample: Sample) -> bool:
         """Return whether a sample meets all demands."""
@@ -673,7 +681,7 @@ def _count_losses(cells: Booleans, stencil: Booleans) -> Floats:
     return np.rint(loss_counts[:, :rows, :columns])
 
 
-def _is_of(formula: Formula, names: Sequence[str]) -> bool:
+def _is_of(formula: Formula, object_names: Sequence[str]) -> bool:
     """Return whether a formula depends only on some objects."""
     for part in iter_formulas(formula):
         if isinstance(part, Quantified):
@@ -681,7 +689,7 @@ def _is_of(formula: Formula, names: Sequence[str]) -> bool:
         terms = terms_of(part.expression) if isinstance(part, Atom) else ()
         for term in terms:
             base = base_of(term)
-            if not (isinstance(base, TrackedName) and base.name in names):
+            if not (isinstance(base, TrackedName) and base.name in object_names):
                 return False
     return True
 

@@ -171,18 +171,20 @@ def _add_axes(
     entity: SceneEntity, low_corner: tuple[float, float], high_corner: tuple[float, float], height: float
 ) -> None:
     """Add a frame with ticks and coordinates below and on the left."""
-    size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
+    map_size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
     corners = [low_corner, (high_corner[0], low_corner[1]), high_corner, (low_corner[0], high_corner[1])]
     entity.lines.append(_line(corners, height, NEUTRAL, LinePrimitive.LINE_LOOP, pixels=_THIN_PIXELS))
     ticks: list[tuple[float, float]] = []
     for x in _round_numbers(low_corner[0], high_corner[0]):
-        ticks += [(x, low_corner[1]), (x, low_corner[1] - _TICK * size)]
-        _add_text(entity, number_text(x), (x, low_corner[1] - (_TICK + _FONT) * size), height, _FONT * size)
+        ticks += [(x, low_corner[1]), (x, low_corner[1] - _TICK * map_size)]
+        _add_text(
+            entity, number_text(x), (x, low_corner[1] - (_TICK + _FONT) * map_size), height, _FONT * map_size
+        )
     for y in _round_numbers(low_corner[1], high_corner[1]):
-        ticks += [(low_corner[0], y), (low_corner[0] - _TICK * size, y)]
+        ticks += [(low_corner[0], y), (low_corner[0] - _TICK * map_size, y)]
         text = number_text(y)
-        left = low_corner[0] - (2.0 * _TICK + _half_width(text)) * size
-        _add_text(entity, text, (left, y), height, _FONT * size)
+        text_x = low_corner[0] - (2.0 * _TICK + _half_width(text)) * map_size
+        _add_text(entity, text, (text_x, y), height, _FONT * map_size)
     entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
 
 
@@ -195,14 +197,14 @@ def _add_scale(
     margin: float,
 ) -> None:
     """Add the colour bar on the right, with numbers at its ends, at 0 and at the margin."""
-    size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
-    left, right = high_corner[0] + _GAP * size, high_corner[0] + (_GAP + _BAR) * size
+    map_size = max(high_corner[0] - low_corner[0], high_corner[1] - low_corner[1])
+    bar_left, bar_right = high_corner[0] + _GAP * map_size, high_corner[0] + (_GAP + _BAR) * map_size
     bar_values = np.linspace(-greatest_value, greatest_value, _SHADES)
     bar_levels = np.linspace(low_corner[1], high_corner[1], _SHADES)
     bar = entity.triangles.add()
     bar.pose.position.z, bar.pose.orientation.w = height, 1.0
     for level, colour in zip(bar_levels.tolist(), (cell_colours(bar_values) / 255.0).tolist(), strict=True):
-        for x in (left, right):
+        for x in (bar_left, bar_right):
             bar.points.add(x=x, y=level)
             bar.colors.add(r=colour[0], g=colour[1], b=colour[2], a=colour[3])
     for corner in range(0, 2 * (_SHADES - 1), 2):
@@ -215,12 +217,12 @@ def _add_scale(
         ) / 2.0
         if abs(tick_value) > greatest_value:
             continue
-        ticks += [(left, level), (right + _TICK * size, level)]
-        if all(abs(level - other_level) >= _FONT * size for other_level in levels_of_texts):
+        ticks += [(bar_left, level), (bar_right + _TICK * map_size, level)]
+        if all(abs(level - other_level) >= _FONT * map_size for other_level in levels_of_texts):
             levels_of_texts.append(level)
             text = number_text(tick_value)
-            x = right + (2.0 * _TICK + _half_width(text)) * size
-            _add_text(entity, text, (x, level), height, _FONT * size)
+            x = bar_right + (2.0 * _TICK + _half_width(text)) * map_size
+            _add_text(entity, text, (x, level), height, _FONT * map_size)
     entity.lines.append(_line(ticks, height, NEUTRAL, LinePrimitive.LINE_LIST, pixels=_THIN_PIXELS))
 
 
@@ -233,20 +235,20 @@ def _round_numbers(low: float, high: float) -> Iterator[float]:
     """Yield the multiples of a round number in an interval, at most `_MOST_TICKS`."""
     least_step = (high - low) / (_MOST_TICKS - 1)
     power = 10.0 ** math.floor(math.log10(least_step))
-    step = next(
+    tick_step = next(
         factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least_step * (1 - 1e-9)
     )
     # without the tolerances, rounding could drop ticks at the ends
-    for multiple in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
-        yield multiple * step
+    for multiple in range(math.ceil(low / tick_step - 1e-9), math.floor(high / tick_step + 1e-9) + 1):
+        yield multiple * tick_step
 
 
 def _add_text(
-    entity: SceneEntity, text: str, place: tuple[float, float], height: float, font_size: float
+    entity: SceneEntity, text: str, position: tuple[float, float], height: float, font_size: float
 ) -> None:
     """Add a text that scales with the map, at any distance of the viewer's camera."""
     label = entity.texts.add(billboard=True, font_size=font_size, text=text)
-    label.pose.position.x, label.pose.position.y, label.pose.position.z = *place, height
+    label.pose.position.x, label.pose.position.y, label.pose.position.z = *position, height
     label.pose.orientation.w = 1.0
     label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
 
@@ -261,14 +263,14 @@ def path_message(
 
     Without a target, the message deletes the earlier drawing.
     """
-    lines: dict[str, list[LinePrimitive]] = {_PATH: [], _TRAVELLED: []}
+    lines_by_id: dict[str, list[LinePrimitive]] = {_PATH: [], _TRAVELLED: []}
     if target is not None and tracked is not None:
         height = 0.0 if tracked.height is None else tracked.height[1]
-        lines[_PATH] = _path_lines(target, tracked, height, POSITIVE)
+        lines_by_id[_PATH] = _path_lines(target, tracked, height, POSITIVE)
         if travelled:
-            lines[_TRAVELLED] = [_line(travelled, height, NEUTRAL)]
+            lines_by_id[_TRAVELLED] = [_line(travelled, height, NEUTRAL)]
     message = SceneUpdate()
-    for identifier, lines_of_entity in lines.items():
+    for identifier, lines_of_entity in lines_by_id.items():
         if lines_of_entity:
             entity = message.entities.add(id=identifier, frame_id=FRAME, lines=lines_of_entity)
             entity.timestamp.FromNanoseconds(time_ns)
@@ -296,12 +298,13 @@ def _line(
     points: Iterable[Sequence[float]],
     height: float,
     colour: tuple[float, float, float],
-    kind: LinePrimitive.Type.ValueType = LinePrimitive.LINE_STRIP,
+    line_type: LinePrimitive.Type.ValueType = LinePrimitive.LINE_STRIP,
     *,
     pixels: float = _PIXELS,
 ) -> LinePrimitive:
+    """Return a line through points (x, y) at a height, footprint units; its width is in pixels."""
     # scale_invariant: the thickness is in pixels (https://docs.foxglove.dev/docs/sdk/schemas/line-primitive)
-    line = LinePrimitive(type=kind, thickness=pixels, scale_invariant=True)
+    line = LinePrimitive(type=line_type, thickness=pixels, scale_invariant=True)
     line.pose.position.z, line.pose.orientation.w = height, 1.0
     for x, y in points:
         line.points.add(x=x, y=y)

@@ -157,8 +157,8 @@ def gradient_map(
     blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
     blocked[danger >= -margin] = CONSTRAINED
-    parts = MapParts(maps, robustness_maps, progress, constraints)
-    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns, parts)
+    map_parts = MapParts(maps, robustness_maps, progress, constraints)
+    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns, map_parts)
 
 
 def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
@@ -492,11 +492,13 @@ def map_layers(
         failed: places (x, y) where motions of the object failed, which the object avoids.
         tried: (A, rows, columns), further cells near failed targets.
     """
-    parts, shape = gradient.made_of, gradient.blocked.shape
-    formulas = parts.then.about.propositions
-    cube_parts = [[_Part.of(formulas[number], value) for number, value in cube] for cube in parts.progress]
+    map_parts, shape = gradient.made_of, gradient.blocked.shape
+    formulas = map_parts.then.about.propositions
+    cube_parts = [
+        [_Part.of(formulas[number], value) for number, value in cube] for cube in map_parts.progress
+    ]
     leaves = tuple(dict.fromkeys(leaf for cube in cube_parts for part in cube for leaf in part.leaves()))
-    lower, upper = _bounds_of(parts.then, [leaf.formula for leaf in leaves])
+    lower, upper = _bounds_of(map_parts.then, [leaf.formula for leaf in leaves])
     layers = np.empty((len(leaves), *shape))
     for layer_index, leaf in enumerate(leaves):
         layers[layer_index] = lower[layer_index] if leaf.wanted else -upper[layer_index]
@@ -586,15 +588,16 @@ def literal_text(formula: Formula, wanted: bool) -> str:
     return text if wanted else f"not ({text})"
 
 
-def _limit_of(parts: Iterable[_Limit], shape: tuple[int, ...], *, is_every: bool) -> _Limit:
-    limit, limiting = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
-    for part_value, part_limiting in parts:
-        is_limiting = part_value < limit if is_every else part_value > limit
-        limit, limiting = (
-            np.where(is_limiting, part_value, limit),
-            np.where(is_limiting, part_limiting, limiting),
+def _limit_of(member_limits: Iterable[_Limit], shape: tuple[int, ...], *, is_every: bool) -> _Limit:
+    """Return the least limit of members in each cell if `is_every`, else the greatest limit."""
+    limit, limiting_index = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
+    for member_value, member_index in member_limits:
+        is_limiting = member_value < limit if is_every else member_value > limit
+        limit, limiting_index = (
+            np.where(is_limiting, member_value, limit),
+            np.where(is_limiting, member_index, limiting_index),
         )
-    return limit, limiting
+    return limit, limiting_index
 
 
 def _bounds_of(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Floats, Floats]:
@@ -628,7 +631,7 @@ def _causes(gradient: GradientMap, is_avoided: Booleans) -> tuple[tuple[BlockedB
     count_order = np.argsort(-counts, kind="stable")
     causes = []
     blocked_by = np.full(blocked.shape, -1, np.int64)
-    for cause_index, (code, count) in enumerate(
+    for cause_index, (code, cell_count) in enumerate(
         zip(unique_codes[count_order].tolist(), counts[count_order].tolist(), strict=True)
     ):
         kind, cause_number = _KINDS[code // _NUMBERS], code % _NUMBERS
@@ -642,7 +645,7 @@ def _causes(gradient: GradientMap, is_avoided: Booleans) -> tuple[tuple[BlockedB
         if kind == "object" and not name:
             kind = "obstacle"
         blocked_by[codes == code] = min(cause_index, MOST_CAUSES - 1)
-        causes.append(BlockedBy(kind, name, count))
+        causes.append(BlockedBy(kind, name, cell_count))
     return tuple(causes[:MOST_CAUSES]), blocked_by
 
 

@@ -243,7 +243,7 @@ class Movables:
         is_bound = any(concerns(self.propositions[number], name) for number in proposition_numbers)
         if settings.skill == "push" or settings.lift is None or not is_bound:
             return target
-        danger, grid, parts = self._danger_on_the_way(target, constraints, proposition_numbers)
+        danger, grid, map_parts = self._danger_on_the_way(target, constraints, proposition_numbers)
         base_distance = distance_to([settings.workspace.base], grid)
         is_reached = (base_distance >= settings.workspace.nearest) & (
             base_distance <= settings.workspace.farthest
@@ -264,7 +264,7 @@ class Movables:
             return "the robot does not reach all of any way there"
         centres = [grid.centre(*cell) for cell in path.cells.tolist()]
         crossed_cells = [grid.cell(*point) for point in points_along(centres, grid.cell_size)]
-        texts, indices = most_dangerous(parts, (1, *grid.shape))
+        texts, indices = most_dangerous(map_parts, (1, *grid.shape))
         crossed_numbers = dict.fromkeys(
             int(indices[0][cell]) for cell in crossed_cells if danger[cell] >= 0.0
         )
@@ -803,11 +803,11 @@ class MotionOrder:
         target = target_in(gradient, tracked, settings, pose)
         if isinstance(target, str):
             return None
-        # the step is half a radius, so that successive footprints leave no gap for another object
-        step = max(workspace.grid.cell_size, radius_of(tracked) / 2.0)
+        # the spacing is half a radius, so that successive footprints leave no gap for another object
+        spacing = max(workspace.grid.cell_size, radius_of(tracked) / 2.0)
         covered_parts = [
             part
-            for x, y in points_along(target.waypoints, step)
+            for x, y in points_along(target.waypoints, spacing)
             for part in moved_object(tracked, x, y).footprint.parts
         ]
         covered_parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts

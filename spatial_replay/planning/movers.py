@@ -223,8 +223,8 @@ class MotionTimes:
         Without an earlier motion, the expected step is one cell.
         """
         mean_step = self._total_length / self._sample_count if self._sample_count else cell_size
-        rest = 0 if self._newest_length else max(self.approach - self._standing_samples, 0)
-        return Timing(max(self._newest_length, mean_step), rest, self.approach)
+        longest_rest = 0 if self._newest_length else max(self.approach - self._standing_samples, 0)
+        return Timing(max(self._newest_length, mean_step), longest_rest, self.approach)
 
 
 class Course(NamedTuple):
@@ -454,17 +454,17 @@ class Lookout:
         is_sure = states <= can_accept
         previous_number = 0
         bounds_by_sample = zip(*(bound.T.tolist() for bound in bounds), strict=True)
-        for number, (lower, upper) in zip(sample_numbers, bounds_by_sample, strict=True):
-            values = zip(lower, upper, strict=True)
-            symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in values)
+        for sample_number, (lower, upper) in zip(sample_numbers, bounds_by_sample, strict=True):
+            value_bounds = zip(lower, upper, strict=True)
+            symbol = tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in value_bounds)
             # the samples since the previous predicted sample are assumed equal to this sample
-            for _ in range(number - previous_number):
+            for _ in range(sample_number - previous_number):
                 previous_states, states = states, self._automaton.step_set(states, symbol)
                 if states == previous_states:
                     break
-            previous_number = number
+            previous_number = sample_number
             if not states <= can_accept if is_sure else states.isdisjoint(can_accept):
-                return number
+                return sample_number
         return math.inf
 
 
@@ -532,7 +532,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: 
     """
     start_trace = Trace.from_samples([sample])
     sample_count = max(len(course.places) for course in courses.values())
-    footprints, rows = start_trace.footprints, np.repeat(start_trace.rows, sample_count, axis=0)
+    footprints, footprint_rows = start_trace.footprints, np.repeat(start_trace.rows, sample_count, axis=0)
     yaws, uncertainties, class_codes = [start_trace.yaw], [start_trace.uncertainty], [start_trace.class_code]
     for name, course in courses.items():
         tracked, column, course_length = (
@@ -540,7 +540,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: 
             start_trace.names.index(name),
             len(course.places),
         )
-        rows[:, column] = len(footprints) + np.arange(sample_count) % course_length
+        footprint_rows[:, column] = len(footprints) + np.arange(sample_count) % course_length
         turns = course.turn * np.array(sample_numbers if course.turn else [0] * course_length, np.float64)
         # a turning object has another orientation at each place, so poses are added one by one
         if course.turn:
@@ -556,7 +556,7 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: 
     return Trace(
         times_ns=np.arange(sample_count, dtype=np.int64),
         names=start_trace.names,
-        rows=rows,
+        rows=footprint_rows,
         footprints=footprints,
         yaw=np.concatenate(yaws),
         uncertainty=np.concatenate(uncertainties),

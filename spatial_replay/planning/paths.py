@@ -185,7 +185,10 @@ def _at_least(row: int, column: int, box: Integers) -> float:
 
 @piece
 def _directions(free: Flags, row: int, column: int, down: int, right: int, directions: Integers) -> int:
-    """Write the possible next directions after a step into `directions`, and return their number."""
+    """Write the possible next directions after a step into `directions`, and return their number.
+
+    A direction is (`down`, `right`): rows and columns per step, -1, 0 or 1.
+    """
     if down != 0 and right != 0:
         directions[0, 0], directions[0, 1] = down, 0
         directions[1, 0], directions[1, 1] = 0, right
@@ -208,7 +211,10 @@ def _directions(free: Flags, row: int, column: int, down: int, right: int, direc
 
 @piece
 def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """Return the number of diagonal steps to the next cell where a path may turn or end; 0 for none."""
+    """Return the number of diagonal steps to the next cell where a path may turn or end, or 0.
+
+    A step goes `down` rows and `right` columns, each -1 or 1.
+    """
     steps = 0
     while True:
         if not (free[row + down, column] and free[row, column + right] and free[row + down, column + right]):
@@ -226,7 +232,10 @@ def _jump_diagonal(free: Flags, goals: Flags, row: int, column: int, down: int, 
 
 @piece
 def _jump_straight(free: Flags, goals: Flags, row: int, column: int, down: int, right: int) -> int:
-    """Return the number of straight steps to the next cell where a path may turn or end; 0 for none."""
+    """Return the number of straight steps to the next cell where a path may turn or end, or 0.
+
+    A step goes `down` rows and `right` columns, each -1, 0 or 1.
+    """
     steps = 0
     while True:
         row += down

@@ -612,13 +612,13 @@ class Planner:
         order = "by name" if self.settings.movable is None else "in `movable`"
         return f"{equality} and {equal_words}, {f'and comes later {order}' if is_later else _LEADS_NOWHERE}"
 
-    def _wanted_text(self, number: int, value: bool) -> str:
+    def _wanted_text(self, proposition_number: int, is_wanted: bool) -> str:
         """Return the text of a literal with the names of its specs; a long text is left out."""
         text, spec_text = (
-            self._named_automaton.propositions[number].literal(value),
-            " and ".join(self._specs[number]),
+            self._named_automaton.propositions[proposition_number].literal(is_wanted),
+            " and ".join(self._specs[proposition_number]),
         )
-        if not spec_text or self._named_automaton.propositions[number].name:
+        if not spec_text or self._named_automaton.propositions[proposition_number].name:
             return text
         return spec_text if len(text) > _LONGEST_WANTED else f"{text} ({spec_text})"
 

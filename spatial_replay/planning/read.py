@@ -328,8 +328,8 @@ def _blocking_texts(
     settings: Settings,
 ) -> Iterator[str]:
     """Yield the causes that keep an object out of a cell, with numbers."""
-    kind = "" if cause is None else cause.kind
-    if cause is not None and kind == "constraint":
+    cause_kind = "" if cause is None else cause.kind
+    if cause is not None and cause_kind == "constraint":
         danger = danger_of(gradient.made_of.now, gradient.made_of.constraints)[cell]
         rule = plain(ban_of(cause.name, bans).rule)
         if danger >= 0.0:
@@ -349,9 +349,9 @@ def _blocking_texts(
             f"they overlap by {-distance:.4g}" if distance < 0.0 else f"{distance:.4g} is left between them"
         )
     other_causes = {"reach": "the robot does not reach it", "failed": "a motion failed near it"}
-    if kind in other_causes:
-        yield f"blocked: {other_causes[kind]}"
-    elif kind == "unknown":
+    if cause_kind in other_causes:
+        yield f"blocked: {other_causes[cause_kind]}"
+    elif cause_kind == "unknown":
         yield "blocked: a relation there is unknown"
 
 
@@ -780,15 +780,15 @@ def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
         return {}
     robustness = best_robustness(candidate)
     best_text = "nowhere free" if math.isinf(robustness) else f"{robustness:.4g}"
-    rows = {"best": [best_text]}
+    texts_by_key = {"best": [best_text]}
     if candidate.HasField("target"):
         target = candidate.target
-        rows["target"] = [f"({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"]
+        texts_by_key["target"] = [f"({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"]
     elif candidate.rejected:
-        rows["rejected"] = [candidate.rejected]
+        texts_by_key["rejected"] = [candidate.rejected]
     for key, line in candidate_lines(candidate):
-        rows.setdefault(key, []).append(line)
-    return rows
+        texts_by_key.setdefault(key, []).append(line)
+    return texts_by_key
 
 
 def redo_decisions(

@@ -203,11 +203,11 @@ class Workspace:
         Raises:
             UsageError: the sample has no object.
         """
-        parts = [part for tracked in sample.objects.values() for part in tracked.footprint.parts]
-        if not parts:
+        footprint_parts = [part for tracked in sample.objects.values() for part in tracked.footprint.parts]
+        if not footprint_parts:
             raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
-        lowest = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)
-        highest = np.max([part.vertices.max(axis=0) + part.radius for part in parts], axis=0)
+        lowest = np.min([part.vertices.min(axis=0) - part.radius for part in footprint_parts], axis=0)
+        highest = np.max([part.vertices.max(axis=0) + part.radius for part in footprint_parts], axis=0)
         longer_side = float((highest - lowest).max()) or 1.0
         (xmin, ymin), (xmax, ymax) = (lowest - longer_side / 2).tolist(), (highest + longer_side / 2).tolist()
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer_side / CELLS_AROUND))

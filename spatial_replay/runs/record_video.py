@@ -92,12 +92,12 @@ _COLOURS: Final = (NEUTRAL, POSITIVE, NEUTRAL, NEGATIVE)
 
 
 def _members(requirement: Requirement, sample: Sample) -> set[str]:
-    names = set(requirement.objects)
+    object_names = set(requirement.objects)
     for group in requirement.groups:
         for name, tracked_object in sample.objects.items():
             if group.class_name in (ANY_CLASS, (tracked_object.class_name or "").casefold()):
-                names |= {name} - group.excluded
-    return names
+                object_names |= {name} - group.excluded
+    return object_names
 
 
 def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:

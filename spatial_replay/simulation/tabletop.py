@@ -249,8 +249,8 @@ class Tabletop:
         Raises:
             UsageError: no such object, or the robot does not push.
         """
-        numbers = [number for point in path for number in point]
-        self._refuse_unless("push", name, numbers and [*numbers, 0.0 if yaw is None else yaw])
+        coordinates = [number for point in path for number in point]
+        self._refuse_unless("push", name, coordinates and [*coordinates, 0.0 if yaw is None else yaw])
         return self._move(name, pushing(self._scene, name, path, yaw))
 
     def place(
@@ -367,7 +367,7 @@ class Tabletop:
             raise UsageError(f"the world {self.name} is closed; make another one")
         return self._engine
 
-    def _refuse_unless(self, skill: str, name: str, numbers: Sequence[float]) -> None:
+    def _refuse_unless(self, skill: str, name: str, coordinates: Sequence[float]) -> None:
         self._open_engine()
         if self._scenario.skill != skill:
             robot_skill = self._scenario.skill
@@ -375,8 +375,8 @@ class Tabletop:
         movable_names = [body.name for body in self.bodies if body.movable]
         if name not in movable_names:
             raise UsageError(f"{name!r} cannot be moved in {self.name}; {', '.join(movable_names)} can")
-        if not numbers or not all(map(math.isfinite, numbers)):
-            raise UsageError(f"{name} cannot be moved to {list(numbers)}; give finite numbers")
+        if not coordinates or not all(map(math.isfinite, coordinates)):
+            raise UsageError(f"{name} cannot be moved to {list(coordinates)}; give finite numbers")
 
 
 def _displacements(

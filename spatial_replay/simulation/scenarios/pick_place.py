@@ -15,12 +15,12 @@ def _thing(
     name: str,
     class_name: str,
     shape: Shape,
-    place: tuple[float, float],
+    position: tuple[float, float],
     mass_kg: float,
     colour: tuple[float, float, float],
     yaw: float = 0.0,
 ) -> Placement:
-    return Placement(Body(name, class_name, shape), *place, yaw, mass_kg, colour)
+    return Placement(Body(name, class_name, shape), *position, yaw, mass_kg, colour)
 
 
 def _script(scene: Scene) -> Generator[None, None, Outcome]:
