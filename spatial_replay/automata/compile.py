@@ -541,7 +541,7 @@ class _Composition:
         machines = [merge_equivalent_states(self.machine(operand)) for operand in operands]
         size_heap = [(machine.size, number) for number, machine in enumerate(machines)]
         heapify(size_heap)
-        # the two smallest machines first, because the size of a product is up to the product of the sizes
+        # the two smallest machines first: a product may be as large as the product of both sizes
         while len(size_heap) > 1:
             smallest, next_smallest = (machines[heappop(size_heap)[1]] for _ in range(2))
             machines.append(merge_equivalent_states(join_machines(smallest, next_smallest, is_conjunction)))
@@ -762,8 +762,8 @@ def automaton(
         name: name of the spec; None for the only result of the file.
         rate_hz: sampling rate, which converts bounds in seconds into bounds in samples. The result is valid
             only for runs of this rate.
-        compiler: "own" for this package, or "mona"; both give equal automata. None tries MONA only if the
-            formula exceeds this package's limits.
+        compiler: "own" for this package, or "mona"; both give equal automata. With None, MONA is tried
+            only if the formula exceeds this package's limits.
         stored: contents of automaton files. A stored automaton of this spec replaces a call of MONA, unless
             the spec has bounds in seconds.
 

@@ -463,7 +463,7 @@ def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
 
 
 def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason], why: str = "") -> str:
-    """Return the sentence that every path from a state was pruned, with the pruned edges by kind of reason.
+    """Return a sentence that says that no path from a state is left, and why its edges were pruned.
 
     Args:
         why: infeasible part of the task; if empty, the detail of a `LATER` reason replaces it.

@@ -341,7 +341,7 @@ def with_choice(
 def choose_candidate(
     consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
 ) -> Consideration:
-    """Return an edge with the candidate `number` chosen, and with the planned motions; None chooses none."""
+    """Return an edge with its planned motions, and the candidate `number` chosen; None for no candidate."""
     candidates = tuple(
         replace(candidate, is_chosen=index == number)
         for index, candidate in enumerate(consideration.candidates)

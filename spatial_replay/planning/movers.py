@@ -76,7 +76,7 @@ def _motion(earlier: TrackedObject, newest: TrackedObject) -> Pose:
 
 
 def next_sample(before: Sample, sample: Sample, target: Target, skill: Skill) -> Sample:
-    """Return the expected next sample after two samples while an object is moved to a target."""
+    """Return the expected next sample, from the newest two samples, while an object moves to a target."""
     motions = motions_between(before, sample)
     objects = {name: _advance(sample.objects[name], motion) for name, motion in motions.items()}
     if target.name in motions:
