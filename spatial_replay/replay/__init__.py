@@ -1,5 +1,6 @@
-"""Replay: a log and specifications in, verdicts and an annotated log out.
+"""Replay: evaluate specifications over a log, and write verdicts and an annotated log.
 
-`selection` picks the samples, `engine` evaluates them and writes the log, `document` the JSON. `loaded_log`
-evaluates a log in memory again and plays it. `specification_files` reads saved specifications again.
+`selection` chooses the samples, `engine` evaluates them and writes the log, and `document` writes the JSON.
+`loaded_log` evaluates a log in memory repeatedly and plays it. `specification_files` reads saved
+specifications again.
 """

@@ -26,11 +26,13 @@ from spatial_replay.trace.doubts import json_doubt
 def document_from_replay(
     replayed: Replayed, *, signal: bool = False, window_ns: int | None = None
 ) -> Mapping[str, Any]:
-    """Return one JSON object; infinite numbers are the strings "inf" and "-inf", undetermined ones null.
+    """Return the results as one JSON object.
+
+    Infinite numbers are the strings "inf" and "-inf". Undetermined numbers are null.
 
     Args:
-        signal: whether the series include each node's robustness from each sample to the end.
-        window_ns: width of a sliding window; the series include each node's robustness over it.
+        signal: whether the series contain each node's robustness from each sample to the end of the log.
+        window_ns: width of a sliding window, ns; the series contain each node's robustness over the window.
 
     Raises:
         UsageError: the semantics have no signal or no window.
@@ -64,7 +66,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         **json_fields(result, *RESULT_COLUMNS),
         "requirement": result.spec.id,
         "title": result.spec.title,
-        # the witness that headline, arrow and event show
+        # headline, arrow and event show this witness
         "worst": None if result.worst is None else witness_document(result.worst, first_ns),
         "causes": [_cause(cause, first_ns) for cause in result.causes],
         "violations": [_invariant(invariant) for invariant in result.violated_invariants],
@@ -94,7 +96,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
 
 
 def _of_node(node: NodeResult) -> dict[str, Any]:
-    """Return the fields that a node and its explanation share."""
+    """Return the JSON fields that nodes and explanations of nodes share."""
     return {
         **json_fields(node, "name", "requirement", "title", "verdict", "robustness"),
         "lower": json_number(node.final_lower),
@@ -115,7 +117,7 @@ def _untested_part(part: UntestedPart, first_ns: int) -> dict[str, Any]:
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
-    """Return the witness of a node's verdict. Its sentences count time from `first_ns`."""
+    """Return the witness of a node's verdict as JSON. Times in its sentences count from `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
     document: dict[str, Any] = {
         **json_fields(witness, "node", "verdict", "lower", "upper", "time_ns", "obstacle"),
@@ -145,7 +147,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
 
 
 def _missed_response(witness: Witness, missed: MissedResponse) -> dict[str, Any]:
-    """Return a missed response, with the closest atom if another atom decides."""
+    """Return a missed response as JSON. "closest" is null if the closest atom also decides the verdict."""
     closest_atom, closest_ns = witness.closest or (None, None)
     threshold = witness.closest_threshold
     return {
@@ -197,12 +199,12 @@ def _measurement(measured: Measured) -> dict[str, Any]:
 
 
 def _numbers(node_rows: Floats) -> list[list[float | str | None]]:
-    """Return one list of numbers for each node."""
+    """Return one list of JSON numbers for each row of an array, (N, T)."""
     return [[json_number(number) for number in row] for row in node_rows.tolist()]
 
 
 def idle_document(template: UntestedPart) -> dict[str, Any]:
-    """Return a template without instances in the format of explanations: a reason, but no verdict."""
+    """Explain a template without instances as JSON. The explanation has a reason, but no verdict."""
     return {
         "specification": template.text.partition("(")[0],
         "object": None,
@@ -220,7 +222,7 @@ class Explanation:
     """The reason for the verdict of one node.
 
     Attributes:
-        time_ns: time of the sample that decides.
+        time_ns: time of the deciding sample.
         sentences: the reason in words.
         document: the reason as JSON.
     """
@@ -234,18 +236,18 @@ class Explanation:
 def explain_results(
     replayed: Replayed, *, node: str | None = None, object: str | None = None, goes_on: bool = False
 ) -> list[Explanation]:
-    """Explain the verdicts of results, or of their nodes with a given name.
+    """Explain the verdict of each result, or of each result's node with a given name.
 
     Args:
         replayed: a replay that kept series and leaves.
-        object: explain only results about this object of a template.
+        object: name of an object; only results of templates for this object are explained.
         goes_on: whether the log has later samples, which could change a verdict.
 
     Returns:
-        One explanation for each result; none if all specs are templates without objects.
+        One explanation for each result. The list is empty if all specs are templates without objects.
 
     Raises:
-        UsageError: there is no such node or object.
+        UsageError: no result has the node, or the object.
     """
     results = [result for result in replayed.results if object in (None, result.object)]
     if not results and node is None and object is None:
@@ -282,7 +284,7 @@ def _find_nodes(result: SpecResult, name: str | None) -> Iterator[int]:
 
 
 def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdict | None:
-    """Return the verdict that `explain_results` explains; None without such a node."""
+    """Return the verdict that `explain_results` explains for a result; None if the node is missing."""
     for node_id in _find_nodes(result, node):
         is_pending = _is_pending(result, node_id, goes_on=goes_on)
         return Verdict.PENDING if is_pending else result.nodes[node_id].verdict
@@ -290,18 +292,18 @@ def verdict_of(result: SpecResult, node: str | None, *, goes_on: bool) -> Verdic
 
 
 def _is_pending(result: SpecResult, node: int, *, goes_on: bool) -> bool:
-    """Return whether the verdict of a node is pending: later samples decide it."""
+    """Return whether later samples can still decide the verdict of a node."""
     _, _, lower, upper = result.series[node]
     return goes_on and online_verdict(float(lower[-1]), float(upper[-1])) is Verdict.PENDING
 
 
 def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: bool = False) -> Explanation:
-    """Explain the verdict of one node of a result; see `explain_results`."""
+    """Explain the verdict of one node of a result (see `explain_results`)."""
     if not result.has_series:
         raise ValueError("the replay did not keep series and leaves")
     node_result = result.nodes[node]
     is_pending = _is_pending(result, node, goes_on=goes_on)
-    # a goal that later samples may still reach is no cause
+    # a goal is no cause while later samples may reach it
     causes = [cause for cause in result.causes_of(node) if not goes_on or cause.settled_ns is not None]
     if is_pending:
         witness = result.witness(node)

@@ -1,4 +1,4 @@
-"""A recorded run evaluated again: source and specifications → evaluation → verdicts and an annotated log."""
+"""Evaluate specifications over a recorded run, and write its annotated log."""
 
 from __future__ import annotations
 
@@ -77,19 +77,25 @@ if TYPE_CHECKING:
 
 
 _MOST_DIGITS = 18
-"""Maximum number of digits of a valid count in the metadata of a log."""
+"""Maximum number of digits of a count in a log's metadata."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Limits of the samples kept in memory for explanations, bytes: per result and in total."""
 _SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
-"""Limits of samples, and of samples times results, whose messages are written together: some 30 MB.
+"""Limits of messages that are written together, some 30 MB: samples, and samples times results.
 
-The memory of earlier messages is reused, because fresh memory of the system costs as much as filling it.
+Small parts reuse the memory of earlier messages. The system's time for new memory equals the time to fill it.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Numbers of a recorder's dropped samples and of all its samples, and whether it was interrupted."""
+    """Samples that a recorder dropped.
+
+    Attributes:
+        count: number of dropped samples.
+        of: number of all samples, dropped samples included.
+        was_interrupted: whether the recording was interrupted.
+    """
 
     count: int
     of: int
@@ -97,12 +103,12 @@ class Dropped:
 
     @property
     def text(self) -> str:
-        """The losses in words; "" if there are none."""
+        """A sentence on the dropped samples; "" if no sample was dropped."""
         return f"the recorder dropped {self.count:,} of {plural(self.of, 'sample')}" if self.count else ""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The losses and an interruption in words, for readers of the log."""
+        """Remarks on dropped samples and on an interruption."""
         ended = "the recording was interrupted" if self.was_interrupted else ""
         return tuple(filter(None, (self.text, ended)))
 
@@ -113,23 +119,23 @@ class Replayed:
 
     Attributes:
         log: base name of the log.
-        samples: number of evaluated samples, without those that fill pauses.
-        first_ns: zero of times in texts: the log's first sample (evaluated or not), or the zero recorded in a
-            cut log.
+        samples: number of evaluated samples, without the samples that fill pauses.
+        first_ns: time that texts count from: the log's first sample (evaluated or not), or the zero that a
+            cut log records.
         start_ns, end_ns: times of the first and the last evaluated sample.
         faults: losses while reading, each with its place.
         remarks: remarks on the samples apart from losses; doubts come first.
-        missing: a warning for each missing name in the specifications, which is unknown.
+        missing: a warning for each name that the log lacks; objects and signals of these names are unknown.
         dropped: samples that the recorder dropped.
         unreadable: number of observations without a usable value: not finite, or too old.
-        results: one per spec and object.
-        vacuous: templates without instances; a result has its parts that decided nothing in its own
-            `vacuous`.
+        results: one result per spec, or per object of a template.
+        vacuous: templates without instances. Other parts that decided nothing are in `vacuous` of their
+            result.
         certificate: hashes of inputs and results; empty unless requested.
         semantics: the semantics of the formulas.
-        left: members of open groups and objects of `present` that left within reach of a threshold and came
-            back; also in `remarks`.
-        doubts: assumptions that the log contradicts; each result has those of its own assumptions.
+        left: absences of group members and of objects in `present`, near a threshold (see `Departures`);
+            `remarks` has their sentences, too.
+        doubts: assumptions that the log contradicts; each result has the doubts about its own assumptions.
     """
 
     log: str
@@ -160,9 +166,9 @@ class ReplayPlan:
 
     Attributes:
         files: the specifications, as an annotated log stores them.
-        instances: instances of each file.
-        departures: departures of each file, before the first sample.
-        heights: height comparisons of all files, before the first sample.
+        instances: instances of the specs in each file.
+        departures: collector of departures for each file, before the first sample.
+        heights: counter of height comparisons for all files, before the first sample.
     """
 
     files: Sequence[Specification]
@@ -172,7 +178,7 @@ class ReplayPlan:
 
     @classmethod
     def of(cls, selection: Selection) -> ReplayPlan:
-        """Prepare the specifications of a selection. For templates, its log is read once to find objects.
+        """Prepare the specifications of a selection. If there are templates, the log is read for objects.
 
         Raises:
             UsageError: the objects of a template are not given.
@@ -191,7 +197,7 @@ class LogAccount:
     """Collects names, losses, remarks and doubts of a log, block by block.
 
     Attributes:
-        samples: number of evaluated samples, without those that fill pauses.
+        samples: number of evaluated samples, without the samples that fill pauses.
     """
 
     def __init__(self, plan: ReplayPlan) -> None:
@@ -208,7 +214,7 @@ class LogAccount:
         self._departures = [departures.restart() for departures in plan.departures]
 
     def add(self, block: Block, trace: Trace) -> None:
-        """Add the next block, with its evaluated samples."""
+        """Add the next block and its evaluated samples."""
         self._remarks += block.remarks
         self._doubts += block.doubts
         self._faults += trace.faults
@@ -233,7 +239,7 @@ class LogAccount:
             raise selection.nothing_to_evaluate(self._faults)
 
     def doubts(self, first_ns: int) -> tuple[Doubt, ...]:
-        """Return the assumptions that the log contradicts, whose sentences count time from `first_ns`."""
+        """Return the doubts about the log. Times in their sentences count from `first_ns`."""
         return distinct_doubts(self._doubts, first_ns)
 
     def summary(
@@ -243,10 +249,10 @@ class LogAccount:
         results: Sequence[SpecResult],
         certificate: Mapping[str, str] = MappingProxyType({}),
     ) -> Replayed:
-        """Return the results of the log with the collected facts.
+        """Return the results together with the collected facts about the log.
 
         Args:
-            first_ns: zero of times in texts.
+            first_ns: time that texts count from.
 
         Raises:
             SpecificationError: a name is missing, and names are strict.
@@ -300,7 +306,7 @@ class LogAccount:
         )
 
     def _empty_ends(self, window: Window, first_ns: int) -> Iterator[Sentence]:
-        """Yield remarks on ends of the window without samples: the log pauses, or has ended."""
+        """Yield a remark for each end of the window at which the log has no samples."""
         first_sample_ns, last_sample_ns = self._times_ns[0], self._times_ns[-1]
         mean_step_ns = (last_sample_ns - first_sample_ns) / max(self.samples - 1, 1)
         window_start_ns = max(window.start_ns, first_ns) if window.start_ns else first_sample_ns
@@ -314,11 +320,11 @@ class LogAccount:
 
 
 class Replay:
-    """One pass over a source: samples in, verdicts and messages out.
+    """One evaluation of a source, which returns verdicts and writes messages.
 
     Attributes:
         files: the specifications, as an annotated log stores them.
-        trees: all results, with their reported names.
+        trees: formula tree and reported name of each result.
     """
 
     def __init__(
@@ -332,17 +338,17 @@ class Replay:
         certify: bool = True,
         show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
-        """Prepare the evaluation. For templates, the source is read once to find objects.
+        """Prepare the evaluation. If there are templates, the source is read once to find objects.
 
         Args:
-            keep_series: keep every sample's numbers in memory.
-            keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
-            certify: hash inputs and results, which takes about as long as the evaluation.
-            show: receives the frames of the scene.
+            keep_series: whether the robustness of all nodes at each sample is kept in memory.
+            keep_leaves: whether the values of all atoms at each sample are kept, for witnesses and signals.
+            certify: whether inputs and results are hashed, which takes about as long as the evaluation.
+            show: function that receives the frames of the scene.
 
         Raises:
-            UsageError: a template lacks its objects, or no template has a given parameter; the semantics lack
-                an operator; the arrow has no result.
+            UsageError: an option does not fit the specifications: objects or parameters of templates, an
+                operator that the semantics lack, or an arrow without a result.
         """
         self._source = source
         self._written_files = files
@@ -385,10 +391,11 @@ class Replay:
         """Evaluate the whole source and return the results.
 
         Args:
-            write: receives the messages of the annotated log, block by block; without it, none are made.
-            begin: called before `write` with the zero of times in texts.
-            layer: leave out the source's own messages.
-            advance: called with the number of samples of each block that is done.
+            write: function that receives the messages of the annotated log, block by block; None makes no
+                messages.
+            begin: function that is called before `write` with the time that texts count from.
+            layer: whether the source's own messages are left out.
+            advance: function that is called with the number of samples of each evaluated block.
 
         Raises:
             LogError: the log has no sample.
@@ -397,7 +404,7 @@ class Replay:
         """
         self._is_beside = layer
         needs_messages = write is not None or self._hashes is not None
-        # the next block is evaluated while messages of this one are made, if a core is free for that
+        # while the messages of this block are made, a free core evaluates the next block
         for block, trace, stretches in read_ahead(self._evaluate(messages=needs_messages)):
             self._traces.add(trace)
             window_samples = self._selection.inside(trace)
@@ -433,7 +440,7 @@ class Replay:
         """Write the messages of a block in parts, because messages of many results are large."""
         part_length = max(1, min(_SAMPLES_AT_ONCE, _RESULTS_AT_ONCE // max(len(stretches), 1)))
         part_begins = range(0, max(len(trace), 1), part_length)
-        # the log's own messages may lie before the first sample or after the last one
+        # the log's own messages may be earlier than its first sample or later than its last sample
         part_starts_ns = [
             -FOREVER,
             *(int(trace.times_ns[begin]) for begin in part_begins[1:]),
@@ -449,12 +456,12 @@ class Replay:
     def draw_samples(
         self, results: Sequence[SpecResult], times_ns: Sequence[int], show: Callable[[SceneFrames], None]
     ) -> None:
-        """Draw the scene at some samples, also at those without a message of the scene.
+        """Draw the scene at given samples. The annotated log need not have a scene message at these times.
 
         Args:
             results: results of `run`, with series and leaves.
-            times_ns: times of the samples, increasing.
-            show: receives the scene at each of these times.
+            times_ns: increasing times of the samples.
+            show: function that receives the scene at each time.
         """
         if not times_ns:
             return
@@ -479,7 +486,7 @@ class Replay:
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """The automaton of each of `trees`, or the reason why it has none."""
+        """The automaton of each result in `trees`, or the reason why there is none."""
         return self._evaluation.automata
 
     def attachments(self) -> list[Attachment]:
@@ -490,7 +497,7 @@ class Replay:
         return [*texts, *automata_attachments(self.automata, REPLAYED_PREFIX)]
 
     def layout(self) -> Attachment:
-        """Return the viewer layout of the annotated log; call it after `run`."""
+        """Return the viewer layout of the annotated log. It needs a finished `run`."""
         planner_file = planned_for(self._source, self.files)
         return self._evaluation.layout(
             self._topics,
@@ -502,7 +509,10 @@ class Replay:
         )
 
     def _shown_start(self) -> tuple[int, str]:
-        """Return time and log of the first message in a viewer: of this log or the source next to it."""
+        """Return the time of the first message that a viewer shows, and the name of the message's log.
+
+        An annotated log without the source's messages is opened next to the source.
+        """
         is_bag = self._selection.options.keep == () and not isinstance(self._source, McapSource)
         start_ns = first_message_ns(self._source) if self._is_beside or is_bag else None
         return (self._start_ns, "this log") if start_ns is None else (start_ns, self._source.name)
@@ -523,12 +533,12 @@ class Replay:
             if self._keep_series or self._keep_leaves:
                 kept_blocks = self._kept[result_index]
                 kept_blocks.append(self._kept_part(stretch))
-                # joined arrays lie in temporary files: 0.25 instead of 0.64 GB for a million samples
+                # joined arrays are in temporary files: a million samples take 0.25 instead of 0.64 GB
                 while len(kept_blocks) > 1 and len(kept_blocks[-2].times_ns) <= len(kept_blocks[-1].times_ns):
                     kept_blocks[-2:] = [join_blocks(kept_blocks[-2:])]
 
     def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
-        """Return a stretch with only those arrays that are kept."""
+        """Return a stretch with series and leaves, which are empty if they are not kept."""
         series = stretch.series if self._keep_series else np.empty((len(stretch.series), 4, 0))
         leaves = stretch.leaves if self._keep_leaves else np.empty((1, stretch.leaves.shape[1], 0))
         return SeriesBlock(stretch.times_ns, series, leaves)
@@ -560,7 +570,7 @@ class Replay:
 
 
 def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trace, list[SeriesBlock]]:
-    """Return samples with the part of each stretch at their times."""
+    """Return samples and the part of each stretch at the times of these samples."""
     if not len(trace):
         return trace, [stretch.between(0, 0) for stretch in stretches]
     first_ns, last_ns = trace.times_ns[[0, -1]].tolist()
@@ -568,7 +578,7 @@ def with_stretches(trace: Trace, stretches: Sequence[SeriesBlock]) -> tuple[Trac
 
 
 class _KeptTraces:
-    """The samples of a short log, kept so that explanations need not read it again."""
+    """The samples of a short log in memory. Explanations of longer logs read the log again."""
 
     def __init__(self, selection: Selection, most_bytes: int) -> None:
         self._selection = selection
@@ -590,7 +600,7 @@ class _KeptTraces:
 
 
 def dropped_samples(source: Source) -> Dropped:
-    """Return the dropped samples of a recorder, and its interruption, from a log's metadata."""
+    """Return the dropped samples and the interruption of a recording from the log's metadata."""
     ending = dict(source.metadata()).get(ENDING, {})
     count_texts = [ending.get(name, "0") for name in ("samples", "dropped")]
     # the metadata of a log may be any text; 18 digits fit into 64 bits
@@ -617,12 +627,12 @@ def replayed_specs(
     """Return the results of streams after the last sample.
 
     Args:
-        trees: the results, with their reported names.
+        trees: formula tree and reported name of each stream.
         blocks: all samples of each stream as one block; None if nothing was kept.
         traces: function that reads the samples again.
-        zero_ns: zero of times in sentences.
+        zero_ns: time that sentences count from.
         units: declared units, see `unit_of`.
-        has_series, has_leaves: whether the blocks hold the numbers, and the atoms.
+        has_series, has_leaves: whether the blocks have series, and whether they have leaves.
         doubts: doubts about the log.
     """
     doubts_by_result = doubts_of_instances([stream.instance for stream in streams], doubts, traces)
@@ -647,17 +657,17 @@ _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 
 
 def plan_of(source: Source) -> Mapping[str, str]:
-    """Return the metadata of the plan that a log was recorded with; empty without any."""
+    """Return the metadata of the plan that was recorded with a log; empty without a plan."""
     return dict(source.metadata()).get(PLAN_METADATA, {})
 
 
 def planned_result(source: Source) -> str:
-    """Return the name of the result that a planner worked for; "" without any."""
+    """Return the name of the result that was the planner's goal; "" without a plan."""
     return plan_of(source).get("specification", "")
 
 
 def planned_for(source: Source, files: Sequence[Specification]) -> str:
-    """Return the name of the planner's specification file if none of these has its meaning; else ""."""
+    """Return the name of the planner's specification file; "" if an evaluated file has the same meaning."""
     file_name = plan_of(source).get("file", "")
     text_by_name = {
         attachment.name: attachment.data.decode("utf-8", "replace") for attachment in source.attachments()
@@ -686,16 +696,17 @@ def run_replay(
     """Evaluate specifications over a source, and write the annotated log if an output is given.
 
     Equal sources, specifications and options give equal results and an equal file. A replay of an annotated
-    log gives the same as a replay of its source.
+    log equals a replay of the log's source.
 
     Args:
-        keep_series: keep every sample's numbers in memory.
-        keep_leaves: keep every sample's atoms in memory, for witnesses and signals.
+        keep_series: whether the robustness of all nodes at each sample is kept in memory.
+        keep_leaves: whether the values of all atoms at each sample are kept, for witnesses and signals.
         output: path of the annotated log; an existing file is replaced only when the log is complete.
         inputs: files that the output must not overwrite.
-        layer: leave the source's own messages, metadata and attachments out of the output.
-        certify: hash inputs and results, for which messages are read, too; always done with an output.
-        advance: called with the number of samples of each block that is done.
+        layer: whether the source's own messages, metadata and attachments are left out of the output.
+        certify: whether inputs and results are hashed, which also reads the messages. With an output, they
+            are always hashed.
+        advance: function that is called with the number of samples of each evaluated block.
 
     Raises:
         UsageError: an option is invalid, the window has no sample, or the output is an input.
@@ -715,7 +726,7 @@ def run_replay(
     )
     if output is None:
         return replay.run(advance=advance)
-    # imported here since a replay without an annotated log needs no writer
+    # imported here, because a replay without an annotated log needs no writer
     from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
     from spatial_replay.logs.output_file import replacing
 
@@ -751,15 +762,15 @@ def load_files(
     *,
     constants: Mapping[str, float | str] | None = None,
 ) -> list[Specification]:
-    """Load the named specifications; without any, the specifications in the log.
+    """Load the specifications at given paths, or the log's own specifications without a path.
 
-    A replayed log has the specifications of the last replay, and another log those of the recording.
+    A replayed log has the specifications of its last replay. Other logs have the recorded specifications.
 
     Args:
         constants: values that replace those in the specifications, see `load_specifications`.
 
     Raises:
-        UsageError: no specification is named or in the log, or no specification has one of the constants.
+        UsageError: no path is given and the log has no specification, or a constant is in no specification.
         SpecificationError: a specification has errors.
     """
     specifications: Sequence[Path | SpecificationText] = tuple(dict.fromkeys(paths)) or recorded_texts(source)
@@ -771,7 +782,7 @@ def load_files(
 def recorded_texts(source: Source) -> list[SpecificationText]:
     """Return the texts of the specifications in a log.
 
-    A replayed log has the specifications of the last replay, and another log those of the recording.
+    A replayed log has the specifications of its last replay. Other logs have the recorded specifications.
     """
     attachments = source.attachments()
     for prefix in (REPLAYED_PREFIX, RECORDED_PREFIX):
@@ -790,7 +801,7 @@ def recorded_texts(source: Source) -> list[SpecificationText]:
 def _begin(
     sink: Sink, source: Source, replay: Replay, options: ReplayOptions, zero_ns: int, *, layer: bool
 ) -> None:
-    """Write the metadata and the attachments, which come before the first message."""
+    """Write the metadata and the attachments, which an annotated log has before its first message."""
     source_record = dict(source.metadata()).get(METADATA, {})
     is_replayed = source_record.get("written_by") == "replay"
     record = {
@@ -828,7 +839,7 @@ def _copy_metadata(sink: Sink, source: Source) -> None:
 
 
 def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) -> dict[str, object]:
-    """Return the options that differ from the defaults, as `verification` reads them back."""
+    """Return the options that differ from the defaults, in the format that `verification` reads."""
     default_window = Window()
     recorded_options = dict(source.options)
     recorded_options |= {

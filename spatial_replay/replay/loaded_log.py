@@ -1,6 +1,6 @@
 """A log in memory, evaluated repeatedly with other values for the constants of its specifications.
 
-`LoadedLog` holds the log, `EditedFiles` the specifications with some values, and `Evaluated` their results.
+`LoadedLog` holds the log, `EditedFiles` the edited specifications, and `Evaluated` their results.
 `OwnMessages` holds the log's own messages, and `Playback` plays all messages.
 """
 
@@ -62,21 +62,21 @@ from spatial_replay.trace.trace import Trace, within
 
 _FEW: Final = 2_000
 _FEW_BYTES: Final = 1 << 26
-"""Limits of messages kept in memory: messages of one topic, and bytes of all such topics."""
+"""Limits of the topics that are kept in memory: messages per topic, and bytes of all these topics."""
 
 _PIECE: Final = 256
 """Samples per encoded piece."""
 
 
 class OwnMessages:
-    """The messages of a copy of a log: its own messages, and encoded samples if it has none of them.
+    """The messages of a copy of a log: the log's own messages, and its samples if no message contains them.
 
     Topics with few messages (a map, a transform) are kept in memory, because viewers show a message until the
-    next one of its topic. The other topics are read again for playback.
+    topic's next message. The other topics are read again for playback.
 
     Attributes:
-        channels: in the order of their first messages.
-        start_ns, end_ns: times of the first and the last message or sample; 0 and -1 if there are none.
+        channels: channels in the order of their first messages.
+        start_ns, end_ns: times of the first and the last message or sample; 0 and -1 for an empty log.
     """
 
     def __init__(self, selection: Selection) -> None:
@@ -104,14 +104,14 @@ class OwnMessages:
             # the end is tested, because a log may begin at 0
             self._samples_ns = (span_start_ns if span_end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
         self._count(messages)
-        # a log without messages is played from memory; others are read again
+        # a log without messages is played from memory; other logs are read again
         if self._counts:
             self._samples = []
         else:
             self._samples.append(block.trace)
 
     def iter_from(self, start_ns: int) -> Iterator[Messages]:
-        """Read the messages at or after a time, in order, in pieces of bounded size.
+        """Read the messages at or after a time in the order of time, in pieces of limited size.
 
         Raises:
             LogError: the log can no longer be read.
@@ -123,7 +123,7 @@ class OwnMessages:
             first_sample += len(selection.inside(block.trace))
 
     def few_before(self, time_ns: int) -> Messages:
-        """Return the last message before a time of each topic with few messages."""
+        """For each topic in memory, return the last message before a time."""
         earlier_messages = [
             select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
             for channel_pieces in self._few.values()
@@ -132,7 +132,7 @@ class OwnMessages:
         return latest_messages(merge(earlier_messages), time_ns)
 
     def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
-        """Read the log from a time on. A log of samples only is read from memory, in small pieces."""
+        """Read the log from a time on. A log without messages is read from memory, in small pieces."""
         if self._counts:
             for block in read_blocks(self._selection.source, start_ns, self._selection.window.end_ns):
                 # trimmed samples at the ends of the log are left out
@@ -166,7 +166,7 @@ class OwnMessages:
 
 
 class MessageCursor:
-    """A position in a log's own messages, which moves forward."""
+    """A position in a log's own messages. It only moves forward."""
 
     def __init__(self, own_messages: OwnMessages, start_ns: int) -> None:
         self._pieces = own_messages.iter_from(start_ns)
@@ -175,7 +175,7 @@ class MessageCursor:
         self._is_over = False
 
     def take_before(self, end_ns: int) -> Messages:
-        """Return the remaining messages before a time.
+        """Move to a time, and return the messages before it that are not returned yet.
 
         Raises:
             LogError: the log can no longer be read.
@@ -193,7 +193,7 @@ class MessageCursor:
 
 
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
-    """Return the messages of each channel from a time on; if it has none, its last message before."""
+    """Return each channel's messages from a time on, or else the channel's last message."""
     # the first index of a channel in reversed order is its last message
     _, reversed_rows = np.unique(messages.channel[::-1], return_index=True)
     is_shown = messages.log_time_ns >= time_ns
@@ -211,18 +211,18 @@ def _size(messages: Messages) -> int:
 
 
 MOST_NUMBERS: Final = 1 << 27
-"""Limit of numbers in an evaluation, which has four per node and sample: 1 GiB."""
+"""Maximum number of values in an evaluation, four per node and sample: 1 GiB."""
 
 
 @dataclass(frozen=True, slots=True)
 class EditedFiles:
-    """The specifications with some values for their constants.
+    """The specifications with edited constants.
 
     Attributes:
         loaded: the evaluated log.
-        files: specifications as a log stores them.
-        given: values that replace those in the text.
-        constants: all values, by the names of `LoadedLog.constants`.
+        files: edited specifications, as an annotated log stores them.
+        given: edited values, by name.
+        constants: all constants after the edits, by the names in `LoadedLog.constants`.
     """
 
     loaded: LoadedLog
@@ -232,22 +232,22 @@ class EditedFiles:
 
 
 class LoadedLog:
-    """A log in memory, with the specifications whose constants are changed.
+    """A log in memory, with specifications whose constants can be edited.
 
-    Measurements between footprints are cached, so that a change computes only the new ones.
+    Measurements between footprints are cached, so an edit computes only new measurements.
 
     Attributes:
         name: the log's name.
         options: options of the evaluation.
         constants: constants of the specifications as written, by the names that edits use.
-        trace: all samples that are read, also those before the window that operators look back at.
+        trace: all read samples, including samples before the window that operators look back at.
         inside: samples in the window.
         own: the log's own messages.
         faults, remarks: losses while reading, and other remarks of the source.
         doubts: assumptions that the log contradicts.
         missing: a warning for each missing name in the specifications.
         dropped: samples that the recorder dropped.
-        plan: metadata of the plan that was recorded with the log; empty without one.
+        plan: metadata of the plan that was recorded with the log; empty without a plan.
     """
 
     def __init__(
@@ -262,8 +262,8 @@ class LoadedLog:
         """Read the log.
 
         Args:
-            saved: files of the specifications, if constants may be written into them.
-            advance: called with the number of samples of each block that is read.
+            saved: files of the specifications, if constants may be written into these files.
+            advance: function that is called with the number of samples of each read block.
 
         Raises:
             LogError: the log has no sample, or cannot be read.
@@ -304,7 +304,7 @@ class LoadedLog:
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
-        """Return the log with other specifications, and with the samples and measurements in memory.
+        """Return the log with other specifications. Both share the samples and the cached measurements.
 
         The log is read again if only the new specifications look back at samples before the window. A log
         with trimmed ends is also read again if the new specifications name other objects or signals.
@@ -333,7 +333,8 @@ class LoadedLog:
             The changed values.
 
         Raises:
-            UsageError: the files may not be written, a constant is missing, or a save has changed one since.
+            UsageError: the files may not be written, a constant is missing, or a later save changed a
+                constant.
             SpecificationError, MissingFileError, OutputError: see `write_constants`.
         """
         if self._saved is None:
@@ -343,7 +344,7 @@ class LoadedLog:
         return self._saved.write(self._by_file(values), self._files)
 
     def was_written(self, name: str) -> bool:
-        """Return whether a constant has the value in its file that `write_constants` wrote."""
+        """Return whether a constant's file still has the value that `write_constants` wrote."""
         return self._saved is not None and self._saved.was_written(*self._places[name])
 
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
@@ -357,8 +358,8 @@ class LoadedLog:
         """Return the specifications with other values for some constants. Only changed files are parsed.
 
         Args:
-            values: numbers, and durations as texts ("2s"), by name; other constants keep their written
-                values.
+            values: numbers, or durations as texts ("2s"), by name of a constant. Other constants keep their
+                written values.
 
         Raises:
             UsageError: a constant is missing, or a value is of another kind.
@@ -409,7 +410,7 @@ class LoadedLog:
         )
 
     def _place(self, name: str, value: object) -> tuple[int, str]:
-        """Return the number of a constant's file and its name there, after a check of the value's kind."""
+        """Check the kind of a constant's value, and return the index of its file and its name in the file."""
         if name not in self._places:
             constant_names = tuple(self._places)
             hint = (
@@ -444,13 +445,13 @@ _MOST_NAMED: Final = 5
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """An evaluation of the whole log with some values for the constants.
+    """An evaluation of the whole log with edited constants.
 
     Attributes:
-        edited: the specifications with these values.
-        selection: the samples in memory.
+        edited: the specifications with edited constants.
+        selection: selection of the samples in memory.
         evaluation: the evaluation after the last sample.
-        stretches: all samples, for each of its trees.
+        stretches: numbers of all samples, one stretch for each tree of `evaluation`.
     """
 
     loaded: LoadedLog
@@ -466,7 +467,7 @@ class Evaluated:
 
     @cached_property
     def replayed(self) -> Replayed:
-        """The results as those of a replay; without a certificate, since no log is written."""
+        """The results in the form of a replay. They have no certificate, because no log is written."""
         loaded = self.loaded
         times_ns = loaded.inside.times_ns
         return Replayed(
@@ -513,7 +514,7 @@ class Evaluated:
 
     @property
     def summary(self) -> str:
-        """The verdicts of the results, the worst first, and the constants that differ from the text."""
+        """A text with the verdicts of the results, the worst first, and with the edited constants."""
         sorted_results = [self.replayed.results[index] for index in worst_first(self.replayed.results)]
         text = "; ".join(map(_result_text, sorted_results[:_MOST_NAMED])) or "the template matched no objects"
         if len(sorted_results) > _MOST_NAMED:
@@ -540,7 +541,7 @@ class Evaluated:
         return layout_attachment(contents, live=True)
 
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
-        """Return the samples in the window from number `begin` to before `end`, with their evaluation."""
+        """Return samples in the window with their evaluation, from index `begin` to before `end`."""
         return with_stretches(self.loaded.inside.slice(begin, end), self.stretches)
 
 
@@ -562,7 +563,10 @@ def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]
 
 
 def _places(files: Sequence[Specification]) -> dict[str, tuple[int, str]]:
-    """Return the file number and the name of each constant. Names in two files get their file's stem."""
+    """Return the file index and the name of each constant, by unique name.
+
+    Names that several files have begin with the stem of the file.
+    """
     all_names = [name for file in files for name in file.constants]
     return {
         f"{PurePath(file.filename).stem}.{name}" if all_names.count(name) > 1 else name: (
@@ -583,8 +587,8 @@ def _edit_file(file: Specification, values: Mapping[str, float | str]) -> Specif
 def _storable(edited: Specification, written: Specification, stored: Specification) -> Specification:
     """Return an edited specification as a log stores it, with the new values in its text.
 
-    Messages refer to nodes by their place in the text. If the log stores a canonical text, the canonical text
-    of the edited specification is parsed to get the places.
+    Messages refer to nodes by places in the text. If the log stores a canonical text, the canonical text of
+    the edited specification is parsed for its places.
 
     Args:
         stored: the written specification as a log stores it.
@@ -611,20 +615,20 @@ _MOST_CHANGES: Final = 100
 class Playback:
     """The messages that an annotated log would have, in the order of time.
 
-    After a seek, the messages equal those of a replay, for any division into stretches. Only the scene
-    differs: it is drawn again at once, and entities of another time are deleted.
+    After a seek, the messages equal the messages of a replay, for any sequence of `advance_to`. Only the
+    scene differs: a seek draws it again, and deletes entities of other times.
 
     Attributes:
-        evaluated: the evaluation; another one of the same log may replace it before a `seek`.
+        evaluated: the evaluation. Another evaluation of the same log may replace it before a `seek`.
         start_ns, end_ns: times of the first sample, and of the last sample or message of the log.
-        arrow: the title of the result whose violation the scene points at, from the next `seek` on; "" for
-            the first one.
-        time_ns: the time up to which messages were taken, inclusive.
-        past: states of results at the last changes before the sample of the last `seek`, by time.
+        arrow: title of the result whose violation the scene points at; "" for the first result. The next
+            `seek` applies a change.
+        time_ns: time up to which messages were returned, inclusive.
+        past: messages with the latest changes of results before the last `seek`, by time.
     """
 
     def __init__(self, evaluated: Evaluated) -> None:
-        """Start before the first message. Call `seek` before anything else."""
+        """Start before the first message. The first call must be `seek`."""
         log_messages = evaluated.loaded.own
         self._times_ns = evaluated.loaded.inside.times_ns
         self.start_ns, self.end_ns = int(self._times_ns[0]), log_messages.end_ns
@@ -658,10 +662,10 @@ class Playback:
         )
 
     def seek(self, time_ns: int) -> Messages:
-        """Go to a time, and return the messages that a viewer shows at it.
+        """Go to a time, and return the messages that a viewer shows at that time.
 
         These are the messages of the last sample, the specification, the latest events, and the last message
-        of each of the log's own topics. `past` has the states of results before that sample.
+        of each of the log's own topics. `past` then has the changes of results before that sample.
 
         Raises:
             LogError: the log can no longer be read.
@@ -686,7 +690,7 @@ class Playback:
         return join([shown_messages, _last(self._end())])
 
     def advance_to(self, time_ns: int) -> Messages:
-        """Return the remaining messages up to a time, inclusive.
+        """Play up to a time, inclusive, and return the messages since the last call.
 
         Raises:
             LogError: the log can no longer be read.
@@ -699,19 +703,19 @@ class Playback:
         return join([next_messages, self._end()])
 
     def reach_ns(self, samples: int) -> int:
-        """Return the time of the sample a number of samples after the last one taken, or the end."""
+        """Return the time that is a number of samples ahead; the end of the log if it has fewer samples."""
         sample_index = self._next + samples - 1
         return int(self._times_ns[sample_index]) if sample_index < len(self._times_ns) else self.end_ns
 
     def _end(self) -> Messages:
-        """Return the messages at the end of the log, once it is reached."""
+        """Return the final messages once, when the end of the log is reached."""
         if self._has_ended or self.time_ns < self.end_ns:
             return Messages()
         self._has_ended = True
         return merge(self._annotator.end(self.end_ns, self.evaluated.evaluation.finals))
 
     def _seek_own(self, sample_ns: int) -> Messages:
-        """Return the log's latest own message of each topic, and all its messages at the present time."""
+        """Return the latest of the log's own messages of each topic, and all own messages at `time_ns`."""
         log_messages = self.evaluated.loaded.own
         since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), log_messages.start_ns)
         self._own = MessageCursor(log_messages, since_ns)

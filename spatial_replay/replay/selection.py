@@ -45,18 +45,18 @@ if TYPE_CHECKING:
 
 
 KEEP_ALL: Final = (ALL,)
-"""Default selection of a copy."""
+"""Topics that a copy keeps by default: all."""
 
 _DECIMAL: Final = re.compile(r"\d{1,19}", re.ASCII)
 CLIP_METADATA: Final = "spatial_replay_clip"
-"""Metadata record of a clip with its origin."""
+"""Name of the metadata record that describes a clip's origin."""
 
 
 def default_keep(source: Source) -> tuple[str, ...]:
-    """Return the messages of a source that an annotated log keeps: none of ROS 2, else all.
+    """Return the topics of a source that an annotated log keeps: none for ROS 2, else all.
 
-    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. Therefore the bag is
-    unchanged, and the annotated log is opened next to it.
+    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` does not play such a file.
+    Therefore the annotated log is opened next to the unchanged bag.
     """
     reader = _external(source)
     return () if reader is not None and reader.profile == "ros2" else KEEP_ALL
@@ -66,8 +66,8 @@ def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
     """Return a source whose blocks hold the samples and the messages that a copy keeps.
 
     Args:
-        keep: "all", "mapped" for the topics of the samples, or patterns of topics such as "/camera/*";
-            several are combined. None leaves the source unchanged.
+        keep: "all", "mapped" for the topics of the samples, or patterns of topics such as "/camera/*".
+            Several entries are combined. None leaves the source unchanged.
 
     Raises:
         UsageError: no topic of the log fits a pattern.
@@ -102,11 +102,11 @@ def _topics(source: Source) -> list[str]:
 
 
 def _external(source: Source) -> MessageReader | None:
-    """Return a reader of the messages that a mapping reads; None for other sources."""
+    """Return a reader of a source's external log; None for sources without a mapping."""
     path = source.path
     if not hasattr(source, "mapping") or not isinstance(path, LogFile):
         return None
-    # readers of external logs are loaded when there is one
+    # readers of external logs are imported only for such a log
     from spatial_replay.bags.open import open_messages
 
     return open_messages(path)
@@ -114,7 +114,7 @@ def _external(source: Source) -> MessageReader | None:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """The samples to evaluate: every `every`th of the log, from `start_ns` to before `end_ns`."""
+    """The samples to evaluate: one in `every` samples of the log, from `start_ns` to before `end_ns`."""
 
     start_ns: int = 0
     end_ns: int = FOREVER
@@ -139,11 +139,11 @@ class ReplayOptions:
         window: the samples to evaluate.
         each: objects for each parameter of a template: "all", "class:NAME" or a name.
         semantics: "ltlf", or "paper": Def. 16 of the paper to the letter.
-        strict_names: whether missing names are errors; otherwise missing objects and signals are unknown, and
+        strict_names: whether missing names are errors. Otherwise missing objects and signals are unknown, and
             a template has no result for a missing class.
         keep: messages of the log that a copy keeps: "all", "mapped", or patterns of topics; () for samples
-            only. None is `default_keep` for a copy, and otherwise leaves the source unchanged.
-        arrow: the title of the result whose violation the scene points at; "" for the first one.
+            only. For a copy, None stands for `default_keep`; otherwise it leaves the source unchanged.
+        arrow: title of the result whose violation the scene points at; "" for the first result.
     """
 
     window: Window = Window()
@@ -157,7 +157,7 @@ class ReplayOptions:
 DEFAULT_OPTIONS = ReplayOptions()
 
 _FIRST_NS = 10**8
-"""Time after a log's first message that is searched for the first sample, nanoseconds."""
+"""Duration after a log's first message in which the first sample is searched, nanoseconds."""
 
 
 def look_before(files: Sequence[Specification]) -> bool:
@@ -173,7 +173,7 @@ def first_sample_ns(source: Source) -> int:
     """
     source = source.keeping()
     begin_ns = source.begin_ns
-    # first the begin of the log, if its index gives the time; then the whole log
+    # if the index has the log's begin, a short part is read before the whole log
     for end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
         for block in read_blocks(source, None, end_ns):
             if len(block.trace):
@@ -182,7 +182,7 @@ def first_sample_ns(source: Source) -> int:
 
 
 def named_zero_ns(source: Source) -> int | None:
-    """Return the zero in a log's metadata: the first sample of the log that it was cut from."""
+    """Return the zero in a log's metadata: the time of the original log's first sample, or None."""
     records = dict(source.metadata())
     for record_name in (METADATA, CLIP_METADATA):
         zero_text = records.get(record_name, {}).get(ZERO, "")
@@ -192,7 +192,7 @@ def named_zero_ns(source: Source) -> int | None:
 
 
 def zero_ns(source: Source) -> int:
-    """Return the zero of times in texts about a log: the zero in its metadata, or its first sample.
+    """Return the time that texts about a log count from: the zero in its metadata, or its first sample.
 
     Raises:
         LogError: the log has no sample.
@@ -202,18 +202,18 @@ def zero_ns(source: Source) -> int:
 
 
 def first_message_ns(source: Source) -> int | None:
-    """Return the time of a log's first message, if its index says so."""
+    """Return the time of a log's first message, in nanoseconds; None if no index has it."""
     path = source.path
     if not isinstance(path, LogFile) or not (isinstance(source, McapSource) or hasattr(source, "mapping")):
         return None
-    # readers of external logs are loaded when there is one
+    # readers of external logs are imported only for such a log
     from spatial_replay.bags.open import open_messages
 
     return open_messages(path).start_ns
 
 
 def log_zero_ns(source: Source, window: Window, ends: RunEnds) -> int:
-    """Return the zero of a log whose samples were read, see `zero_ns`."""
+    """Return the zero of a log whose samples were read (see `zero_ns`)."""
     if window.start_ns or ends.begin_ns is None:
         return known_zero_ns(source)
     recorded_zero_ns = named_zero_ns(source)
@@ -238,7 +238,7 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
     """Return a time on the clock of a log.
 
     Raises:
-        LogError: the time counts from a sample, and the log has none.
+        LogError: the time counts from a sample, and the log has no sample.
     """
     if point.origin == "last sample":
         return point.absolute_ns(last_ns=last_sample_ns(source))
@@ -248,11 +248,11 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
 def window_from_points(
     source: Source, start: TimePoint | None, end: TimePoint | None, every: int = 1
 ) -> Window:
-    """Return the window from `start` to before `end`; None is an end of the log.
+    """Return the window from `start` to before `end`; None stands for that end of the log.
 
     Raises:
         UsageError: the window is empty.
-        LogError: a time counts from a sample, and the log has none.
+        LogError: a time counts from a sample, and the log has no sample.
     """
     whole_log = Window()
     start_ns = whole_log.start_ns if start is None else absolute_ns(start, source)
@@ -299,7 +299,7 @@ class LogNames:
         return frozenset(self.objects), frozenset(self.signals), frozenset(self.classes)
 
     def check(self, file: Specification, each: Mapping[str, str]) -> tuple[Diagnostic, ...]:
-        """Compare the names in a specification with the names in the log, see `check_names`."""
+        """Compare the names in a specification with the names in the log (see `check_names`)."""
         objects, signals, classes = sorted(self.objects), sorted(self.signals), sorted(self.classes)
         return check_names(file, objects, signals, classes=classes, each=each)
 
@@ -309,7 +309,7 @@ class CheckedTrace(NamedTuple):
 
     Attributes:
         missing: a warning for each missing name.
-        zero_ns: zero of times in texts about the log.
+        zero_ns: time that texts about the log count from.
     """
 
     trace: Trace
@@ -319,16 +319,16 @@ class CheckedTrace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The part of a source that specifications are evaluated over; it can be read any number of times.
+    """The part of a source that specifications are evaluated over. It can be read any number of times.
 
     Attributes:
-        files: specifications; samples before the window that they look back at are read, too.
+        files: specifications. If they look back at samples before the window, these samples are read, too.
         needs: names in the specifications.
         looks_back: whether the specifications look back at samples before the window.
 
     Raises:
-        UsageError: no template has a given parameter, the semantics lack an operator, or a time window may
-            lie between two samples of a pause (`max_gap`).
+        UsageError: no template has a given parameter, the semantics lack an operator, or a time window fits
+            between two samples of a pause (`max_gap`).
     """
 
     source: Source
@@ -350,10 +350,10 @@ class Selection:
         checked_semantics(self.options.semantics, self.files)
 
     def over(self, source: Source) -> Selection:
-        """Return the same part of another log.
+        """Return the selection for another log.
 
         Raises:
-            UsageError: a time window may lie between two samples of a pause (`max_gap`).
+            UsageError: a time window fits between two samples of a pause (`max_gap`).
         """
         _check_windows(self.files, source.max_gap_ns or 0)
         selection = copy(self)
@@ -365,16 +365,18 @@ class Selection:
         return self.options.window
 
     def run_ends(self) -> RunEnds:
-        """Return the rule for the ends of the log; a start or an end of the window overrides it."""
+        """Return the rule for the ends of the log. A window's start or end overrides the rule."""
         return RunEnds(self.needs, start=not self.window.start_ns, end=self.window.end_ns >= FOREVER)
 
     def read_blocks(
         self, *, messages: bool = True, ends: RunEnds | None = None
     ) -> Generator[tuple[Block, Trace], None, None]:
-        """Read each block with its samples in the window, and also before it if a specification looks back.
+        """Read each block and its samples in the window.
+
+        If a specification looks back or samples are thinned, samples before the window are read, too.
 
         Args:
-            messages: whether the blocks have to hold messages.
+            messages: whether the blocks need their messages.
             ends: a new result of `run_ends`, which callers can read afterwards.
         """
         ends = ends or self.run_ends()
@@ -390,7 +392,7 @@ class Selection:
             yield Block(Trace.empty(), remarks=remarks), Trace.empty()
 
     def _read_samples(self, *, messages: bool) -> Iterator[tuple[Block, Trace]]:
-        """Read each block, with every Nth of its samples."""
+        """Read each block, and every Nth of its samples."""
         window = self.window
         # every Nth sample is counted from the log's first sample, independent of the window
         reads_from_start = self.looks_back or window.every > 1
@@ -407,17 +409,17 @@ class Selection:
             yield block, trace
 
     def iter_traces(self, ends: RunEnds | None = None) -> Iterator[Trace]:
-        """Read the samples of `read_blocks`."""
+        """Read the samples that `read_blocks` yields, with the doubts of their blocks."""
         for block, trace in read_ahead(self.read_blocks(messages=False, ends=ends)):
             yield replace(trace, doubts=block.doubts) if block.doubts else trace
 
     def trace(
         self, advance: Callable[[int], None] = lambda samples: None, ends: RunEnds | None = None
     ) -> Trace:
-        """Read the samples of `read_blocks` as one trace.
+        """Read the samples that `read_blocks` yields, as one trace.
 
         Args:
-            advance: called with the number of samples of each block.
+            advance: function that is called with the number of samples of each block.
             ends: see `read_blocks`.
         """
         if isinstance(self.source, MemorySource) and self.window.is_whole and not self.source.trace.spans:
@@ -431,7 +433,7 @@ class Selection:
         return replace(Trace.concatenate(traces), units=self.source.axes.units)
 
     def checked_trace(self, advance: Callable[[int], None]) -> CheckedTrace:
-        """Return the trace with a warning for each missing name, see `missing_names`.
+        """Return the trace with a warning for each missing name (see `missing_names`).
 
         Raises:
             LogError, UsageError: the window has no sample.
@@ -449,21 +451,21 @@ class Selection:
         return within(trace, self.window.start_ns, self.window.end_ns)
 
     def own_messages(self, block: Block, first: int) -> Messages:
-        """Return the source's messages in the window, and encoded samples if it has no messages of them.
+        """Return a block's messages in the window. Samples are encoded if no message contains them.
 
         Args:
-            first: the number of the block's first sample in the window.
+            first: number of samples in the window before the block.
         """
         messages = block.messages
         window_messages = messages.within(self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
-            # the source orders messages of one time by its own channel numbers, and `merge` by content
+            # the source orders messages of equal time by channel number; `merge` orders them by content
             return merge([window_messages])
         trace = self.inside(block.trace)
         return merge([window_messages, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
-        """Return the instances of a specification. For templates, the source is read to find objects.
+        """Return the instances of a specification. If there are templates, the source is read for objects.
 
         Raises:
             UsageError: the objects of a template are not given.
@@ -478,7 +480,7 @@ class Selection:
         """Return a warning for each missing object, signal and class of the specifications.
 
         Args:
-            names: names in the window.
+            names: names in the evaluated samples.
 
         Raises:
             SpecificationError: a name is missing, and names are strict.
@@ -498,7 +500,7 @@ class Selection:
         """Return the error for a window without any sample.
 
         Args:
-            faults: faults of the log so far.
+            faults: faults of the log until now.
         """
         log_name = self.source.name
         block_spans_ns = [
@@ -532,7 +534,7 @@ def _trim(block: Block, ends: RunEnds) -> Block:
 
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
-    """Check that no time window can lie between two samples that fill a pause."""
+    """Check that no time window fits between two samples of a pause."""
     if not max_gap_ns:
         return
     sample_step_ns = max_gap_ns // SAMPLES_A_GAP
@@ -549,7 +551,13 @@ def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
 
 @dataclass(frozen=True)
 class _ClippedSource(SourceOf):
-    """A log from one time to before another, preceded by the earlier messages that are still valid."""
+    """A log between two times, preceded by the earlier messages that are still valid.
+
+    Attributes:
+        start_ns, end_ns: begin of the part, and its exclusive end.
+        latched: last message of each topic before the part (see `_last_before`).
+        about: metadata record of the clip.
+    """
 
     start_ns: int
     end_ns: int
@@ -563,7 +571,7 @@ class _ClippedSource(SourceOf):
         if len(self.latched) and (start_ns or 0) <= self.start_ns:
             yield Block(Trace.from_samples(()), self.latched)
         for block in self.source.iter_blocks(read_start_ns, read_end_ns):
-            # an external log is read from before the window, to find the values valid in it
+            # an external log is read from before the window, to find the values at its start
             yield replace(block, messages=block.messages.within(read_start_ns, read_end_ns))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
@@ -573,10 +581,10 @@ class _ClippedSource(SourceOf):
 
 
 def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
-    """Return the part of a log that a clip has, by the clip's metadata.
+    """Return the part of a log that a clip contains, by the clip's metadata.
 
     Args:
-        about: metadata record of the clip: the times of its first and last sample, and the kept topics.
+        about: metadata record of the clip: times of the clip's first and last sample, and the kept topics.
 
     Raises:
         LogError: the record cannot be read.
@@ -588,12 +596,15 @@ def clipped_source(source: Source, about: Mapping[str, str]) -> Source:
         kept_source = source_keeping(source, tuple(map(str, kept_topics)))
     except (LookupError, TypeError, ValueError) as error:
         raise LogError(f"the metadata {CLIP_METADATA} of the clip cannot be read: {error}") from error
-    # the record has the time of the last sample, and a window ends before its end
+    # the record has the time of the last sample, but the end of the part is exclusive
     return _ClippedSource(kept_source, start_ns, end_ns + 1, _last_before(kept_source, start_ns), about)
 
 
 def _last_before(source: Source, start_ns: int) -> Messages:
-    """Return the last message of each topic before a time, or of each frame for transforms; no samples."""
+    """Return the last message of each topic before a time. Transforms have one message per frame.
+
+    Samples are left out.
+    """
     latest_messages: dict[tuple[Channel, str], Messages] = {}
     frame_readers: dict[Channel, Callable[[bytes], Sequence[str]]] = {}
     for messages in _messages_before(source, start_ns):
@@ -607,7 +618,7 @@ def _last_before(source: Source, start_ns: int) -> Messages:
                 message = select(messages, np.array([row]))
                 for frame in frame_readers[channel](message.payloads[0]):
                     latest_messages[channel, frame] = message
-    # one message may place several frames
+    # one message may have the transforms of several frames
     distinct_messages = {id(message): message for message in latest_messages.values()}
     return merge(list(distinct_messages.values()))
 
@@ -624,7 +635,7 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
 
 
 def _frame_names(channel: Channel) -> Callable[[bytes], Sequence[str]]:
-    """Return a function from a message to its child frames; other messages give one empty name."""
+    """Return a function that reads the child frames of a message, or [""] if the message has none."""
     schema_name = "" if channel.schema is None else channel.schema.name
     decode: Callable[[bytes], Any] | None = None
     if short_type(schema_name) in TRANSFORM_TYPES:

@@ -1,4 +1,4 @@
-"""Specification files of a running command: read again after saves, with constants that can be written."""
+"""Specification files of a running command, which reads them after saves and writes their constants."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from spatial_replay.spec.load import load_specification, load_specifications
 _MARK: Final = b"\xef\xbb\xbf"
 """Byte order mark of UTF-8, which some editors write."""
 _SETTLE_S: Final = 0.04
-"""Time without a change of size and times after which a file counts as saved, seconds."""
+"""A file counts as saved if its size and times are unchanged for this duration, seconds."""
 _ERROR_SETTLE_S: Final = 0.1
 """Further wait for a file that has errors or is missing, because an editor may be writing it, seconds."""
 _PATIENCE_S: Final = 1.0
 """Longest wait for a file that keeps changing, seconds."""
 _IDLE_MS: Final = 100
 _STEP_MS: Final = 10
-"""Timeout for a change, and wait for further changes after one, milliseconds."""
+"""Timeout of a wait for changes, and wait for further changes after a change, milliseconds."""
 
 
 _State: TypeAlias = tuple[int, int, int, int]
-"""Inode, size and times of a file; one of them differs after a save."""
+"""Inode, size (bytes), and times of modification and of status change (ns). A save changes at least one."""
 
 
 class SpecificationFiles:
     """Specification files that are read again when they are saved.
 
-    The object holds the last read state of the files, and the constants that were written into them. One
-    thread watches, and others may write.
+    The object holds the last read state of the files, and the constants that it wrote into the files. One
+    thread watches the files, and other threads may write constants.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class SpecificationFiles:
             MissingFileError, SpecificationError, UsageError: as `load_specifications`.
         """
         with self._turn:
-            # before the files are read, so that a save during the reading counts as a change
+            # states are read before the files, so that a save during the reading counts as a change
             self._read, self._sources = self._state(), []
             files = load_specifications(self.paths, constants=self._constants)
             self._sources = [file.source for file in files]
@@ -82,21 +82,21 @@ class SpecificationFiles:
             return files
 
     def was_written(self, index: int, name: str) -> bool:
-        """Return whether a constant has the value that `write` wrote, given the number of its file."""
+        """Return whether a constant of the file at an index still has the value that `write` wrote."""
         return (index, name) in self._written
 
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
-        """Yield the files after each save of another text, or the error if they cannot be read.
+        """Yield the files after each save that changes their text, or the error if they cannot be read.
 
         Between saves it yields None, about ten times a second. A file counts as saved after 0.04 s without a
-        change of size and times. A file with errors, or a missing one, gets 0.1 s more.
+        change of size and times. After a further 0.1 s, an invalid or missing file counts as an error.
 
         Raises:
             UsageError: the library that watches files is not installed.
         """
         with importing("--watch needs watchfiles", extra="live"):
             from watchfiles import watch
-        # a link and its target lie in different folders, and either may be saved
+        # a link and its target may be in different folders, and an editor may save either
         watched_paths = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
         file_names = {path.name for path in watched_paths}
         # folders are watched, because many editors replace a file instead of writing into it
@@ -114,11 +114,11 @@ class SpecificationFiles:
     def write(
         self, values: Sequence[Mapping[str, float | str]] = (), loaded: Sequence[Specification] = ()
     ) -> dict[str, float | str]:
-        """Write values of constants into the files, together with the values given at the start.
+        """Write values of constants into the files, together with the values given to the constructor.
 
         Args:
-            values: values by name for each of the files, in addition to those given at the start.
-            loaded: the files as they were loaded when the values were chosen.
+            values: new values by name, one mapping per file.
+            loaded: files for which the new values were chosen. Constants that were saved since are refused.
 
         Returns:
             The changed values by name.
@@ -160,7 +160,7 @@ class SpecificationFiles:
         loaded_constants: Mapping[str, Constant],
         saved_constants: Mapping[str, Constant],
     ) -> None:
-        """Refuse to overwrite a number that was saved by somebody else after the file was loaded."""
+        """Refuse to overwrite a value that another program saved after the file was loaded."""
         for name in new_names:
             constant = saved_constants.get(name)
             if constant not in (None, loaded_constants[name], self._written.get((file_index, name))):
@@ -170,7 +170,10 @@ class SpecificationFiles:
                 )
 
     def _wait_for_save(self) -> list[Specification] | SpatialReplayError | None:
-        """Return the saved files; None if their texts are unchanged, or if they keep changing."""
+        """Return the files once they are saved, or their error.
+
+        The result is None if the texts are unchanged, or if the files keep changing.
+        """
         previous_sources, deadline_s = self._sources, time.monotonic() + _PATIENCE_S
         while time.monotonic() < deadline_s:
             states = self._state()
@@ -191,7 +194,7 @@ class SpecificationFiles:
         return None
 
     def _state(self) -> list[_State | None]:
-        """Return the states of the files; None for a missing file."""
+        """Return the state of each file; None for a missing file."""
         states: list[_State | None] = []
         for path in self.paths:
             try:
@@ -207,15 +210,15 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
     """Write values of constants into a specification file, and change only these numbers.
 
     Args:
-        values: numbers, and durations as texts, by name; a value that the file already has is not rewritten.
+        values: numbers, or durations as texts, by name of a constant. Equal values are not written again.
 
     Returns:
         The names of the constants that changed.
 
     Raises:
         MissingFileError: the file cannot be read.
-        SpecificationError: the file has errors, now or with these values.
-        UsageError: a constant is missing, or is computed from others.
+        SpecificationError: the file has errors, before or after the change.
+        UsageError: a constant is missing, or is computed from other constants.
         OutputError: the file cannot be written.
     """
     try:
@@ -241,13 +244,13 @@ def write_constants(path: Path, values: Mapping[str, float | str]) -> tuple[str,
     byte_order_mark = _MARK if content.startswith(_MARK) else b""
     with replacing(path) as stream:
         stream.write(byte_order_mark + changed_file.source.encode("utf-8"))
-    # `replacing` makes a new file, which gets the mode of the old one
+    # `replacing` makes a new file, which gets the mode of the old file
     path.chmod(mode)
     return tuple(changed_values)
 
 
 def plain_values(file: Specification) -> dict[str, float | str]:
-    """Return the values of the constants that are not computed from others."""
+    """Return the values of the constants that are not computed from other constants."""
     return {
         name: constant_value(constant)
         for name, constant in file.constants.items()

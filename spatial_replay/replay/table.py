@@ -35,7 +35,7 @@ SECONDS = "seconds"
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
 _LONGEST_TEXT: Final = 60
-"""Characters of a node's text in a title."""
+"""Maximum length of a node's text in a title, characters."""
 _FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
 """Beginnings of cells that spreadsheets evaluate: https://owasp.org/www-community/attacks/CSV_Injection."""
 _Result: TypeAlias = tuple[str, str | None]
@@ -52,7 +52,7 @@ class TableRows:
         times_ns: (T,) int64.
         seconds: (T,), since the zero in the log's metadata, or else since the first row.
         numbers: (T, nodes); NaN where a node has no number or no sample.
-        states: possible states of each automaton after each sample: "2", "1|2" or "".
+        states: for each automaton, its possible states after each sample: "2", "1|2", or "" if not reported.
     """
 
     times_ns: Integers
@@ -96,7 +96,7 @@ def export_table(
 
 
 def check_table_name(output: Path) -> None:
-    """Raise UsageError if a file's name does not have the ending of a table."""
+    """Raise UsageError if a file's name ends in neither .csv nor .parquet."""
     if output.suffix.lower() not in _WRITERS:
         raise UsageError(
             f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
@@ -104,7 +104,7 @@ def check_table_name(output: Path) -> None:
 
 
 def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple[str, ...]]]:
-    """Read the robustness of a log block by block, with losses.
+    """Read the robustness of a log block by block, with the losses of each block.
 
     Raises:
         UsageError: the format of the log has no robustness.
@@ -123,10 +123,10 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
 
 
 def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]:
-    """Return the distinct titles of the columns of nodes and of automata.
+    """Return a distinct column title for each node, and for each automaton.
 
-    The title of a node lists the named specs on the path to it: `task/deliver`. A node without a name has the
-    title of the nearest named spec, followed by its own text.
+    A node's title lists the named specs on the path to the node: `task/deliver`. A node without a name has
+    the title of the nearest named spec, followed by the node's text.
     """
     node_names: dict[_Node, str | None] = {}
     faults: list[str] = []
@@ -166,7 +166,7 @@ def _result_title(result: _Result) -> str:
 
 
 def _claim_title(title: str, fallback: str, used_titles: set[str]) -> str:
-    """Return a title, or an alternative if a column has it already, and mark it as used."""
+    """Mark a title as used, and return it. If a column already has the title, an alternative is used."""
     candidates = chain(
         [title, f"{title} #{fallback.rpartition('#')[2]}", fallback],
         (f"{fallback} ({number})" for number in count(2)),
@@ -189,7 +189,7 @@ def _trees(source: Source) -> Mapping[_Result, SpecificationResult]:
 
 
 def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
-    """Return the title of each node of a tree; nodes come in the order of their numbers, parents first."""
+    """Return the title of each node by id. A tree lists its nodes by id, parents before their operands."""
     owners: dict[int, str] = {}
     titles: dict[int, str] = {}
     for node in tree.nodes:
@@ -205,14 +205,14 @@ def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
 
 
 def _payloads(source: Source, topic: str) -> Iterator[bytes]:
-    """Yield the payloads of a topic. Damage is reported with the robustness."""
+    """Yield the payloads of a topic. Losses are left out, because `_iter_series` reports them."""
     if isinstance(source, McapSource):
         for payloads, _ in source.iter_payloads(topic):
             yield from payloads
 
 
 def _iter_states(source: Source) -> Iterator[tuple[int, _Result, str]]:
-    """Yield time, result and states of each message about an automaton."""
+    """Yield the time, the result and the states of each readable message about an automaton."""
     for payload in _payloads(source, AUTOMATON):
         try:
             state = AutomatonState.FromString(payload)
@@ -254,7 +254,7 @@ def _iter_tables(
 
 
 def _text_cell(text: str) -> str:
-    """Return a text with an apostrophe before it if a spreadsheet would take it for a formula."""
+    """Return the text of a cell, with an apostrophe first if a spreadsheet would evaluate the text."""
     return f"'{text}" if text.startswith(_FORMULAS) else text
 
 

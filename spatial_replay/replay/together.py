@@ -1,4 +1,4 @@
-"""Many logs replayed with one plan. Short logs are measured together, and each has its own results."""
+"""Replays of many logs with one plan. Short logs are measured together, but each log has its results."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class ShortLog:
     """A log in memory, with its account.
 
     Attributes:
-        zero_ns: zero of times in sentences.
-        samples: number of evaluated samples, with those that fill pauses.
+        zero_ns: time that sentences count from.
+        samples: number of evaluated samples, including samples that fill pauses.
         nbytes: size of the samples, bytes.
     """
 
@@ -50,10 +50,10 @@ class ShortLog:
 class JointReplay:
     """Replays of the same specifications over many logs with the same units.
 
-    Results are equal to those of `Replay` with `keep_leaves`, to the bit.
+    All bits of the results equal the results of `Replay` with `keep_leaves`.
 
     Attributes:
-        trees: all results, with their reported names.
+        trees: formula tree and reported name of each result.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class JointReplay:
         """Prepare the specifications.
 
         Args:
-            source: a log, whose units all logs have to share.
+            source: one of the logs. All logs need its units.
 
         Raises:
-            UsageError: see `can_join`; or the semantics lack an operator.
+            UsageError: see `Selection`.
         """
         self._selection = Selection(source, files, options)
         self._plan = ReplayPlan.of(self._selection)
@@ -73,11 +73,11 @@ class JointReplay:
         self._units = source.axes.units
 
     def fits(self, source: Source) -> bool:
-        """Return whether a log has the units of the others."""
+        """Return whether a log has the units of the other logs."""
         return source.axes.units == self._units
 
     def read(self, source: Source) -> ShortLog | None:
-        """Read a log; None if it is too long.
+        """Read a log into memory. The result is None if the log is too long.
 
         Raises:
             LogError, UsageError: the log cannot be read, or has no sample.
@@ -104,7 +104,7 @@ class JointReplay:
         )
 
     def replay(self, logs: Sequence[ShortLog]) -> Iterator[Replayed]:
-        """Evaluate short logs, and yield the results of each.
+        """Evaluate short logs, and yield the results of each log.
 
         Raises:
             SpecificationError: a name is missing in a log, and names are strict.
@@ -140,7 +140,8 @@ class JointReplay:
 def can_join(files: Sequence[Specification], options: ReplayOptions) -> bool:
     """Return whether specifications can be measured over many logs at once.
 
-    Templates have different instances in each log, and terms that look back need earlier samples.
+    Windows, templates and terms that look back exclude it. Templates have different instances in each log,
+    and terms that look back need earlier samples.
     """
     has_templates = any(spec.parameter is not None for file in files for spec in file.results)
     return options.window.is_whole and not has_templates and not look_before(files)

@@ -57,7 +57,7 @@ _LONGEST_S = 120.0
 
 
 def statement(certificate: Mapping[str, str]) -> bytes:
-    """Return the signed text of a certificate: one entry per line, in the order of names."""
+    """Return the signed text of a certificate: one entry per line, sorted by name."""
     return "\n".join(
         [_HEADING, *(f"{key} {value}" for key, value in sorted(certificate.items())), ""]
     ).encode()
@@ -67,11 +67,12 @@ def sign_certificate(certificate: Mapping[str, str], key: Path) -> bytes:
     """Return a signature over a certificate.
 
     Args:
-        key: a private key of OpenSSH, or the public one of a key that ssh-agent or a token holds.
+        key: path of a private OpenSSH key. If ssh-agent or a token holds the private key, path of the public
+            key.
 
     Raises:
         MissingFileError: there is no such key.
-        UsageError: ssh-keygen is missing, or cannot sign with it.
+        UsageError: ssh-keygen is missing, or cannot sign with the key.
     """
     _require(key)
     signing = _ssh_keygen(["sign", "-f", str(key.resolve()), "-n", NAMESPACE], statement(certificate))
@@ -83,15 +84,15 @@ def sign_certificate(certificate: Mapping[str, str], key: Path) -> bytes:
 
 
 def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) -> str | None:
-    """Return the signer of a certificate among given signers; None if none of them signed it.
+    """Return the name of the signer of a certificate; None if no given signer signed it.
 
     Args:
-        signers: public keys, one a line, as in id_ed25519.pub or authorized_keys, or an allowed_signers file
-            of OpenSSH, with names before the keys.
+        signers: file with one public key per line, such as id_ed25519.pub, authorized_keys, or an
+            allowed_signers file of OpenSSH.
 
     Raises:
         MissingFileError: one of the files is missing.
-        UsageError: the file has no signers, or ssh-keygen is missing.
+        UsageError: `signers` has no public key, or ssh-keygen is missing.
     """
     for file in (signature, signers):
         _require(file)
@@ -111,7 +112,7 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
 
 
 def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
-    """Return the text of an allowed_signers file, and names for its principals of bare keys."""
+    """Return the text of an allowed_signers file, and the name of each principal that is made up here."""
     try:
         lines = [line.strip() for line in signers.read_text().splitlines()]
     except UnicodeDecodeError:
@@ -165,7 +166,7 @@ _LONGEST_LINE = 80
 
 
 class FirstDifferences:
-    """Compares the messages of a log with those of a new evaluation, topic by topic."""
+    """Compares the messages of a log with the messages of a new evaluation, topic by topic."""
 
     def __init__(self, log: LogFile) -> None:
         self._reader = McapLog(log)
@@ -210,10 +211,10 @@ class FirstDifferences:
 def explain_differences(
     recorded: Mapping[str, str], computed: Mapping[str, str], differences: Mapping[str, Sentence]
 ) -> list[Sentence]:
-    """Return a sentence on each part of a certificate: equal, or where it differs first.
+    """Return a sentence on each part of a certificate. It says where a part differs first.
 
     Args:
-        differences: the first difference of each topic, in a clause; see `FirstDifferences`.
+        differences: clause on the first difference, by topic (see `FirstDifferences`).
     """
     message_clauses = {
         topic: clause for topic, clause in differences.items() if topic not in DERIVED and topic != OBJECTS
@@ -260,7 +261,7 @@ def explain_differences(
 
 
 def _difference(topic: str, new_payload: bytes, old_payload: bytes) -> str | None:
-    """Return the difference of a message from the recorded one; None if only the encoding differs."""
+    """Return a clause on the difference of two messages; None if only their encodings differ."""
     try:
         # literals, because a bare name in a pattern would capture the topic
         match topic:
@@ -347,7 +348,7 @@ _HASHES: Mapping[str, str] = MappingProxyType(
         "doubts": "other doubts",
     }
 )
-"""The meaning of a difference, by entry of a certificate."""
+"""Description of a difference, by entry of a certificate."""
 
 _NOT_COVERED = (
     "plan settings are not covered by this certificate; --decisions recomputes what followed from them"
@@ -359,13 +360,13 @@ _WINDOW = ("start_ns", "end_ns", "every")
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """A certificate as recorded, and as computed now.
+    """A recorded certificate, and the certificate of a new evaluation.
 
     Attributes:
         recorded: the log's certificate; empty if it has none.
         computed: certificate of the new evaluation.
         faults: losses while reading.
-        explanation: result of `explain_differences`; empty unless requested.
+        explanation: sentences of `explain_differences`; empty if not requested.
         lacks_plan: whether the log was planned, but neither the log nor its certificate has plan settings.
         notes: sentences on parts that the certificate does not cover.
     """
@@ -379,7 +380,7 @@ class Verified:
 
     @property
     def differences(self) -> tuple[str, ...]:
-        """The differences in words; none if everything is equal."""
+        """A sentence on each difference; empty if the certificates are equal."""
         if not self.recorded:
             return ("the log has no certificate: it is not annotated, or was not written to its end",)
         differences = [
@@ -400,12 +401,12 @@ def verify_certificate(
     *,
     explain: bool = False,
 ) -> Verified:
-    """Evaluate a log, or its source, again with the log's own specifications and options.
+    """Compare a log's certificate with a new evaluation, which uses the log's specifications and options.
 
     Args:
-        source: the source of the log; None evaluates the log itself.
-        advance: called with the number of samples of each block that is done.
-        explain: find the first differences, which takes another evaluation.
+        source: source of the log, which is evaluated; None evaluates the log itself.
+        advance: function that is called with the number of samples of each evaluated block.
+        explain: whether the first differences are searched, which takes another evaluation.
 
     Raises:
         UsageError, LogError, SpecificationError: the log cannot be evaluated.
@@ -421,7 +422,7 @@ def verify_certificate(
         )
     kept_topics = None if source is None else _topics_of_copy(log_record, options)
     clip_record = metadata.get(CLIP_METADATA, {})
-    # a replay of a clip also has the clip's record; if the source is that clip, it is not cut again
+    # a replay of a clip also has the clip's record; a source that already is this clip is not cut again
     if source is not None and clip_record and dict(source.metadata()).get(CLIP_METADATA) != clip_record:
         source, kept_topics = clipped_source(source, clip_record), None
     evaluated_source = log if source is None else source
@@ -436,7 +437,7 @@ def verify_certificate(
     computed = dict(replayed.certificate)
     plan_settings = metadata.get(PLAN_METADATA)
     if not options.get("layer") and recorded.get(PLAN_SHA256) == computed.get(PLAN_SHA256):
-        # the source has the certified settings, and the log's own copy of them is checked, too
+        # the source has the certified settings, so the log's own copy is checked, too
         computed |= {} if plan_settings is None else {PLAN_SHA256: plan_sha256(plan_settings)}
         if plan_settings is None:
             computed.pop(PLAN_SHA256, None)
@@ -459,10 +460,10 @@ def verify_certificate(
 
 
 def recorded_reading(log: Source, source: str) -> dict[str, Any]:
-    """Return the options with which a log's source was read, such as the rate of its frames.
+    """Return the recorded reading options of a log's source, such as the frame rate of a video.
 
     Args:
-        source: file name of the given source; options apply only to the recorded source.
+        source: file name of a source. For another source than the recorded one, there are no options.
     """
     log_record = dict(log.metadata()).get(METADATA, {})
     if log_record.get("source") != source:
@@ -483,7 +484,7 @@ def _files(log: Source) -> list[Specification]:
 
 
 def _options(log_record: Mapping[str, str]) -> dict[str, Any]:
-    """Return the options of the replay that wrote a log; none for a recording."""
+    """Return the options of the replay that wrote a log; empty for a recording."""
     if log_record.get("written_by") != "replay":
         return {}
     try:
@@ -494,7 +495,10 @@ def _options(log_record: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _topics_of_copy(log_record: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """Return the topics of its source that a log kept: none in a recording, by default all in a copy."""
+    """Return the source's topics that a log keeps: none for a recording, by default all for a copy.
+
+    A layer has no selection of topics: None.
+    """
     if log_record.get("written_by") != "replay":
         return ()
     return None if options.get("layer") else tuple(options.get("keep", KEEP_ALL))
