@@ -43,7 +43,7 @@ from spatial_replay.tuning.tuned import last_that_holds
 
 
 class KeptNode(NamedTuple):
-    """Node whose verdict a clip keeps, by result and id, with its title."""
+    """Node whose verdict a clip keeps: its result, its id in the result's tree, and its title."""
 
     result: SpecResult
     node: int
@@ -51,7 +51,9 @@ class KeptNode(NamedTuple):
 
 
 def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptNode]:
-    """Return the results and named specs in `of`; by default the violated results, else all results.
+    """Return the results and named specs in `of`.
+
+    Without names, these are the violated results. If no result is violated, these are all results.
 
     Raises:
         UsageError: a name that no result or spec has.
@@ -80,7 +82,7 @@ class _Path(NamedTuple):
     Attributes:
         nodes: ids of the nodes on the path.
         decided_ns: time of the deciding sample.
-        number: robustness interval of the last node at that sample.
+        number: robustness interval of the last node at the deciding sample.
         missed: failed implication on the path, or None.
     """
 
@@ -97,10 +99,10 @@ class _Decision(NamedTuple):
         verdict: verdict of the node.
         certain_ns: time of the sample that made the verdict certain, or None.
         numbers: deciding ends of the robustness interval and of the nominal interval, for the node and its
-            cause. The other ends are left out: a sample that decides nothing can make them unknown.
+            cause. Other ends are left out, because samples that decide nothing can make these ends unknown.
         cause: id of the part that failed first, or None.
         path: path to the deciding atom of the node over all samples.
-        settled: path to the atom that settled the cause or the verdict, at that time.
+        settled: path to the atom that settled the cause, or else the verdict, at the time of settling.
     """
 
     verdict: Verdict
@@ -111,7 +113,7 @@ class _Decision(NamedTuple):
     settled: _Path
 
     def difference(self, other: _Decision | None) -> str:
-        """Return a verb phrase for the difference of another decision from this one."""
+        """Return a verb phrase on the first property in which another decision differs."""
         if other is None:
             return "has no sample"
         if self.verdict is not other.verdict:
@@ -122,7 +124,7 @@ class _Decision(NamedTuple):
 
 
 class _Part:
-    """Node of a result that can be evaluated over any window of its samples."""
+    """Node of a result that can be evaluated over any window of the result's samples."""
 
     def __init__(self, kept_node: KeptNode, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
         result = kept_node.result
@@ -139,7 +141,7 @@ class _Part:
             object_column = trace.names.index(result.object)
             self._seen_ns = trace.times_ns[trace.rows[:, object_column] != ABSENT]
         self._decision = self._decide(result, self._leaves)
-        # of several events at one time, the last entry is shown
+        # if several events have the same time, the last entry is shown
         self._moments = {
             self._decision.settled.decided_ns: f", where `{kept_node.title}` was settled",
             self._decision.path.decided_ns: f", where the robustness of `{kept_node.title}` is decided",
@@ -155,11 +157,11 @@ class _Part:
         return self._moments.get(time_ns)
 
     def holds_over(self, start_ns: int, end_ns: int) -> bool:
-        """Return whether the decision is the same over the samples between two times, both included."""
+        """Return whether the samples between two times, inclusive, have the decision of the whole log."""
         return self._decision_over(start_ns, end_ns) == self._decision
 
     def change_over(self, start_ns: int, end_ns: int) -> str | None:
-        """Return the change over the samples between two times as a clause; None without a change."""
+        """Return a clause on the decision over the samples between two times; None if it is unchanged."""
         decision = self._decision_over(start_ns, end_ns)
         if decision == self._decision:
             return None
@@ -182,7 +184,7 @@ class _Part:
         return self._decide(result, leaves)
 
     def _within(self, begin_index: int, end_index: int, start_ns: int) -> Floats:
-        """Return the leaves that a log of the window alone has; nothing is known before its start."""
+        """Return the leaves of a log that has only the window's samples, and nothing before `start_ns`."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin_index:end_index])
         delay_samples, delay_ns, has_report_delay = self._reach
         if self._trace is None or not self._reach:
@@ -192,7 +194,7 @@ class _Part:
             delay_samples, has_report_delay, int(np.searchsorted(times_ns, start_ns + delay_ns))
         )
         if has_report_delay and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
-            # a rate reads the last two reports: up to the second report in the window, one is from before it
+            # a rate needs two reports; before the window's second report, one of them precedes the window
             head_length = len(times_ns)
         trace_begin, trace_end = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
         head_trace = self._trace.slice(trace_begin, min(trace_begin + head_length, trace_end))
@@ -206,7 +208,7 @@ class _Part:
         return leaves
 
     def _decide(self, result: SpecResult, leaves: Floats) -> _Decision:
-        """Return the verdict over the samples of a result with given leaves, and its reason."""
+        """Return the verdict of the node and its reason, from a result and the result's leaves."""
         times_ns, certain_ns = result.times_ns, result.certain_ns(self._node)
         cause = result.first_cause(self._node)
         deciding_node, settled_ns = (
@@ -230,7 +232,7 @@ class _Part:
 
 
 def _deciding_numbers(evaluation: OfflineNodes, node: int) -> tuple[float, ...]:
-    """Return the deciding ends of a node's interval and nominal interval; none if the verdict is open."""
+    """Return the deciding ends of a node's interval and nominal interval; () if the verdict is open."""
     deciding_end = End.of(final_verdict(*evaluation.interval(node)))
     if deciding_end is End.OPEN:
         return ()
@@ -251,7 +253,7 @@ def _path(evaluation: OfflineNodes, node: int) -> _Path:
 
 
 class ClipSearch:
-    """Search for the window of a clip: outwards from the deciding samples, then inwards from both ends."""
+    """Search for a clip's window. It grows from the deciding samples, and then shrinks from both ends."""
 
     def __init__(
         self,
@@ -312,7 +314,7 @@ class ClipSearch:
             first_index, last_index = cut_first, cut_last
 
     def _outwards(self) -> tuple[int, int]:
-        """Widen the window in doubling steps until it has the results, because small windows cost least."""
+        """Widen the window in doubling steps until it has the same decisions. Small windows cost least."""
         inner_first, inner_last = self._inner
         last_index, margin_samples = len(self._times_ns) - 1, 0
         while True:
@@ -322,9 +324,10 @@ class ClipSearch:
             margin_samples = max(2 * margin_samples, 1)
 
     def _cut(self, outer_index: int, inner_index: int, holds: Callable[[int], bool]) -> int:
-        """Return the end of the shortest window that still has the results, between two ends.
+        """Return the end of the shortest window with the same decisions, between an inner and an outer end.
 
-        The window with the outer end has them. The search starts inside, because long windows cost most.
+        The window up to the outer end has these decisions. The search starts at the inner end, because long
+        windows cost most.
         """
         if inner_index == outer_index or holds(inner_index):
             return inner_index
@@ -332,7 +335,7 @@ class ClipSearch:
         return last_that_holds(inner_index, outer_index - direction, lambda at: not holds(at)) + direction
 
     def _holds(self, first: int, last: int) -> bool:
-        """Return whether a window has every result for the same reason."""
+        """Return whether all decisions are unchanged over a window, given by sample indices."""
         if (first, last) not in self._known:
             window_ns = int(self._times_ns[first]), int(self._times_ns[last])
             self._known[first, last] = all(part.holds_over(*window_ns) for part in self._parts)
@@ -341,7 +344,7 @@ class ClipSearch:
 
 def _join_times(times_ns: Sequence[Integers]) -> Integers:
     first_times_ns = times_ns[0]
-    # times are compared, not lengths: objects that appear one after another can have equally many samples
+    # times are compared, because objects that appear one after another can have equally many samples
     if all(np.array_equal(result_times_ns, first_times_ns) for result_times_ns in times_ns):
         return first_times_ns
     return np.unique(np.concatenate(times_ns))
@@ -349,12 +352,13 @@ def _join_times(times_ns: Sequence[Integers]) -> Integers:
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Written clip.
+    """A clip and the log that it was cut from.
 
     Attributes:
-        whole, replayed: replay of the log without a certificate, and replay of the clip.
+        whole: replay of the log, without a certificate.
+        replayed: replay of the clip.
         start_ns, end_ns: times of the first and the last sample of the clip.
-        kept: titles of results, and names of specs in them, with the same decision as in the log.
+        kept: titles of the results and names of the specs that have the same decision as in the log.
         source_bytes, clip_bytes: sizes of the files; `source_bytes` is None if the log is not a single file.
         reasons: sentences on why the clip cannot begin later or end earlier.
     """
@@ -385,7 +389,7 @@ class Clip:
 
     @property
     def changed(self) -> tuple[str, ...]:
-        """Titles of results with another verdict than in the log; kept results are not among them."""
+        """Titles of results whose verdict differs from the log. Kept results never differ."""
         verdicts = {result.title: result.verdict for result in self.whole.results}
         return tuple(
             result.title
@@ -395,7 +399,7 @@ class Clip:
 
     @property
     def added(self) -> tuple[str, ...]:
-        """Named parts that fail in the clip but not in the log, in results with an unchanged verdict."""
+        """Names of parts that fail only in the clip. Results with a changed verdict are left out."""
         results = {result.title: result for result in self.whole.results}
         part_names = (
             cause.spec
@@ -418,15 +422,15 @@ def cut_clip(
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Clip:
-    """Write the smallest part of a log that has its verdicts, robustness and witnesses.
+    """Write the smallest part of a log that has the log's verdicts, robustness and witnesses.
 
-    If either end is cut by one more sample, or by any power of two of samples, a result changes. The clip has
-    all messages in its window. It also has the last message of each topic, and the last transform of each
-    frame, before the window. Times do not change.
+    If either end loses one more sample, or any power of two of samples, a result changes. The clip has all
+    messages in its window. From before the window, it has the last message of each topic, and the last
+    transform of each frame. Times do not change.
 
     Args:
         options: options of the evaluation; `keep` selects the topics.
-        around_ns: least time that is kept before and after the deciding samples.
+        around_ns: least duration that is kept before and after the deciding samples, ns.
         of: names of the specs to keep; by default the violated results, or all if none is violated.
         inputs: files that the output must not overwrite.
 
@@ -476,7 +480,7 @@ def cut_clip(
 
 
 def _size_of(source: Source) -> int | None:
-    """Return the size of a log that is a single file; None for other logs."""
+    """Return the size of a log's file, bytes; None if the log is not a single file."""
     path = source.path
     if isinstance(path, RemoteFile):
         return path.size

@@ -54,7 +54,7 @@ from spatial_replay.spec.walks import (
 def unify_regions(
     formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
 ) -> tuple[list[Formula], dict[str, Outline]]:
-    """Rename regions in formulas if `others` has other shapes under their names; texts do not change.
+    """Rename regions of formulas that have another shape in `others`. The formulas' texts do not change.
 
     Returns:
         The formulas, and the regions of both sides by name.
@@ -103,11 +103,16 @@ _KINDS: Final[Mapping[str, DeclarationKind]] = MappingProxyType(
     }
 )
 _MOST_CHANGES: Final = 32
-"""Maximum number of declarations that edits are traced to; more differences mean unrelated texts."""
+"""Maximum number of changed declarations that are compared. Texts with more changes are unrelated."""
 
 
 class TextPlace(NamedTuple):
-    """Place in a specification file: a line, from 1, with its text or the statement that begins there."""
+    """Place in a specification file.
+
+    Attributes:
+        line: number of the line, from 1.
+        text: text of the line, or of the statement that begins on the line.
+    """
 
     filename: str
     line: int
@@ -115,7 +120,7 @@ class TextPlace(NamedTuple):
 
 
 class DeclarationChange(NamedTuple):
-    """Declaration that differs between the versions; `old` or `new` is None if that version lacks it."""
+    """Declaration that differs between two versions; `old` or `new` is None if it is missing there."""
 
     kind: DeclarationKind
     name: str
@@ -134,13 +139,13 @@ _Key: TypeAlias = tuple[str, str]
 
 
 class TextVersions:
-    """Two versions of a text, and mixed versions with some declarations exchanged.
+    """Two versions of a text, and mixed versions in which some declarations are exchanged.
 
-    Parsed versions are cached for one diff.
+    Parsed versions are cached.
 
     Attributes:
         old, new: specifications with numbers instead of the names of enumerated values.
-        changes: declarations that differ by more than blanks and comments; only the first of very many.
+        changes: declarations that differ by more than blanks and comments, at most `_MOST_CHANGES`.
     """
 
     def __init__(self, old: Specification, new: Specification, units: Mapping[str, str]) -> None:
@@ -164,16 +169,16 @@ class TextVersions:
         self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
 
     def version(self, changes: Collection[int], *, is_undone: bool) -> Specification | None:
-        """Return the old text with some new declarations, parsed; None if it has errors.
+        """Parse the old text with some new declarations; None if this mixed version has errors.
 
         Args:
-            changes: indices of the declarations in `changes`.
-            is_undone: whether the result is the new text with these old declarations instead.
+            changes: indices of the declarations in the attribute `changes`.
+            is_undone: whether the new text with some old declarations is parsed instead.
         """
         mixture = is_undone, frozenset(changes)
         if mixture not in self._known:
             exchanged_keys = [self._keys[index] for index in changes]
-            # an exchanged declaration may need others that only its own text has
+            # an exchanged declaration may need other declarations of its text
             candidate_texts = (
                 self._exchange(exchanged_keys, is_undone, is_strict) for is_strict in (True, False)
             )
@@ -186,9 +191,9 @@ class TextVersions:
     def edited_lines(
         self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
     ) -> tuple[TextPlace | None, TextPlace | None]:
-        """Return a changed line of the first edited spec, as its place in the old and in the new text.
+        """Return the places of a changed line in the old and in the new text, from the first edited spec.
 
-        A place is None if its text does not have the line. Both places are None if no spec was edited.
+        A place is None if the text lacks the line. Both places are None if no spec was edited.
 
         Args:
             specs: names of each spec in the old and in the new text.
@@ -283,7 +288,10 @@ def _lines_of(file: Specification, statement_span: Span, wanted_span: Span | Non
 def _edited_places(
     block: tuple[Sequence[_Line], Sequence[_Line]],
 ) -> tuple[TextPlace | None, TextPlace | None]:
-    """Return the preferred line of each text, or else its line at the same position in the block."""
+    """Return the place of the preferred line in each text.
+
+    A text without a preferred line gives its line at the same position in the block, or None.
+    """
     wanted_indices = [index for lines in block for index, line in enumerate(lines) if line.is_wanted]
     old_place, new_place = (
         next((line.place for line in lines if line.is_wanted), None)
@@ -346,13 +354,13 @@ EditKind: TypeAlias = Literal[
 
 A "constant" is a number or a window. A "region" or "group" is a declaration. A "definition" changes the
 meaning of a macro or relation (`def`, profile, `scale`). A node is "replaced"; an operand of a conjunction or
-disjunction is "added" or "removed". An edit of the place alone is "moved", of the name alone "renamed".
+disjunction is "added" or "removed". A "moved" node has only a new place, a "renamed" node only a new name.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One edit of a formula with all its occurrences.
+    """One edit of a formula, with all occurrences of the edit.
 
     Attributes:
         spec: innermost named spec that contains the edit.
@@ -362,8 +370,8 @@ class Edit:
         depth: depth of the deepest node; the root has depth 0.
         subject: name of the edited constant, region, group or macro; None for other edits.
         change: edited declaration in both texts; None if the text of a spec was edited.
-        old_specs, new_specs: specs whose text may have been edited, innermost first, each with its names in
-            both texts. For a move, these are the specs of the old place and of the new place.
+        old_specs, new_specs: old and new names of the specs whose text may have been edited, innermost
+            first. For a move, these are the specs of the old place and of the new place.
     """
 
     kind: EditKind
@@ -415,7 +423,13 @@ class Origin(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Node with its id, the names of its specs, innermost first, and its depth."""
+    """Node of a formula's tree.
+
+    Attributes:
+        id: id of the node.
+        specs: names of the specs that contain the node, innermost first.
+        depth: depth of the node; the root has depth 0.
+    """
 
     node: Formula
     id: int
@@ -424,7 +438,7 @@ class Place:
 
     @property
     def around(self) -> tuple[str, ...]:
-        """Names of the specs whose text contains the node; a named node is not in its own spec."""
+        """Names of the specs whose text contains the node. The spec of a named node is left out."""
         return self.specs if self.node.name is None else self.specs[1:] or self.specs
 
     @property
@@ -438,10 +452,11 @@ class Place:
         return places
 
     def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
-        """Return the operands of a conjunction or disjunction; nested ones are replaced by their operands.
+        """Return the operands of a conjunction or disjunction, without nesting of the same operator.
 
         Args:
-            through_names: whether named specs are replaced by their operands, too.
+            operator: "and" or "or"; operands with this operator are replaced by their operands.
+            through_names: whether named specs with this operator are replaced, too.
         """
         member_places: list[Place] = []
         for operand in self.operands:
@@ -458,7 +473,7 @@ class Place:
 
     @property
     def bare(self) -> Place:
-        """The node; a spec that only repeats another spec is replaced by that one."""
+        """The place of the node. If a spec only repeats another spec, the place of the other spec."""
         place = self
         while isinstance(place.node, Boolean) and place.node.operator == "spec":
             place = place.operands[0]
@@ -466,7 +481,7 @@ class Place:
 
 
 class FoundSite(NamedTuple):
-    """Place where the trees differ, with its kind of edit; `parts` are differences within a quantifier."""
+    """Place where two trees differ, and the kind of edit; `parts` are differences in a quantifier's body."""
 
     kind: EditKind
     old: Place | None
@@ -476,7 +491,7 @@ class FoundSite(NamedTuple):
 
     @property
     def ids(self) -> tuple[range, range]:
-        """The ids of the nodes that differ; after a change of window or name, operands are left out."""
+        """Ids of the differing nodes in both trees, without operands if only a window or name differs."""
         is_window_change = (
             self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
         )
@@ -502,7 +517,7 @@ def _size(formula: Formula) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Place where the trees differ, by its index."""
+    """Difference of two trees; `site` is its index in the comparison."""
 
     site: int
     old: Formula | None
@@ -511,7 +526,7 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """Node of both trees whose operands may differ; if `site` is given, its window differs, too."""
+    """Node of both trees whose operands may differ; `site` is an index if the node's window differs."""
 
     site: int | None
     old: Boolean | Temporal
@@ -524,10 +539,10 @@ Merged: TypeAlias = "Formula | Site | Inner"
 
 @dataclass(frozen=True, eq=False)
 class TreeDiff:
-    """Edits between two formulas; empty if their meaning and names are the same.
+    """Edits between two formulas; empty if meaning and names are equal.
 
     Attributes:
-        units: groups of edits that are applied together: a single edit, or several that share a node.
+        units: groups of edits that are applied together: a single edit, or several edits of one node.
     """
 
     units: tuple[tuple[Edit, ...], ...]
@@ -545,7 +560,7 @@ class TreeDiff:
         return tuple(index for index, unit in enumerate(self.units) if unit[0].kind != "renamed")
 
     def formula(self, units: Collection[int]) -> Formula:
-        """Return the old formula with some units of edits applied: those with the given indices."""
+        """Return the old formula with the edits of some units, given by index."""
         sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
         mixed_formula = _build(self._merged, sites)
         return Truth(True) if mixed_formula is None else mixed_formula
@@ -624,7 +639,7 @@ def compare_trees(
 
     Args:
         name: name of the formulas.
-        origins: edits of the texts with the nodes that depend on them; other nodes have their own edits.
+        origins: edits of the texts, each with the nodes that depend on it. Other nodes give separate edits.
         specs: names of all specs in the old and in the new text.
     """
     comparison = _Comparison(regions, specs)
@@ -633,7 +648,7 @@ def compare_trees(
 
 
 def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) -> frozenset[int]:
-    """Return the ids of the nodes of a new formula that differ from an old one, descendants included."""
+    """Return the ids of a new formula's nodes that differ from the old formula, and of their descendants."""
     comparison = _Comparison(regions)
     comparison.align(Place(old, 0, ("",), 0), Place(new, 0, ("",), 0))
     sites = [site for site in comparison.sites if site.kind != "renamed"]
@@ -641,7 +656,7 @@ def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) ->
 
 
 class _Comparison:
-    """Alignment of two trees; meanings are numbered, so that equal nodes are found quickly."""
+    """Alignment of two trees. Meanings have numbers, so equal nodes are found quickly."""
 
     def __init__(
         self, regions: Mapping[str, Outline], specs: tuple[Collection[str], Collection[str]] = ((), ())
@@ -737,7 +752,7 @@ class _Comparison:
         return self._site(FoundSite(edit_kind, old, new, subject))
 
     def _parts(self, old: Place, new: Place) -> tuple[FoundSite, ...]:
-        """Return the differences of two quantifiers' bodies, each of which is evaluated as one node."""
+        """Return the differences of two quantifiers' bodies. A quantifier and its body have the same id."""
         site_count = len(self.sites)
         bodies = [
             Place(place.node.body, place.id, place.specs, place.depth + 1)
@@ -796,7 +811,7 @@ class _Comparison:
         )
 
     def _join(self, sites: Sequence[FoundSite]) -> Iterable[list[int]]:
-        """Return the indices of sites, grouped by the edit of the specs' text that they depend on."""
+        """Group sites by the edit of a spec's text, and return the indices of each group."""
         removed_meanings, added_meanings = (
             {
                 self.meaning(place.node)
@@ -822,7 +837,7 @@ class _Comparison:
         return sites_by_edit.values()
 
     def _specs_of(self, old: Place | None, new: Place | None) -> tuple[tuple[str, str], ...]:
-        """Return the specs whose text contains both places, innermost first, by old and new name."""
+        """Return the old and new names of the specs whose text contains both places, innermost first."""
         if old is None or new is None:
             return tuple((name, name) for place in (old, new) if place is not None for name in place.around)
         name_pairs = [(old_name, new_name) for new_name in new.specs for old_name in old.specs]
@@ -838,7 +853,7 @@ class _Comparison:
         declaration_origins: Sequence[Origin],
         text_origins: Sequence[Origin],
     ) -> Iterator[Edit]:
-        """Yield the edits of a unit: first those of declarations, then those of the specs' text."""
+        """Yield the edits of a unit: edits of declarations, then edits of the specs' text."""
         unit_sites = [self.sites[site] for site in site_indices]
         for origin in declaration_origins:
             if origin.change is not None:
@@ -903,7 +918,7 @@ class _Comparison:
     def _match(
         self, old_node: Any, old_places: Sequence[Place], new_node: Any, new_places: Sequence[Place]
     ) -> Inner:
-        """Match the operands of a conjunction or disjunction: by meaning, then by name, then similar ones."""
+        """Match the operands of two conjunctions or disjunctions: by meaning, by name, then by similarity."""
         partner_indices: dict[int, int] = {}
         matched_indices: set[int] = set()
 
@@ -939,7 +954,7 @@ class _Comparison:
 
 
 def _is_alike(old: Place, new: Place, least_similarity: float, *, by_operator: bool) -> bool:
-    """Return whether two nodes are similar enough, and on request whether they have the same operator."""
+    """Return whether two nodes are similar enough. With `by_operator`, they need the same operator, too."""
     old_node, new_node = old.bare.node, new.bare.node
     return (not by_operator or operator_of(old_node) == operator_of(new_node)) and similarity(
         old_node, new_node

@@ -62,8 +62,8 @@ class Alignment:
     Attributes:
         kind: "time" since the zero of each log, an "event", or the "progress" of an automaton.
         about: spec of the event or of the automaton; None for "time".
-        knots: corresponding times, at least one pair. Between two knots times are interpolated linearly;
-            before the first and after the last one, time runs equally fast in both runs.
+        knots: corresponding times, at least one pair. Between two knots, times are interpolated linearly.
+            Before the first knot and after the last knot, time runs equally fast in both runs.
         a, b: (P,), indices of corresponding samples, by time in A.
     """
 
@@ -83,8 +83,8 @@ class Parting(NamedTuple):
     """Divergence of two runs in one automaton: their first states that differ.
 
     Attributes:
-        a_ns, b_ns: time at which each run enters its differing states; None if it ends before.
-        a_states, b_states: differing states of each run; () if it ends before.
+        a_ns, b_ns: time at which each run enters its differing states; None if the run ends before.
+        a_states, b_states: differing states of each run; () if the run ends before.
     """
 
     a_ns: int | None
@@ -139,7 +139,7 @@ def align_runs(
             f"{name + ' has no' if name else 'no spec has an'} automaton to align by (past operators and "
             "bounds in seconds have none); align by time, or by a spec's name"
         )
-    # the most knots win: the automaton of a formula without temporal operators gives hardly any
+    # the most knots win, because the automaton of a formula without temporal operators gives few knots
     name, knots = max(candidates, key=lambda candidate: len(candidate[1]))
     return _alignment("progress", name, knots, a_ns, b_ns)
 
@@ -161,7 +161,7 @@ def _find_pairs(
 
 
 def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification]) -> Parting | None:
-    """Return the divergence of two runs in the automaton of a spec; None without one."""
+    """Return the divergence of two runs in a spec's automaton; None without a divergence or automaton."""
     paths = [_path(result, files) for result in (one, other)]
     if paths[0] is None or paths[1] is None or paths[0] == paths[1]:
         return None
@@ -232,7 +232,7 @@ def _event(results: Sequence[tuple[SpecResult, SpecResult]], name: str) -> Knot:
         spec_names += [node.name for node in result_a.nodes if node.name is not None]
         if name not in spec_names:
             continue
-        # `value` of a spec without temporal operators is constant, so `now` is used if it never changes
+        # `value` of a spec without temporal operators is constant, so `now` is the second choice
         time_pairs = [
             [
                 _first_change(result.times_ns, read_series(result.node(name)))
@@ -262,7 +262,7 @@ def _first_change(times_ns: Integers, values: Floats) -> int | None:
 
 
 class _Visit(NamedTuple):
-    """States of an automaton, with the time of the first sample after which a run is in them."""
+    """States of an automaton, and the time of the sample after which a run enters these states."""
 
     time_ns: int
     states: tuple[int, ...]
@@ -320,14 +320,14 @@ _PAIRS_AT_ONCE: Final = 16_384
 
 @dataclass(frozen=True, slots=True)
 class ObjectDiff:
-    """Difference of one object between two aligned runs; times are those of samples of A.
+    """Difference of one object between two aligned runs, with times of samples of A.
 
     Attributes:
         first_ns: first time at which the object differs in position, shape or another property.
-        apart_ns: first time at which its two footprints do not touch; None if they always touch.
-        greatest_distance: greatest signed distance between its two footprints; NaN without a measurement.
+        apart_ns: first time at which the object's two footprints do not touch; None if they always touch.
+        greatest_distance: greatest signed distance between the two footprints; NaN without a measurement.
         greatest_ns: time of the greatest distance, or `first_ns` without a measurement.
-        greatest_shift: greatest displacement of the mean of its vertices.
+        greatest_shift: greatest displacement of the footprint's mean vertex.
         samples_only_in_a, samples_only_in_b: number of pairs of samples in which only one run has the object.
     """
 
@@ -343,13 +343,13 @@ class ObjectDiff:
 
 @dataclass(frozen=True, slots=True)
 class SignalDiff:
-    """Difference of one signal between two aligned runs; times are those of samples of A.
+    """Difference of one signal between two aligned runs, with times of samples of A.
 
     Attributes:
         first_ns: first time with different values.
         greatest_difference: greatest difference of two known numbers; NaN if there are none.
         greatest_ns: time of the greatest difference, or `first_ns` without numbers.
-        ratio: median magnitude in B divided by that in A; NaN if one of them is 0.
+        ratio: median magnitude in B divided by the median magnitude in A; NaN if either median is 0.
     """
 
     name: str
@@ -360,7 +360,7 @@ class SignalDiff:
 
     @property
     def has_other_unit(self) -> bool:
-        """Whether the unit seems to be another one in B, such as millimetres instead of metres."""
+        """Whether the signal seems to have another unit in B, such as millimetres instead of metres."""
         return self.ratio >= OTHER_UNITS or self.ratio <= 1.0 / OTHER_UNITS
 
 
@@ -409,7 +409,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
             "Map the same things to the same names"
         )
     require_same_units(a, b)
-    # (P, K) observations
+    # indices of observations, (P, K)
     rows_a, rows_b = (
         trace.rows[samples][:, [trace.names.index(name) for name in common_names]]
         for trace, samples in ((a, alignment.a), (b, alignment.b))
@@ -476,7 +476,7 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
     for property_a, property_b in property_pairs:
         # NaN on both sides is no difference
         is_moved |= (property_a != property_b) & ~(np.isnan(property_a) & np.isnan(property_b))
-    # relative to one vertex, because means of coordinates far from the origin lose digits when subtracted
+    # relative to one vertex: far from the origin, the difference of two means would lose digits
     first_vertices = footprints_a.vertices[footprints_a.vertex_start[footprints_a.part_start[:-1]]]
     shift_x, shift_y = _mean_vertices(footprints_b, first_vertices) - _mean_vertices(
         footprints_a, first_vertices
@@ -507,7 +507,7 @@ def _are_equal(batch_a: FootprintBatch, batch_b: FootprintBatch) -> Booleans:
 
 
 def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
-    """Return the mean of each row's vertices relative to the origin of the row, (2, R)."""
+    """Return the mean vertex of each row relative to the row's origin, (2, R)."""
     vertex_counts = np.diff(batch.vertex_start[batch.part_start])
     vertex_rows = np.repeat(np.arange(len(batch)), vertex_counts)
     coordinate_sums = [
@@ -580,7 +580,7 @@ class RunSpecDiff:
         return not EditOutcome.of(self.a).same_as(EditOutcome.of(self.b))
 
     def sentences(self, zeros_ns: tuple[int, int]) -> Iterator[Sentence]:
-        """Yield sentences on the differences; times of each run count from its zero."""
+        """Yield sentences on the differences. Times of a run count from the run's zero."""
         yield Sentence(" | ".join(map(outcome_text, (self.a, self.b))) + difference_text(self.a, self.b))
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
@@ -658,7 +658,7 @@ def _deepest_flips(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
     if 0 not in flipped_ids:
         return ()
     parent_ids = {one.nodes[node].parent for node in flipped_ids}
-    # a node counts only if all nodes from the root down to it have different verdicts
+    # a node counts only if all its ancestors have different verdicts, too
     connected_ids = {0}
     for node in sorted(flipped_ids):
         if one.nodes[node].parent in connected_ids:
@@ -788,9 +788,9 @@ class LogDiff(Printed, Displayed):
     Attributes:
         a, b: names of the logs.
         samples: number of compared samples of each log.
-        zeros_ns: times that sentences count from, one of each log.
+        zeros_ns: times that sentences count from, one per log.
         alignment: correspondence of the samples.
-        objects: differences of objects, the first ones apart first.
+        objects: differences of objects, sorted by `apart_ns` (see `compare_objects`).
         signals: differences of signals, in the order of their names.
         only_a, only_b: objects, signals and results of templates that only one run has.
         specs: differences of results.
@@ -798,7 +798,7 @@ class LogDiff(Printed, Displayed):
         has_equal_samples: whether all samples are equal.
         faults: sentences on data that was lost while reading.
         doubts: remarks on assumptions that a log contradicts.
-        missing: a warning for each name in the specifications that a log never has.
+        missing: a warning for each name in the specifications that a log lacks.
         traces: samples of both runs.
     """
 
@@ -912,7 +912,7 @@ def diff_sources(
         UsageError: a run has no sample, the runs have no common object or different units, or there is
             nothing to align by.
         LogError: a log cannot be read.
-        SpecificationError: the specifications mention names that a log never has, if names are strict.
+        SpecificationError: a log lacks a name in the specifications, and names are strict.
     """
     selections = [
         Selection(source, tuple(files), replace(run_options, keep=()))

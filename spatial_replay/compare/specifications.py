@@ -48,7 +48,7 @@ from spatial_replay.text import (
 from spatial_replay.trace.trace import Trace
 
 _MOST_EVALUATIONS: Final = 256
-"""Maximum number of formulas evaluated for one cause; at the limit, the cause so far is returned."""
+"""Maximum number of tests of edits for one cause. At the limit, the smallest cause until then is returned."""
 
 
 class EditOutcome(NamedTuple):
@@ -64,16 +64,20 @@ class EditOutcome(NamedTuple):
         return cls(result.verdict, result.robustness, result.lower, result.upper)
 
     def same_as(self, other: EditOutcome, *, verdict_only: bool = False) -> bool:
-        """Return whether two outcomes have the same verdict and, unless `verdict_only`, the same numbers."""
+        """Return whether two outcomes have equal verdicts and equal numbers.
+
+        Args:
+            verdict_only: whether only the verdicts are compared.
+        """
         if verdict_only:
             return self.verdict is other.verdict
-        # NaN, which is not equal to itself, counts as equal to NaN
+        # two NaN count as equal
         number_pairs = zip(self[1:], other[1:], strict=True)
         return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in number_pairs)
 
 
 class EditOutcomes:
-    """Outcomes of the old formula with some of the edits, from atoms that are already evaluated."""
+    """Outcomes of the old formula with some of the edits. Atoms are not evaluated again."""
 
     def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
         self._diff = diff
@@ -90,7 +94,7 @@ class EditOutcomes:
         self.count = 0
 
     def __call__(self, units: Sequence[int]) -> EditOutcome:
-        """Return the outcome of the old formula with only some units of edits applied."""
+        """Return the outcome of the old formula with the edits of some units, given by index."""
         edited_units = frozenset(units)
         if edited_units not in self._known:
             self.count += 1
@@ -123,13 +127,14 @@ class EditOutcomes:
 def find_cause(
     diff: TreeDiff, outcome: Callable[[Sequence[int]], EditOutcome], old: EditOutcome, new: EditOutcome
 ) -> tuple[int, ...]:
-    """Return the units of edits that changed the verdict or, for equal verdicts, the numbers; deepest first.
+    """Return the units of edits that changed the verdict or, for equal verdicts, the numbers.
 
-    These units alone give the new outcome, and all other units alone give the old outcome. No unit can be
-    left out. Single units are tried first, the deepest ones before others.
+    The result is sorted by depth, deepest units first. These units alone give the new outcome, and all other
+    units alone give the old outcome. No unit can be left out. Single units are tried first, deeper units
+    before others.
 
     Args:
-        outcome: function that returns the outcome of the old formula with some units applied.
+        outcome: function from unit indices to the outcome of the old formula with the edits of these units.
     """
     if old.same_as(new):
         return ()
@@ -154,7 +159,7 @@ def find_cause(
 
 
 def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Return a minimal subset of parts for which a condition holds; it must hold for the full set.
+    """Return a minimal subset of parts for which a condition holds. All parts together must fulfil it.
 
     No single part of the subset can be left out. The method is delta debugging, which removes larger pieces
     first (Zeller and Hildebrandt 2002, https://doi.org/10.1109/32.988498).
@@ -189,10 +194,10 @@ class SpecDiff(Displayed):
     Attributes:
         name, old_name: name in the new file and in the old file.
         old, new: results over the log.
-        tree: edits between the two formulas; it can apply some of them to the old formula.
+        tree: edits between the two formulas, which can be applied to the old formula one by one.
         cause: edits that changed the verdict or, for equal verdicts, the robustness; empty if both are equal.
-            These edits alone give the new outcome, and all others alone give the old outcome.
-        alone: for each edit of the cause, the outcome with only this edit; None if it needs other edits.
+            These edits alone give the new outcome, and all other edits alone give the old outcome.
+        alone: outcome with a single edit, for each edit of the cause; None if the edit needs other edits.
         old_places, new_places: edited declaration or line in each text, by edit.
     """
 
@@ -208,7 +213,7 @@ class SpecDiff(Displayed):
 
     @property
     def edits(self) -> tuple[Edit, ...]:
-        """The edits between the two formulas, those in named specs included."""
+        """The edits between the two formulas, including edits in named specs."""
         return self.tree.edits
 
     @property
@@ -239,7 +244,7 @@ class SpecDiff(Displayed):
 
     @property
     def title(self) -> str:
-        """Name with the object of a template, and the old name if it was another."""
+        """Name, with the object of a template's instance, and with the old name after a rename."""
         title = self.name if self.old.object is None else f"{self.name}({self.old.object})"
         return title if self.name == self.old_name else f"{title} (was {self.old_name})"
 
@@ -343,7 +348,10 @@ def outcome_text(result: SpecResult) -> str:
 
 
 def difference_text(first: SpecResult, second: SpecResult) -> str:
-    """Return ", the same" for equal outcomes, the difference if only their texts are equal, or ""."""
+    """Return ", the same" for equal outcomes.
+
+    If different outcomes have equal texts, return a clause with the greatest difference; else return "".
+    """
     outcomes = EditOutcome.of(first), EditOutcome.of(second)
     if outcomes[0].same_as(outcomes[1]):
         return ", the same"
@@ -363,11 +371,12 @@ class SpecificationDiff(Printed, Displayed):
         samples: number of evaluated samples.
         first_ns: time that sentences count from.
         old, new: specifications.
-        specs: specs of both versions that are results in either, renamed ones included, in the new order.
+        specs: differences of specs that are results in either version, in the new order. Renamed specs are
+            last.
         removed, added: names of results that only the old or only the new version has.
         faults: sentences on data that was lost while reading.
         doubts: remarks on assumptions that a log contradicts.
-        missing: a warning for each name in the specifications that the log never has.
+        missing: a warning for each name in the specifications that the log lacks.
     """
 
     log: str
@@ -389,7 +398,7 @@ class SpecificationDiff(Printed, Displayed):
         return not (self.removed or self.added or is_edited or any(spec.is_different for spec in self.specs))
 
     def spec(self, name: str) -> SpecDiff:
-        """Return the difference of the spec of this name in the new file; of several instances, the first.
+        """Return the difference of the spec with this name in the new file, or of its first instance.
 
         Raises:
             UsageError: an unknown spec.
@@ -460,7 +469,7 @@ def diff_over_source(
         UsageError: the versions have no common spec or different parameters of a template, the window has no
             sample, or `evaluate` raises it.
         LogError: the log cannot be read.
-        SpecificationError: the specifications mention names that the log never has, if names are strict.
+        SpecificationError: the log lacks a name in the specifications, and names are strict.
     """
     selection = Selection(source, (old, new), replace(options, keep=()))
     trace, missing_names, zero_ns = selection.checked_trace(advance)
@@ -539,7 +548,7 @@ def evaluate_with(options: ReplayOptions, file: Specification, trace: Trace) -> 
 def _pair_specs(
     old: Specification, new: Specification
 ) -> tuple[list[tuple[NamedSpec, NamedSpec]], tuple[str, ...], tuple[str, ...]]:
-    """Return pairs of specs that are results in either file, and names of results without a counterpart."""
+    """Return pairs of specs that are results in either file, and the names of removed and added results."""
     old_by_name, new_by_name = ({spec.name: spec for spec in file.specs} for file in (old, new))
     spec_pairs = [
         (old_by_name[spec.name], spec)
@@ -578,7 +587,7 @@ def _pair_specs(
 
 
 def _origins(versions: TextVersions, old_spec: NamedSpec, new_spec: NamedSpec) -> Iterator[Origin]:
-    """Yield the nodes of a spec that depend on each declaration, and those that depend on text of specs."""
+    """Yield the nodes of a spec that depend on each changed declaration, and on changed texts of specs."""
     old_file, new_file = versions.old, versions.new
     for change_index, change in enumerate(versions.changes):
         applied_version, undone_version = (
@@ -603,7 +612,10 @@ def _origins(versions: TextVersions, old_spec: NamedSpec, new_spec: NamedSpec) -
 def _changes(
     file: Specification, spec: NamedSpec, other_file: Specification | None, counterpart_name: str
 ) -> frozenset[int] | None:
-    """Return the ids of nodes of a spec that another version lacks; None if that version is invalid."""
+    """Return the ids of a spec's nodes that its counterpart in another file lacks.
+
+    The result is None if the other file is invalid or has no counterpart.
+    """
     counterpart = _find_spec(other_file, counterpart_name)
     if other_file is None or counterpart is None:
         return None
@@ -627,7 +639,10 @@ def _spec_diff(
     units = find_cause(tree, edit_outcomes, old_outcome, new_outcome)
 
     def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
-        """Return the outcome with only one edit, or with all other edits; None if no text has just these."""
+        """Return the outcome with only one edit, or without only this edit if `is_undone`.
+
+        The result is None if no mixed version of the text has exactly these edits.
+        """
         change_indices: Sequence[int] = range(len(versions.changes))
         if edit.change is not None:
             change_indices = (versions.changes.index(edit.change),)

@@ -112,7 +112,7 @@ def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) ->
 
 
 def _allowed_signers(signers: Path) -> tuple[str, dict[str, str]]:
-    """Return the text of an allowed_signers file, and the name of each principal that is made up here."""
+    """Return the text of an allowed_signers file, and a readable name for each generated principal."""
     try:
         lines = [line.strip() for line in signers.read_text().splitlines()]
     except UnicodeDecodeError:
