@@ -80,13 +80,13 @@ class Nav2Tree:
     def add(self, log: Any) -> tuple[TreeNode, ...]:
         """Apply a message of type `NAV2_LOG`; return all nodes after its changes."""
         for change in log.event_log:
-            key = getattr(change, "uid", change.node_name)
-            if key in self._nodes and self._nodes[key].name != change.node_name:
+            node_key = getattr(change, "uid", change.node_name)
+            if node_key in self._nodes and self._nodes[node_key].name != change.node_name:
                 # Nav2 loaded another tree, whose uids start at 1 again
                 self._nodes.clear()
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"
-            self._nodes[key] = TreeNode(change.node_name, "", None, status)
+            self._nodes[node_key] = TreeNode(change.node_name, "", None, status)
         # a stable sort: names, in old versions, stay in the order of their first change
-        keys = sorted(self._nodes, key=lambda key: key if isinstance(key, int) else 0)
-        return tuple(self._nodes[key] for key in keys)
+        node_keys = sorted(self._nodes, key=lambda key: key if isinstance(key, int) else 0)
+        return tuple(self._nodes[key] for key in node_keys)

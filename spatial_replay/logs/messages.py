@@ -81,8 +81,8 @@ class Messages:
     @classmethod
     def from_rows(cls, channels: Mapping[int, Channel], rows: Sequence[Row]) -> Messages:
         """Build the columns from single messages."""
-        *numbers, payloads = zip(*rows, strict=True) if rows else [()] * len(Row._fields)
-        channel, sequence, log_ns, publish_ns = (np.array(column, np.int64) for column in numbers)
+        *number_columns, payloads = zip(*rows, strict=True) if rows else [()] * len(Row._fields)
+        channel, sequence, log_ns, publish_ns = (np.array(column, np.int64) for column in number_columns)
         return Messages(channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def rows(self) -> Iterator[Row]:
@@ -101,41 +101,41 @@ class Messages:
     @property
     def topics(self) -> list[str]:
         """The topic of each message."""
-        names = {number: channel.topic for number, channel in self.channels.items()}
-        return [names[number] for number in self.channel.tolist()]
+        topic_by_number = {number: channel.topic for number, channel in self.channels.items()}
+        return [topic_by_number[number] for number in self.channel.tolist()]
 
     @property
     def topic_ranks(self) -> Integers:
         """(M,) int64, rank of each message's topic among the sorted topics."""
-        names = {channel.topic for channel in self.channels.values()}
-        rank = {name: place for place, name in enumerate(sorted(names))}
-        of_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
+        topics = {channel.topic for channel in self.channels.values()}
+        rank_by_topic = {topic: place for place, topic in enumerate(sorted(topics))}
+        rank_by_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
         for number, channel in self.channels.items():
-            of_channel[number] = rank[channel.topic]
-        return of_channel[self.channel]
+            rank_by_channel[number] = rank_by_topic[channel.topic]
+        return rank_by_channel[self.channel]
 
     def by_channel(self) -> Iterator[tuple[Channel, Integers]]:
         """Iterate over the channels that have messages, with the indices of their messages."""
-        for places in equal_places(self.channel):
-            yield self.channels[int(self.channel[places[0]])], places
+        for message_indices in equal_places(self.channel):
+            yield self.channels[int(self.channel[message_indices[0]])], message_indices
 
     def by_topic(self) -> Iterator[tuple[str, Integers]]:
         """Iterate over the sorted topics that have messages, with the indices of their messages."""
-        for places in equal_places(self.topic_ranks):
-            yield self.channels[int(self.channel[places[0]])].topic, places
+        for message_indices in equal_places(self.topic_ranks):
+            yield self.channels[int(self.channel[message_indices[0]])].topic, message_indices
 
     def of_topics(self, topics: Collection[str]) -> Self:
         """Return the messages of the given topics, in the same order."""
-        numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
-        places = np.flatnonzero(np.isin(self.channel, numbers))
-        return self if len(places) == len(self) else select(self, places)
+        channel_numbers = [number for number, channel in self.channels.items() if channel.topic in topics]
+        message_indices = np.flatnonzero(np.isin(self.channel, channel_numbers))
+        return self if len(message_indices) == len(self) else select(self, message_indices)
 
     def within(self, start_ns: int, end_ns: int) -> Self:
         """Return the messages with log times in [start_ns, end_ns), in the same order."""
         times_ns = self.log_time_ns
         # `end_ns` may exceed int64
-        inside = (times_ns >= start_ns) & (times_ns <= min(end_ns - 1, LATEST_NS))
-        return self if inside.all() else select(self, np.flatnonzero(inside))
+        is_inside = (times_ns >= start_ns) & (times_ns <= min(end_ns - 1, LATEST_NS))
+        return self if is_inside.all() else select(self, np.flatnonzero(is_inside))
 
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
@@ -186,12 +186,12 @@ def merge(streams: Sequence[Messages]) -> Messages:
 def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
     # by identity, because a rank holds the whole schema and is computed once for each object
-    distinct = {id(channel): channel for stream in streams for channel in stream.channels.values()}
-    by_rank = {_rank(channel): channel for channel in distinct.values()}
-    number = {rank: place for place, rank in enumerate(sorted(by_rank))}
-    numbers = {identity: number[_rank(channel)] for identity, channel in distinct.items()}
-    renumbered = [replace(stream, channel=_renumber(stream, numbers)) for stream in streams]
-    channels = {place: by_rank[rank] for rank, place in number.items()}
+    channel_by_id = {id(channel): channel for stream in streams for channel in stream.channels.values()}
+    by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
+    number_by_rank = {rank: number for number, rank in enumerate(sorted(by_rank))}
+    number_by_id = {object_id: number_by_rank[_rank(channel)] for object_id, channel in channel_by_id.items()}
+    renumbered = [replace(stream, channel=_renumber(stream, number_by_id)) for stream in streams]
+    channels = {number: by_rank[rank] for rank, number in number_by_rank.items()}
     return replace(concatenate_tables([Messages(), *renumbered]), channels=channels)
 
 
@@ -201,13 +201,13 @@ def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str,
     return channel.topic, channel.encoding, name, encoding, data, tuple(sorted(channel.metadata.items()))
 
 
-def _renumber(stream: Messages, number: dict[int, int]) -> Integers:
+def _renumber(stream: Messages, number_by_id: dict[int, int]) -> Integers:
     if not len(stream):
         return np.zeros(0, np.int64)
-    new = np.zeros(max(stream.channels) + 1, np.int64)
-    for old, channel in stream.channels.items():
-        new[old] = number[id(channel)]
-    return new[stream.channel]
+    new_numbers = np.zeros(max(stream.channels) + 1, np.int64)
+    for old_number, channel in stream.channels.items():
+        new_numbers[old_number] = number_by_id[id(channel)]
+    return new_numbers[stream.channel]
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,23 +103,23 @@ def layout_of(message: ObjectStates) -> SlotLayout:
     """
     slots = count()
 
-    def slot(present: bool, otherwise: int) -> int:
-        return next(slots) if present else otherwise
+    def slot(is_present: bool, default_slot: int) -> int:
+        return next(slots) if is_present else default_slot
 
-    time = slot(message.HasField("time_ns"), UNKNOWN)
-    names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty", "reported")
-    columns: dict[str, list[int]] = {name: [] for name in names}
+    time_slot = slot(message.HasField("time_ns"), UNKNOWN)
+    column_names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty", "reported")
+    slots_by_column: dict[str, list[int]] = {name: [] for name in column_names}
     for state in message.objects:
         # in the order in which protobuf encodes the fields
         for part in state.parts:
-            columns["coordinates"] += (next(slots) for _ in part.coordinates)
-            columns["radius"].append(slot(part.HasField("radius"), ZERO))
-        columns["yaw"].append(slot(state.HasField("yaw"), UNKNOWN))
-        absent = ZERO if state.HasField("height") else UNKNOWN
-        columns["bottom"].append(slot(state.height.HasField("bottom"), absent))
-        columns["top"].append(slot(state.height.HasField("top"), absent))
-        columns["uncertainty"].append(slot(state.HasField("uncertainty"), ZERO))
-        columns["reported"].append(slot(state.HasField("reported_ns"), UNKNOWN))
+            slots_by_column["coordinates"] += (next(slots) for _ in part.coordinates)
+            slots_by_column["radius"].append(slot(part.HasField("radius"), ZERO))
+        slots_by_column["yaw"].append(slot(state.HasField("yaw"), UNKNOWN))
+        missing_slot = ZERO if state.HasField("height") else UNKNOWN
+        slots_by_column["bottom"].append(slot(state.height.HasField("bottom"), missing_slot))
+        slots_by_column["top"].append(slot(state.height.HasField("top"), missing_slot))
+        slots_by_column["uncertainty"].append(slot(state.HasField("uncertainty"), ZERO))
+        slots_by_column["reported"].append(slot(state.HasField("reported_ns"), UNKNOWN))
     signals: dict[str, int] = {}
     signals_reported: dict[str, int] = {}
     for signal in message.signals:
@@ -129,7 +129,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
         raise WrongMessageError("a signal has no name, or one that another signal has")
     counts = (len(part.coordinates) // 2 for state in message.objects for part in state.parts)
     return SlotLayout(
-        time=time,
+        time=time_slot,
         names=tuple(state.name for state in message.objects),
         classes=tuple(s.class_name if s.HasField("class_name") else None for s in message.objects),
         lasting=frozenset(state.name for state in message.objects if state.lasting),
@@ -137,7 +137,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
         vertex_counts=np.fromiter(counts, np.int64),
         signals=signals,
         signals_reported=signals_reported,
-        **{name: np.array(slots_of, np.int64) for name, slots_of in columns.items()},
+        **{name: np.array(column_slots, np.int64) for name, column_slots in slots_by_column.items()},
     )
 
 
@@ -184,15 +184,15 @@ def decode_objects(
     groups = _groups(payloads, faults)
     faults = _late_reports(groups, times_ns) | _signals_given_twice(groups) | faults
     faults = _wrong_times(groups, times_ns) | faults
-    trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
-    faults = wrong | faults
-    if faults.keys() - wrong.keys():
-        sound = np.ones(len(times_ns), np.bool_)
-        sound[list(faults)] = False
-        trace = trace.take(np.searchsorted(trace.times_ns, times_ns[sound]))
+    trace, observation_faults = trace_from_observations(_observations(groups, times_ns), concave=concave)
+    faults = observation_faults | faults
+    if faults.keys() - observation_faults.keys():
+        is_valid = np.ones(len(times_ns), np.bool_)
+        is_valid[list(faults)] = False
+        trace = trace.take(np.searchsorted(trace.times_ns, times_ns[is_valid]))
     return trace, [
-        Sentence("sample at ", Instant(int(times_ns[index]), 0), f": {what}")
-        for index, what in sorted(faults.items())
+        Sentence("sample at ", Instant(int(times_ns[index]), 0), f": {fault}")
+        for index, fault in sorted(faults.items())
     ]
 
 
@@ -201,12 +201,12 @@ def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
 
     If layouts serve too few messages, messages are split into their objects and signals, which share layouts.
     """
-    whole = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
-    groups, left = _group_by_layout(whole, faults, SAMPLES_PER_LAYOUT)
-    if len(left.samples):
-        split = [_fields(payload) or [payload] for payload in left.payloads]
-        samples = np.repeat(left.samples, [len(fields) for fields in split])
-        pieces = _Pieces(samples, [piece for fields in split for piece in fields])
+    whole_messages = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
+    groups, leftover_pieces = _group_by_layout(whole_messages, faults, SAMPLES_PER_LAYOUT)
+    if len(leftover_pieces.samples):
+        message_fields = [_fields(payload) or [payload] for payload in leftover_pieces.payloads]
+        piece_samples = np.repeat(leftover_pieces.samples, [len(fields) for fields in message_fields])
+        pieces = _Pieces(piece_samples, [piece for fields in message_fields for piece in fields])
         groups += _group_by_layout(pieces, faults, 0)[0]
     return groups
 
@@ -218,64 +218,64 @@ def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tup
         worth: least mean number of pieces per layout, not counting the first `FIRST_LAYOUTS`.
     """
     groups: list[_Group] = []
-    left: list[Integers] = []
-    layouts_tried = served = 0
+    leftover_indices: list[Integers] = []
+    layouts_tried = pieces_served = 0
     lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
-    values, counts = np.unique(lengths, return_counts=True)
+    distinct_lengths, length_counts = np.unique(lengths, return_counts=True)
     # frequent lengths first: their layouts serve most pieces
-    for length in values[np.argsort(-counts, kind="stable")].tolist():
-        places = np.flatnonzero(lengths == length)
-        if (layouts_tried - FIRST_LAYOUTS) * worth > served:
-            left.append(places)
+    for length in distinct_lengths[np.argsort(-length_counts, kind="stable")].tolist():
+        piece_indices = np.flatnonzero(lengths == length)
+        if (layouts_tried - FIRST_LAYOUTS) * worth > pieces_served:
+            leftover_indices.append(piece_indices)
             continue
-        rows = rows_of(select(pieces, places).payloads)
-        while len(places) and (layouts_tried - FIRST_LAYOUTS) * worth <= served:
+        piece_rows = rows_of(select(pieces, piece_indices).payloads)
+        while len(piece_indices) and (layouts_tried - FIRST_LAYOUTS) * worth <= pieces_served:
             layouts_tried += 1
-            group, is_same_layout = _first_group(select(pieces, places[:1]), rows, faults)
+            group, is_same_layout = _first_group(select(pieces, piece_indices[:1]), piece_rows, faults)
             if group is not None:
-                groups.append(replace(group, samples=pieces.samples[places[is_same_layout]]))
-            served += int(np.count_nonzero(is_same_layout))
+                groups.append(replace(group, samples=pieces.samples[piece_indices[is_same_layout]]))
+            pieces_served += int(np.count_nonzero(is_same_layout))
             if not is_same_layout.all():
-                rows = rows[~is_same_layout]
-            places = places[~is_same_layout]
-        left.append(places)
-    rest = np.concatenate([np.empty(0, np.int64), *left])
-    return groups, select(pieces, np.sort(rest))
+                piece_rows = piece_rows[~is_same_layout]
+            piece_indices = piece_indices[~is_same_layout]
+        leftover_indices.append(piece_indices)
+    all_leftover = np.concatenate([np.empty(0, np.int64), *leftover_indices])
+    return groups, select(pieces, np.sort(all_leftover))
 
 
 def _first_group(
-    first: _Pieces, rows: Bytes, faults: dict[int, str]
+    first_piece: _Pieces, rows: Bytes, faults: dict[int, str]
 ) -> tuple[_Group | None, NDArray[np.bool_]]:
     """Return the group of all rows (n, L) with the layout of the first, and (n,) whether a row is settled.
 
     The group is None if the first row is not a valid message; then only that row is settled.
     """
-    alone = np.zeros(len(rows), np.bool_)
-    alone[0] = True
+    is_first_row = np.zeros(len(rows), np.bool_)
+    is_first_row[0] = True
     try:
-        message = parse_object_states(first.payloads[0])
+        message = parse_object_states(first_piece.payloads[0])
         template, layout = WireTemplate.of(message), layout_of(message)
     except (WrongMessageError, LayoutError) as error:
-        faults[int(first.samples[0])] = str(error)
-        return None, alone
-    is_same_layout = template.matches(rows) if len(template) == rows.shape[1] else ~alone
+        faults[int(first_piece.samples[0])] = str(error)
+        return None, is_first_row
+    is_same_layout = template.matches(rows) if len(template) == rows.shape[1] else ~is_first_row
     if is_same_layout[0]:
         matching_rows = rows if is_same_layout.all() else rows[is_same_layout]
-        return _Group(first.samples, layout, _pad(template.words(matching_rows))), is_same_layout
+        return _Group(first_piece.samples, layout, _pad(template.words(matching_rows))), is_same_layout
     # another encoder wrote the fields in another order, so the library encodes the message again
-    row = rows_of([message.SerializeToString(deterministic=True)])
-    return _Group(first.samples, layout, _pad(template.words(row))), alone
+    first_row = rows_of([message.SerializeToString(deterministic=True)])
+    return _Group(first_piece.samples, layout, _pad(template.words(first_row))), is_first_row
 
 
 def _fields(payload: bytes) -> list[bytes] | None:
     """Split a message into fields, each a valid message; None if a field is unknown or time is repeated."""
     pieces: list[bytes] = []
-    begin, end, times = 0, len(payload), 0
+    begin, end, time_count = 0, len(payload), 0
     while begin < end:
         tag, position = payload[begin], begin + 1
         if tag == _TIME_TAG:
             position += 8
-            times += 1
+            time_count += 1
         elif tag in (_OBJECT_TAG, _SIGNAL_TAG):
             # a varint: https://protobuf.dev/programming-guides/encoding/#varints
             length = shift = 0
@@ -288,7 +288,7 @@ def _fields(payload: bytes) -> list[bytes] | None:
             position += length
         else:
             return None
-        if position > end or times > 1:
+        if position > end or time_count > 1:
             return None
         pieces.append(payload[begin:position])
         begin = position
@@ -302,21 +302,21 @@ def _wrong_times(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]
         if group.layout.time != UNKNOWN:
             stated_ns[group.samples] = _whole(group, group.layout.time)
             has_time[group.samples] = True
-    wrong = np.flatnonzero(has_time & (stated_ns != times_ns)).tolist()
-    faults = {index: f"time_ns is {stated_ns[index]}, not the log time of the message" for index in wrong}
+    indices = np.flatnonzero(has_time & (stated_ns != times_ns)).tolist()
+    faults = {index: f"time_ns is {stated_ns[index]}, not the log time of the message" for index in indices}
     return faults | dict.fromkeys(np.flatnonzero(~has_time).tolist(), "the message has no time_ns")
 
 
 def _late_reports(groups: Sequence[_Group], times_ns: Integers) -> dict[int, str]:
     faults: dict[int, str] = {}
     for group in groups:
-        slots = [*zip(group.layout.names, group.layout.reported.tolist(), strict=True)]
-        for name, slot in (*slots, *group.layout.signals_reported.items()):
+        named_slots = [*zip(group.layout.names, group.layout.reported.tolist(), strict=True)]
+        for name, slot in (*named_slots, *group.layout.signals_reported.items()):
             if slot != UNKNOWN:
                 reported_ns = _whole(group, slot)
                 is_wrong = (reported_ns < 0) | (reported_ns > times_ns[group.samples])
-                what = f"reported_ns of {name!r} is not a time up to that of the sample"
-                faults |= dict.fromkeys(group.samples[is_wrong].tolist(), what)
+                fault = f"reported_ns of {name!r} is not a time up to that of the sample"
+                faults |= dict.fromkeys(group.samples[is_wrong].tolist(), fault)
     return faults
 
 
@@ -345,28 +345,30 @@ def _pad(words: Words) -> Floats:
 
 
 def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
-    names = {name: code for code, name in enumerate(dict.fromkeys(n for g in groups for n in g.layout.names))}
-    ordered = class_order(name for group in groups for name in group.layout.classes)
-    classes = {name: code for code, name in enumerate(ordered)}
+    name_codes = {
+        name: code for code, name in enumerate(dict.fromkeys(n for g in groups for n in g.layout.names))
+    }
+    class_names = class_order(name for group in groups for name in group.layout.classes)
+    class_codes = {name: code for code, name in enumerate(class_names)}
 
     def column(field: str) -> Floats:
-        picked = [np.take(g.numbers, getattr(g.layout, field), axis=1).reshape(-1) for g in groups]
-        return np.concatenate([np.empty(0), *picked])
+        group_columns = [np.take(g.numbers, getattr(g.layout, field), axis=1).reshape(-1) for g in groups]
+        return np.concatenate([np.empty(0), *group_columns])
 
-    def repeat(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
-        tiled = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in values)
-        return np.concatenate([np.empty(0, np.int64), *tiled])
+    def repeat(group_values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
+        tiled_values = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in group_values)
+        return np.concatenate([np.empty(0, np.int64), *tiled_values])
 
-    signals = sorted({name for g in groups for name in g.layout.signals})
-    require_few(names, signals)
-    samples = (np.repeat(g.samples, len(g.layout.names)) for g in groups)
+    signal_names = sorted({name for g in groups for name in g.layout.signals})
+    require_few(name_codes, signal_names)
+    sample_columns = (np.repeat(g.samples, len(g.layout.names)) for g in groups)
     return Observations(
         times_ns=times_ns,
-        sample=np.concatenate([np.empty(0, np.int64), *samples]),
-        name=repeat((g, [names[n] for n in g.layout.names]) for g in groups),
-        names=list(names),
-        class_code=repeat((g, [classes[c] for c in g.layout.classes]) for g in groups),
-        classes=ordered,
+        sample=np.concatenate([np.empty(0, np.int64), *sample_columns]),
+        name=repeat((g, [name_codes[n] for n in g.layout.names]) for g in groups),
+        names=list(name_codes),
+        class_code=repeat((g, [class_codes[c] for c in g.layout.classes]) for g in groups),
+        classes=class_names,
         yaw=column("yaw"),
         uncertainty=column("uncertainty"),
         shapes=FootprintBatch(
@@ -378,7 +380,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
             top=column("top"),
         ),
         invalid=np.concatenate([np.empty(0, np.bool_), *map(_invalid, groups)]),
-        signals={name: _signal(name, groups, len(times_ns)) for name in signals},
+        signals={name: _signal(name, groups, len(times_ns)) for name in signal_names},
         reported_ns=_report_times(groups, times_ns),
         signals_reported_ns=_signal_report_times(groups, times_ns),
         lasting=frozenset().union(*(group.layout.lasting for group in groups)),
@@ -389,12 +391,12 @@ def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | No
     """Return the report time of each observation, (R,); None if all equal the times of their samples."""
     if all((group.layout.reported == UNKNOWN).all() for group in groups):
         return None
-    columns = [np.empty(0, np.int64)]
+    report_columns = [np.empty(0, np.int64)]
     for group in groups:
         slots = group.layout.reported
         stated_ns = np.ascontiguousarray(group.numbers[:, slots]).view(np.int64)
-        columns.append(np.where(slots == UNKNOWN, times_ns[group.samples, None], stated_ns).ravel())
-    return np.concatenate(columns)
+        report_columns.append(np.where(slots == UNKNOWN, times_ns[group.samples, None], stated_ns).ravel())
+    return np.concatenate(report_columns)
 
 
 def _signal_report_times(groups: Sequence[_Group], times_ns: Integers) -> dict[str, Integers]:
@@ -409,18 +411,18 @@ def _signal_report_times(groups: Sequence[_Group], times_ns: Integers) -> dict[s
 def _invalid(group: _Group) -> NDArray[np.bool_]:
     """Return (K * J,) whether an orientation or a height is given but not finite."""
     layout = group.layout
-    invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
+    is_invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
     for slots in (layout.yaw, layout.bottom, layout.top):
-        invalid |= (slots != UNKNOWN) & ~np.isfinite(group.numbers[:, slots])
-    return invalid.ravel()
+        is_invalid |= (slots != UNKNOWN) & ~np.isfinite(group.numbers[:, slots])
+    return is_invalid.ravel()
 
 
-def _signal(name: str, groups: Sequence[_Group], count: int) -> Floats:
-    values = np.full(count, np.nan)
+def _signal(name: str, groups: Sequence[_Group], sample_count: int) -> Floats:
+    signal_values = np.full(sample_count, np.nan)
     for group in groups:
         if name in group.layout.signals:
-            values[group.samples] = group.numbers[:, group.layout.signals[name]]
-    return values
+            signal_values[group.samples] = group.numbers[:, group.layout.signals[name]]
+    return signal_values
 
 
 def sample_messages(trace: Trace, first: int) -> Messages:
@@ -435,53 +437,64 @@ def encode_objects(trace: Trace) -> Payloads:
     is joined from pieces: its time, its objects and its signals. Pieces of one layout are encoded together.
     """
     # https://protobuf.dev/programming-guides/encoding/#last-one-wins
-    count = len(trace)
-    times = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
-    signals = [_signal_pieces(trace, name) for name in trace.signals]
-    every_sample = np.arange(count)
-    of_objects = np.nonzero(trace.rows != ABSENT)[0]
-    samples = np.concatenate([every_sample, of_objects, *[every_sample] * len(signals)])
-    pieces = Payloads.concatenate([times, _object_pieces(trace), *signals])
-    return pieces.select(np.argsort(samples, kind="stable")).join(np.bincount(samples, minlength=count))
+    sample_count = len(trace)
+    time_pieces = _pieces(ObjectStates(time_ns=0), trace.times_ns.view(np.float64)[:, None])
+    signal_pieces = [_signal_pieces(trace, name) for name in trace.signals]
+    sample_indices = np.arange(sample_count)
+    object_samples = np.nonzero(trace.rows != ABSENT)[0]
+    piece_samples = np.concatenate([sample_indices, object_samples, *[sample_indices] * len(signal_pieces)])
+    pieces = Payloads.concatenate([time_pieces, _object_pieces(trace), *signal_pieces])
+    return pieces.select(np.argsort(piece_samples, kind="stable")).join(
+        np.bincount(piece_samples, minlength=sample_count)
+    )
 
 
 def _object_pieces(trace: Trace) -> Payloads:
     """Encode every object of every sample, in the order of sample and name."""
-    present = trace.rows != ABSENT
-    marked = trace.rows[present]
+    is_present = trace.rows != ABSENT
+    marked_rows = trace.rows[is_present]
     # the row number -2 - row marks an unreadable observation, see `Trace`
-    rows = np.where(marked < 0, -2 - marked, marked)
-    name = np.nonzero(present)[1]
+    row_indices = np.where(marked_rows < 0, -2 - marked_rows, marked_rows)
+    name_indices = np.nonzero(is_present)[1]
     pieces = list[tuple[Integers, Payloads]]()
-    reported_ns = np.zeros(0, np.int64) if trace.reported_ns is None else trace.reported_ns[present]
-    is_earlier = np.zeros(len(rows), np.bool_)
+    reported_ns = np.zeros(0, np.int64) if trace.reported_ns is None else trace.reported_ns[is_present]
+    is_earlier = np.zeros(len(row_indices), np.bool_)
     if trace.reported_ns is not None:
-        is_earlier = reported_ns != trace.times_ns[np.nonzero(present)[0]]
-    layouts = combined_code([name, marked < 0, is_earlier, _row_layout(trace)[rows]], len(rows))
-    for places in equal_places(layouts):
-        first = int(places[0])
-        message = _message(trace, int(name[first]), int(rows[first]), unreadable=bool(marked[first] < 0))
-        numbers = _numbers(trace, message, rows[places])
-        if is_earlier[first]:
+        is_earlier = reported_ns != trace.times_ns[np.nonzero(is_present)[0]]
+    layout_codes = combined_code(
+        [name_indices, marked_rows < 0, is_earlier, _row_layout(trace)[row_indices]], len(row_indices)
+    )
+    for object_indices in equal_places(layout_codes):
+        first_index = int(object_indices[0])
+        message = _message(
+            trace,
+            int(name_indices[first_index]),
+            int(row_indices[first_index]),
+            is_unreadable=bool(marked_rows[first_index] < 0),
+        )
+        numbers = _numbers(trace, message, row_indices[object_indices])
+        if is_earlier[first_index]:
             message.objects[0].reported_ns = 0
-            numbers = np.column_stack([numbers, reported_ns[places].view(np.float64)])
-        pieces.append((places, _pieces(message, numbers)))
+            numbers = np.column_stack([numbers, reported_ns[object_indices].view(np.float64)])
+        pieces.append((object_indices, _pieces(message, numbers)))
     return join_in_order(pieces)
 
 
 def _signal_pieces(trace: Trace, name: str) -> Payloads:
     """Encode a signal of every sample; an unknown value gives an empty piece."""
-    message, values = ObjectStates(), trace.signals[name]
+    message, signal_values = ObjectStates(), trace.signals[name]
     signal = message.signals.add(name=name, value=0.0)
-    pieces = _pieces(message, values[:, None])
+    pieces = _pieces(message, signal_values[:, None])
     reported_ns = trace.signals_reported_ns.get(name, trace.times_ns)
     is_earlier = reported_ns != trace.times_ns
     if is_earlier.any():
         signal.reported_ns = 0
-        numbers = np.column_stack([values[is_earlier], reported_ns[is_earlier].view(np.float64)])
-        current, earlier = np.flatnonzero(~is_earlier), np.flatnonzero(is_earlier)
-        pieces = join_in_order([(current, pieces.select(current)), (earlier, _pieces(message, numbers))])
-    return pieces.without(np.isnan(values))
+        numbers = np.column_stack([signal_values[is_earlier], reported_ns[is_earlier].view(np.float64)])
+        current_samples, earlier_samples = np.flatnonzero(~is_earlier), np.flatnonzero(is_earlier)
+        pieces = join_in_order(
+            [(current_samples, pieces.select(current_samples)), (earlier_samples, _pieces(message, numbers))]
+        )
+    return pieces.without(np.isnan(signal_values))
 
 
 def _pieces(message: Message, numbers: Floats) -> Payloads:
@@ -492,35 +505,35 @@ def _pieces(message: Message, numbers: Floats) -> Payloads:
 def _row_layout(trace: Trace) -> Integers:
     """Return (R,) codes; observations of one code have messages that differ only in numbers and name."""
     shapes = trace.footprints
-    counts = np.diff(shapes.part_start)
+    part_counts = np.diff(shapes.part_start)
     vertex_counts = np.diff(shapes.vertex_start)
-    columns = [counts, trace.class_code, np.isnan(trace.yaw), np.isnan(shapes.bottom)]
-    for place in range(int(counts.max(initial=0))):
-        has_part = counts > place
-        column = np.zeros(len(counts), np.int64)
-        column[has_part] = vertex_counts[shapes.part_start[:-1][has_part] + place]
+    columns = [part_counts, trace.class_code, np.isnan(trace.yaw), np.isnan(shapes.bottom)]
+    for part_index in range(int(part_counts.max(initial=0))):
+        has_part = part_counts > part_index
+        column = np.zeros(len(part_counts), np.int64)
+        column[has_part] = vertex_counts[shapes.part_start[:-1][has_part] + part_index]
         columns.append(column)
-    return combined_code(columns, len(counts))
+    return combined_code(columns, len(part_counts))
 
 
-def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectStates:
+def _message(trace: Trace, name_index: int, row: int, *, is_unreadable: bool) -> ObjectStates:
     """Return the message of one observation, with all its numbers 0.
 
     An unreadable observation gets orientation and height, because either may be the value that is not finite.
     """
     shapes = trace.footprints
     message = ObjectStates()
-    state = message.objects.add(name=trace.names[name], uncertainty=0.0)
-    state.lasting = not unreadable and state.name in trace.lasting
+    state = message.objects.add(name=trace.names[name_index], uncertainty=0.0)
+    state.lasting = not is_unreadable and state.name in trace.lasting
     class_name = trace.classes[trace.class_code[row]]
     if class_name is not None:
         state.class_name = class_name
-    for part in range(shapes.part_start[row], shapes.part_start[row + 1]):
-        corners = int(shapes.vertex_start[part + 1] - shapes.vertex_start[part])
-        state.parts.add(coordinates=[0.0] * (2 * corners), radius=0.0)
-    if unreadable or not np.isnan(trace.yaw[row]):
+    for part_index in range(shapes.part_start[row], shapes.part_start[row + 1]):
+        vertex_count = int(shapes.vertex_start[part_index + 1] - shapes.vertex_start[part_index])
+        state.parts.add(coordinates=[0.0] * (2 * vertex_count), radius=0.0)
+    if is_unreadable or not np.isnan(trace.yaw[row]):
         state.yaw = 0.0
-    if unreadable or not np.isnan(shapes.bottom[row]):
+    if is_unreadable or not np.isnan(shapes.bottom[row]):
         state.height.bottom = state.height.top = 0.0
     return message
 
@@ -530,12 +543,16 @@ def _numbers(trace: Trace, message: ObjectStates, rows: Integers) -> Floats:
     (state,) = message.objects
     shapes = trace.footprints
     columns: list[Floats] = []
-    parts = shapes.part_start[rows]
-    for place, part in enumerate(state.parts):
-        begin = shapes.vertex_start[parts + place]
-        corners = np.arange(len(part.coordinates) // 2)
-        columns.append(shapes.vertices[begin[:, None] + corners].reshape(len(rows), len(part.coordinates)))
-        columns.append(shapes.radius[parts + place, None])
+    first_parts = shapes.part_start[rows]
+    for part_index, part in enumerate(state.parts):
+        first_vertices = shapes.vertex_start[first_parts + part_index]
+        vertex_offsets = np.arange(len(part.coordinates) // 2)
+        columns.append(
+            shapes.vertices[first_vertices[:, None] + vertex_offsets].reshape(
+                len(rows), len(part.coordinates)
+            )
+        )
+        columns.append(shapes.radius[first_parts + part_index, None])
     if state.HasField("yaw"):
         columns.append(trace.yaw[rows, None])
     if state.HasField("height"):

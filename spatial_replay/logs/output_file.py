@@ -106,8 +106,8 @@ def _lock(descriptor: int, output: Path) -> None:
 
 def _stream(file: int, output: Path, durability: Durability = "process") -> BinaryIO:
     with _writing(output):
-        kind = io.BufferedWriter if durability == "process" else _DurableWriter
-        return kind(_OutputFile(file, output), 1 << 20)
+        stream_type = io.BufferedWriter if durability == "process" else _DurableWriter
+        return stream_type(_OutputFile(file, output), 1 << 20)
 
 
 class _DurableWriter(io.BufferedWriter):

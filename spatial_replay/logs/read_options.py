@@ -105,9 +105,10 @@ class ReadOptions:
         """
         for name, value in self.non_defaults().items():
             if name not in accepted:
-                text = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
+                value_text = fspath(cast("PathLike[str]", value)) if name == "mapping" else value
                 raise UsageError(
-                    f"{_option(name, text)} does not apply to {log} ({kind}): {_REASONS[name]}; leave it out"
+                    f"{_option(name, value_text)} does not apply to {log} ({kind}): {_REASONS[name]}; leave"
+                    " it out"
                 )
 
 
@@ -120,10 +121,10 @@ def late_ns(text: object) -> int:
     Raises:
         UsageError: another text.
     """
-    late = LATEST_NS if text == "all" else _nanoseconds(text)
-    if late is None:
+    lateness_ns = LATEST_NS if text == "all" else _nanoseconds(text)
+    if lateness_ns is None:
         raise UsageError(f"max_lateness is {shortened(text)}; give a duration such as 2s or 500ms, or all")
-    return late
+    return lateness_ns
 
 
 def gap_ns(text: object) -> int | None:
@@ -132,10 +133,10 @@ def gap_ns(text: object) -> int | None:
     Raises:
         UsageError: another text, or 0.
     """
-    gap = _nanoseconds(text)
-    if text is not None and not gap:
+    pause_ns = _nanoseconds(text)
+    if text is not None and not pause_ns:
         raise UsageError(f"max_gap is {shortened(text)}; give a duration above 0, such as 2s or 500ms")
-    return gap
+    return pause_ns
 
 
 def _nanoseconds(text: object) -> int | None:
@@ -188,41 +189,41 @@ _MORE = re.compile(r"… and (\d+) more faults? of")
 
 def count_of(faults: Sequence[str]) -> int:
     """Count faults, including the later faults that the last line counts."""
-    uncounted = _MORE.match(faults[-1]) if faults else None
-    return len(faults) + (int(uncounted[1]) - 1 if uncounted else 0)
+    more_match = _MORE.match(faults[-1]) if faults else None
+    return len(faults) + (int(more_match[1]) - 1 if more_match else 0)
 
 
 class FaultList:
     """Faults in the order of discovery; `take` returns each once."""
 
     def __init__(self) -> None:
-        self._count = 0
-        self._moved = 0
-        self._waiting: list[str] = []
+        self._fault_count = 0
+        self._moved_count = 0
+        self._pending: list[str] = []
 
     def __len__(self) -> int:
-        return self._count
+        return self._fault_count
 
     def add(self, fault: str) -> None:
         """Add a fault with its place."""
-        self._count += 1
-        if self._count <= MOST_FAULTS:
-            self._waiting.append(fault)
+        self._fault_count += 1
+        if self._fault_count <= MOST_FAULTS:
+            self._pending.append(fault)
 
     def move_to(self, target: FaultList) -> None:
         """Move pending faults to another list; add the number of faults beyond the limit to its count."""
         for fault in self.take():
             target.add(fault)
-        beyond = max(0, self._count - MOST_FAULTS)
-        target._count += beyond - self._moved
-        self._moved = beyond
+        excess = max(0, self._fault_count - MOST_FAULTS)
+        target._fault_count += excess - self._moved_count
+        self._moved_count = excess
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
         """Return the faults since the last call. With `last`, add a line that counts the later faults."""
-        faults, self._waiting = self._waiting, []
-        if last and self._count > MOST_FAULTS:
-            more = self._count - MOST_FAULTS
-            faults.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
+        faults, self._pending = self._pending, []
+        if last and self._fault_count > MOST_FAULTS:
+            excess = self._fault_count - MOST_FAULTS
+            faults.append(f"… and {excess} more fault{'s' if excess > 1 else ''} of this kind or another")
         return tuple(faults)
 
 
@@ -234,28 +235,29 @@ class FaultKinds(FaultList):
 
     def __init__(self) -> None:
         super().__init__()
-        self._first: dict[str, str] = {}
-        self._more: Counter[str] = Counter()
+        self._first_by_kind: dict[str, str] = {}
+        self._repeat_counts: Counter[str] = Counter()
 
     def add(self, fault: str) -> None:
         """Add a fault with its place."""
-        place, at, what = str(fault).partition(" at ")
-        kind = f"{place}{at}{_NUMBER.sub('0', what)}"
-        if kind in self._first:
-            self._more[kind] += 1
-        elif len(self._first) < MOST_FAULTS:
-            self._first[kind] = str(fault)
+        place, separator, fault_text = str(fault).partition(" at ")
+        kind = f"{place}{separator}{_NUMBER.sub('0', fault_text)}"
+        if kind in self._first_by_kind:
+            self._repeat_counts[kind] += 1
+        elif len(self._first_by_kind) < MOST_FAULTS:
+            self._first_by_kind[kind] = str(fault)
             super().add(fault)
         else:
-            self._more[_FURTHER] += 1
+            self._repeat_counts[_FURTHER] += 1
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
         """Return the first fault of each new kind. With `last`, add a count of repetitions for each kind."""
         faults = super().take()
         if not last:
             return faults
-        counts, self._more = self._more, Counter()
+        counts, self._repeat_counts = self._repeat_counts, Counter()
         more = (
-            f"… and {count:,} more like this: {self._first.get(kind, kind)}" for kind, count in counts.items()
+            f"… and {count:,} more like this: {self._first_by_kind.get(kind, kind)}"
+            for kind, count in counts.items()
         )
         return (*faults, *more)

@@ -66,18 +66,18 @@ class RangeStream(io.RawIOBase):
         A batch is fetched when one of its ranges is read. From the second batch on, the next batch is fetched
         in advance.
         """
-        batch, size, most = list[Range](), 0, _BATCH_BYTES
-        in_order = list(ranges)
-        if sum(end - begin for begin, end in in_order) > _BATCH_BYTES:
+        batch, batch_bytes, batch_limit = list[Range](), 0, _BATCH_BYTES
+        planned_ranges = list(ranges)
+        if sum(end - begin for begin, end in planned_ranges) > _BATCH_BYTES:
             # a small first batch, because the reader may stop after the first messages
-            most = _BATCH_BYTES // 32
-        for begin, end in in_order:
+            batch_limit = _BATCH_BYTES // 32
+        for begin, end in planned_ranges:
             batch.append((begin, end))
             self._batch_of.setdefault(begin, len(self._batches))
-            size += end - begin
-            if size >= most:
+            batch_bytes += end - begin
+            if batch_bytes >= batch_limit:
                 self._batches.append(batch)
-                batch, size, most = [], 0, min(4 * most, _BATCH_BYTES // 2)
+                batch, batch_bytes, batch_limit = [], 0, min(4 * batch_limit, _BATCH_BYTES // 2)
         if batch:
             self._batches.append(batch)
 
@@ -88,14 +88,14 @@ class RangeStream(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position}.get(whence)
-        self._position = (self._file.size if base is None else base) + offset
+        base_offset = {os.SEEK_SET: 0, os.SEEK_CUR: self._position}.get(whence)
+        self._position = (self._file.size if base_offset is None else base_offset) + offset
         return self._position
 
     def read(self, size: int = -1) -> bytes:
         end = self._file.size if size < 0 else self._position + size
-        if (batch := self._batch_of.get(self._position)) is not None:
-            self._fetch(batch)
+        if (batch_number := self._batch_of.get(self._position)) is not None:
+            self._fetch(batch_number)
         data = self._file.read(self._position, end)
         self._position += len(data)
         return data
@@ -105,14 +105,16 @@ class RangeStream(io.RawIOBase):
             self._thread.shutdown(wait=False, cancel_futures=True)
         super().close()
 
-    def _fetch(self, batch: int) -> None:
+    def _fetch(self, index: int) -> None:
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "remote-batches")
         # the first batch is fetched alone, because a search for the first sample needs no other
-        for number in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
-            if number not in self._fetching:
-                self._fetching[number] = self._thread.submit(self._file.fetch, self._batches[number])
-        self._fetching[batch].result()
+        for batch_index in range(index, min(index + 1 + bool(index), len(self._batches))):
+            if batch_index not in self._fetching:
+                self._fetching[batch_index] = self._thread.submit(
+                    self._file.fetch, self._batches[batch_index]
+                )
+        self._fetching[index].result()
 
 
 _Item = TypeVar("_Item")
@@ -132,20 +134,20 @@ def each_ahead(
     `most`, and at most twice the yielded size. So a caller that takes only the first item reads few items.
     """
     threads = ThreadPoolExecutor(at_once, "reading-ahead")
-    waiting: deque[tuple[int, Future[_Read]]] = deque()
-    ahead = yielded = 0
+    pending_reads: deque[tuple[int, Future[_Read]]] = deque()
+    ahead_size = yielded_size = 0
     try:
         for item in items:
-            waiting.append((size(item), threads.submit(read, item)))
-            ahead += size(item)
+            pending_reads.append((size(item), threads.submit(read, item)))
+            ahead_size += size(item)
             # with `most` as the only limit, up to 39 % of a log were read for a window of one second
-            while ahead > min(most, 2 * yielded) and len(waiting) > at_once:
-                first, reading = waiting.popleft()
-                ahead -= first
-                yielded += first
-                yield reading.result()
-        while waiting:
-            yield waiting.popleft()[1].result()
+            while ahead_size > min(most, 2 * yielded_size) and len(pending_reads) > at_once:
+                first_size, future = pending_reads.popleft()
+                ahead_size -= first_size
+                yielded_size += first_size
+                yield future.result()
+        while pending_reads:
+            yield pending_reads.popleft()[1].result()
     finally:
         # garbage collection may close this generator while a thread starts, and a wait would then block it
         threads.shutdown(wait=False, cancel_futures=True)
@@ -162,19 +164,19 @@ def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
     ordered = sorted(span for span in ranges if span[1] > span[0])
     needed_bytes = sum(end - begin for begin, end in ordered)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
-    bridged, wasted = set[int](), 0
+    bridged_gaps, wasted_bytes = set[int](), 0
     for gap, index in gaps:
-        wasted += max(gap, 0)
-        if wasted > _WASTE * needed_bytes:
+        wasted_bytes += max(gap, 0)
+        if wasted_bytes > _WASTE * needed_bytes:
             break
-        bridged.add(index)
-    result: list[Range] = []
+        bridged_gaps.add(index)
+    merged_ranges: list[Range] = []
     for index, (begin, end) in enumerate(ordered):
-        if index - 1 in bridged:
-            result[-1] = (result[-1][0], max(result[-1][1], end))
+        if index - 1 in bridged_gaps:
+            merged_ranges[-1] = (merged_ranges[-1][0], max(merged_ranges[-1][1], end))
         else:
-            result.append((begin, end))
-    return result
+            merged_ranges.append((begin, end))
+    return merged_ranges
 
 
 class HeldBytes:
@@ -187,12 +189,12 @@ class HeldBytes:
 
     def missing(self, begin: int, end: int) -> list[Range]:
         """Return the parts of a range that are not held."""
-        gaps = []
+        missing_ranges = []
         for start, data in self._overlapping(begin, end):
             if start > begin:
-                gaps.append((begin, start))
+                missing_ranges.append((begin, start))
             begin = max(begin, start + len(data))
-        return [*gaps, (begin, end)] if begin < end else gaps
+        return [*missing_ranges, (begin, end)] if begin < end else missing_ranges
 
     def read(self, begin: int, end: int) -> bytes:
         """Return the bytes of a range that is held."""
@@ -208,15 +210,16 @@ class HeldBytes:
             self._size += end - start
         while len(self._parts) > 1 and self._size > MOST_HELD_BYTES:
             # dicts keep the order of insertion
-            oldest = next(iter(self._parts))
-            self._size -= len(self._parts.pop(oldest))
-            self._begins.remove(oldest)
+            oldest_start = next(iter(self._parts))
+            self._size -= len(self._parts.pop(oldest_start))
+            self._begins.remove(oldest_start)
 
     def _overlapping(self, begin: int, end: int) -> list[tuple[int, bytes]]:
         """Return the parts that overlap a range, in order, each with its offset in the file."""
-        first = max(bisect_right(self._begins, begin) - 1, 0)
+        first_index = max(bisect_right(self._begins, begin) - 1, 0)
         parts = (
-            (start, self._parts[start]) for start in self._begins[first : bisect_left(self._begins, end)]
+            (start, self._parts[start])
+            for start in self._begins[first_index : bisect_left(self._begins, end)]
         )
         return [(start, data) for start, data in parts if start + len(data) > begin]
 
@@ -331,26 +334,26 @@ class RemoteFile(PathLike[str]):
         Raises:
             UsageError: the address names no file, or obstore is not installed.
         """
-        parts = urlsplit(address)
-        self._scheme = parts.scheme
+        url = urlsplit(address)
+        self._scheme = url.scheme
         self._address = address
         if self._scheme in WEB_SCHEMES:
             # the query after the path may be a signature, which is a secret
-            self._shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
-            self._key, bucket, name = "", address, unquote(parts.path).rpartition("/")[2]
+            self._public_address = f"{url.scheme}://{url.netloc.rpartition('@')[2]}{url.path}"
+            self._key, bucket, name = "", address, unquote(url.path).rpartition("/")[2]
         else:
-            self._shown = address
+            self._public_address = address
             bucket, _, self._key = address.partition("://")[2].partition("/")
             name = self._key.rpartition("/")[2]
-        if not name or not parts.netloc:
+        if not name or not url.netloc:
             raise UsageError(
-                f"{self._shown} names no file; give the address of one log, such as s3://bucket/run.mcap"
+                f"{self._public_address} names no file; give the address of one log, such as s3://bucket/run.mcap"
             )
-        _refuse_empty_parts(self._shown, self._key)
+        _refuse_empty_parts(self._public_address, self._key)
         self.name = name
         self._obstore = obstore_library()
         self._store = open_store(self._scheme, bucket)
-        self._held = HeldBytes()
+        self._held_bytes = HeldBytes()
         # two locks, because the first read holds `_opening` and may take `_lock` in `fetch`
         self._lock, self._opening = Lock(), Lock()
         self._version: FileVersion | None = None
@@ -359,10 +362,10 @@ class RemoteFile(PathLike[str]):
         return self._address
 
     def __str__(self) -> str:
-        return self._shown
+        return self._public_address
 
     def __repr__(self) -> str:
-        return f"RemoteFile({self._shown!r})"
+        return f"RemoteFile({self._public_address!r})"
 
     @property
     def version(self) -> FileVersion:
@@ -407,28 +410,28 @@ class RemoteFile(PathLike[str]):
         end = min(end, self.version.size)
         # a read of more than half of the cache is not cached, because it would evict its own beginning
         if end - begin > MOST_HELD_BYTES // 2:
-            bounds = range(begin, end, _PIECE_BYTES)
-            return b"".join(self.iter_pieces([(start, min(start + _PIECE_BYTES, end)) for start in bounds]))
+            starts = range(begin, end, _PIECE_BYTES)
+            return b"".join(self.iter_pieces([(start, min(start + _PIECE_BYTES, end)) for start in starts]))
         while True:
             with self._lock:
-                missing = self._held.missing(begin, end)
-                if not missing:
-                    return self._held.read(begin, end)
-            first, last = missing[0][0], missing[-1][1]
-            self.fetch([(first, min(max(last, first + _LEAST_BYTES), self.version.size))])
+                missing_ranges = self._held_bytes.missing(begin, end)
+                if not missing_ranges:
+                    return self._held_bytes.read(begin, end)
+            first_byte, end_byte = missing_ranges[0][0], missing_ranges[-1][1]
+            self.fetch([(first_byte, min(max(end_byte, first_byte + _LEAST_BYTES), self.version.size))])
 
     def fetch(self, ranges: Iterable[Range]) -> None:
         """Read the missing parts of ranges in parallel; nearby parts are joined."""
         with self._lock:
-            missing = [gap for begin, end in ranges for gap in self._held.missing(begin, end)]
+            missing_ranges = [gap for begin, end in ranges for gap in self._held_bytes.missing(begin, end)]
         pieces = [
             (begin, min(begin + _PIECE_BYTES, end))
-            for first, end in joined_ranges(missing)
-            for begin in range(first, end, _PIECE_BYTES)
+            for range_begin, end in joined_ranges(missing_ranges)
+            for begin in range(range_begin, end, _PIECE_BYTES)
         ]
         for (begin, _), data in zip(pieces, self.iter_pieces(pieces), strict=True):
             with self._lock:
-                self._held.add(begin, data)
+                self._held_bytes.add(begin, data)
 
     def iter_pieces(self, pieces: Sequence[Range], at_once: int = _AT_ONCE) -> Iterator[bytes]:
         """Read ranges in parallel, and yield their bytes in order, without caching them."""
@@ -438,37 +441,37 @@ class RemoteFile(PathLike[str]):
         """Read the whole file in parts, in order."""
         version = self.version
         if version.has_ranges:
-            bounds = range(0, version.size, _PIECE_BYTES)
-            pieces = [(begin, min(begin + _PIECE_BYTES, version.size)) for begin in bounds]
+            starts = range(0, version.size, _PIECE_BYTES)
+            pieces = [(begin, min(begin + _PIECE_BYTES, version.size)) for begin in starts]
             yield from self.iter_pieces(pieces, at_once=8)
             return
         try:
             yield from map(bytes, self._get({}).stream(min_chunk_size=2**20))
         except self._obstore.exceptions.BaseError as error:
-            raise store_failure(self._shown, self._scheme, error) from None
+            raise store_failure(self._public_address, self._scheme, error) from None
 
     def _read_ends(self) -> FileVersion:
         """Read the end and the beginning in parallel; return the version."""
         with ThreadPoolExecutor(1, "remote-reading") as thread:
-            head = thread.submit(self._part, {"range": (0, _HEAD_BYTES)})
+            head_read = thread.submit(self._part, {"range": (0, _HEAD_BYTES)})
             try:
                 version, begin, tail = self._part({"range": {"suffix": _TAIL_BYTES}})
-                first, _, beginning = head.result()
+                head_version, _, beginning = head_read.result()
             except self._obstore.exceptions.NotSupportedError:
-                return self._without_suffix(head)
-        if first != version:
+                return self._without_suffix(head_read)
+        if head_version != version:
             raise self._replacement_error()
-        self._held.add(begin, tail)
-        self._held.add(0, beginning)
+        self._held_bytes.add(begin, tail)
+        self._held_bytes.add(0, beginning)
         return version
 
-    def _without_suffix(self, head: Future[tuple[FileVersion, int, bytes]]) -> FileVersion:
+    def _without_suffix(self, head_read: Future[tuple[FileVersion, int, bytes]]) -> FileVersion:
         """Return the version from a server that refuses suffix ranges (Azure), or all ranges."""
         try:
-            version, _, beginning = head.result()
+            version, _, beginning = head_read.result()
         except self._obstore.exceptions.NotSupportedError:
             return self._version_of(self._get({"head": True}).meta, has_ranges=False)
-        self._held.add(0, beginning)
+        self._held_bytes.add(0, beginning)
         self._version = version
         self.fetch([(max(0, version.size - _TAIL_BYTES), version.size)])
         return version
@@ -478,8 +481,8 @@ class RemoteFile(PathLike[str]):
         version_before = self._version
         # If-Match refuses weak tags, so the tag of the answer is compared too:
         # https://www.rfc-editor.org/rfc/rfc9110#section-13.1.1
-        strong = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
-        version, _, data = self._part({"range": requested, **strong})
+        condition = {"if_match": version_before.tag} if version_before and version_before.is_exact else {}
+        version, _, data = self._part({"range": requested, **condition})
         if version != version_before or len(data) != requested[1] - requested[0]:
             raise self._replacement_error()
         return data
@@ -497,7 +500,7 @@ class RemoteFile(PathLike[str]):
                 error = failure
             # obstore repeats failed requests, but not answers that break off
             if attempt == _ATTEMPTS:
-                raise store_failure(self._shown, self._scheme, error) from None
+                raise store_failure(self._public_address, self._scheme, error) from None
         raise AssertionError
 
     def _get(self, options: dict[str, Any]) -> Any:
@@ -509,17 +512,17 @@ class RemoteFile(PathLike[str]):
         except exceptions.PreconditionError:
             raise self._replacement_error() from None
         except (OSError, ValueError, exceptions.BaseError) as error:
-            raise store_failure(self._shown, self._scheme, error) from None
+            raise store_failure(self._public_address, self._scheme, error) from None
 
     @staticmethod
     def _version_of(meta: Any, *, has_ranges: bool = True) -> FileVersion:
-        modified = meta["last_modified"]
+        modified_at = meta["last_modified"]
         # obstore gives the epoch for an answer without a date
-        dated = modified.isoformat() if modified and modified.timestamp() > 0 else None
-        return FileVersion(meta["size"], meta["e_tag"] or dated, has_ranges)
+        date = modified_at.isoformat() if modified_at and modified_at.timestamp() > 0 else None
+        return FileVersion(meta["size"], meta["e_tag"] or date, has_ranges)
 
     def _replacement_error(self) -> RemoteError:
-        return RemoteError(f"{self._shown} was replaced while it was read; run the command again")
+        return RemoteError(f"{self._public_address} was replaced while it was read; run the command again")
 
 
 LogFile: TypeAlias = Path | RemoteFile
@@ -595,15 +598,15 @@ def store_failure(address: str, scheme: str, error: Exception, action: str = "re
         return MissingFileError(f"{address}: there is no such file; check the address")
     if isinstance(error, (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError)):
         return MissingFileError(f"{address}: access denied; {_CREDENTIALS[scheme]}")
-    text = str(error).partition("\n")[0].strip()
-    if "empty path segment" in text:
-        key = text.partition('"')[2].rpartition('"')[0]
+    message = str(error).partition("\n")[0].strip()
+    if "empty path segment" in message:
+        key = message.partition('"')[2].rpartition('"')[0]
         return RemoteError(f"{address}: the object {key!r} {_EMPTY_PART}, or name a folder without it")
-    if "404 " in text:
+    if "404 " in message:
         return MissingFileError(f"{address}: there is no such bucket; check the address")
-    if "416 " in text:
+    if "416 " in message:
         return RemoteError(f"{address} is empty; give a log with at least one sample")
-    reason = fspath(text).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
+    reason = fspath(message).rpartition(" - ")[2].partition(": <")[0].rstrip(":")
     reason = _REASONS.get(reason.rpartition("HTTP error: ")[2], reason)
     remedy = "the address" if scheme in WEB_SCHEMES else f"the credentials: {_CREDENTIALS[scheme]}"
     return RemoteError(f"{address} cannot be {action}: {reason}; check the network and {remedy}")
@@ -623,11 +626,11 @@ _shows: Final[ContextVar[Show | None]] = ContextVar("shows", default=None)
 @contextmanager
 def showing_downloads(show: Show) -> Iterator[None]:
     """Show the progress of downloads of this thread, as a context."""
-    before = _shows.set(show)
+    token = _shows.set(show)
     try:
         yield
     finally:
-        _shows.reset(before)
+        _shows.reset(token)
 
 
 def local_copy(path: str | PathLike[str]) -> Path:
@@ -668,10 +671,10 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
     """
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
-    parent = user_cache_folder("downloads")
+    downloads_folder = user_cache_folder("downloads")
     # with the version, so that each version has its own copy
     identities = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
-    folder = parent / hashlib.sha256("\n".join(identities).encode()).hexdigest()[:32]
+    folder = downloads_folder / hashlib.sha256("\n".join(identities).encode()).hexdigest()[:32]
     # without a strong tag, a copy may be outdated, so it is made again
     if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
@@ -686,24 +689,24 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
             f" set {_LIMIT} to more gigabytes, or copy the log to this machine"
         )
     if reason:
-        _LOG.warning("%s: downloading %.1f MB once, to %s: %s", address, size / 1e6, parent, reason)
+        _LOG.warning("%s: downloading %.1f MB once, to %s: %s", address, size / 1e6, downloads_folder, reason)
     show = _shows.get()
     try:
-        parent.mkdir(parents=True, exist_ok=True)
-        _make_room(parent, limit - size)
+        downloads_folder.mkdir(parents=True, exist_ok=True)
+        _make_room(downloads_folder, limit - size)
         # renamed when it is complete, so that no process reads a partial copy
-        partial = Path(tempfile.mkdtemp(".partial", "", parent))
+        partial_folder = Path(tempfile.mkdtemp(".partial", "", downloads_folder))
         try:
-            (partial / below).mkdir(exist_ok=True)
+            (partial_folder / below).mkdir(exist_ok=True)
             with nullcontext(lambda size: None) if show is None else show("downloading", size) as advance:
                 for file in files:
-                    _write(file, partial / below / _name(file), advance)
+                    _write(file, partial_folder / below / _name(file), advance)
             shutil.rmtree(folder, ignore_errors=True)
             # another process has made the same copy
             with suppress(FileExistsError):
-                partial.rename(folder)
+                partial_folder.rename(folder)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(partial_folder, ignore_errors=True)
     except OSError as error:
         raise output_error(folder, error) from error
     return folder / below
@@ -718,31 +721,33 @@ def _has(copy: Path, size: int) -> bool:
 
 
 def _write(file: RemoteFile, copy: Path, advance: Callable[[int], None]) -> None:
-    size = 0
+    received_bytes = 0
     with copy.open("wb") as stream:
         for part in file.iter_whole():
-            size += len(part)
-            if size > file.version.size:
+            received_bytes += len(part)
+            if received_bytes > file.version.size:
                 break
             stream.write(part)
             advance(len(part))
-    if size != file.version.size:
-        raise LogError(f"{file}: {size} bytes came instead of {file.version.size}; run the command again")
+    if received_bytes != file.version.size:
+        raise LogError(
+            f"{file}: {received_bytes} bytes came instead of {file.version.size}; run the command again"
+        )
 
 
-def _make_room(parent: Path, room: int) -> None:
+def _make_room(downloads_folder: Path, room_bytes: int) -> None:
     """Remove the least recently used copies until the others fit into `room` bytes."""
     copies = []
-    for folder in parent.iterdir():
+    for folder in downloads_folder.iterdir():
         with suppress(OSError):
-            size = sum(path.stat().st_size for path in folder.rglob("*"))
-            copies.append((folder.stat().st_mtime, folder.name, size))
-    total = sum(size for *_, size in copies)
-    for _, name, size in sorted(copies):
-        if total <= room:
+            copy_bytes = sum(path.stat().st_size for path in folder.rglob("*"))
+            copies.append((folder.stat().st_mtime, folder.name, copy_bytes))
+    total_bytes = sum(copy_bytes for *_, copy_bytes in copies)
+    for _, name, copy_bytes in sorted(copies):
+        if total_bytes <= room_bytes:
             return
-        shutil.rmtree(parent / name, ignore_errors=True)
-        total -= size
+        shutil.rmtree(downloads_folder / name, ignore_errors=True)
+        total_bytes -= copy_bytes
 
 
 def user_cache_folder(name: str) -> Path:
@@ -766,12 +771,12 @@ def gigabytes(variable: str, otherwise: float) -> int:
     """
     text = os.environ.get(variable, str(otherwise))
     try:
-        size = int(float(text) * _GIGABYTE)
+        byte_count = int(float(text) * _GIGABYTE)
     except (ValueError, OverflowError):
-        size = -1
-    if size < 0:
+        byte_count = -1
+    if byte_count < 0:
         raise UsageError(f"{variable} is {text!r}; give a number of gigabytes")
-    return size
+    return byte_count
 
 
 _FILES_AT_ONCE: Final = 32
@@ -789,13 +794,13 @@ class RemoteFolder:
         Raises:
             UsageError: a web address, an address without a bucket, or obstore is not installed.
         """
-        self._scheme, _, rest = address.partition("://")
+        self._scheme, _, path = address.partition("://")
         if self._scheme in WEB_SCHEMES:
             raise UsageError(
                 "a web server neither lists nor takes files; give a folder of a bucket, such as "
                 "s3://bucket/results, or one on this machine"
             )
-        bucket, _, key = rest.partition("/")
+        bucket, _, key = path.partition("/")
         if not bucket:
             raise UsageError(f"{address} names no bucket; give one, such as s3://bucket/results")
         folder = key.strip("/")
@@ -883,12 +888,15 @@ def matching_addresses(pattern: str) -> list[str]:
         UsageError: a web server cannot list its files.
         MissingFileError, RemoteError: the bucket cannot be read.
     """
-    scheme, _, rest = pattern.partition("://")
+    scheme, _, path = pattern.partition("://")
     if scheme in WEB_SCHEMES:
         raise UsageError(f"{pattern}: web servers do not list their files; give each address")
-    bucket, _, key = rest.partition("/")
+    bucket, _, key = path.partition("/")
     _refuse_empty_parts(pattern, key)
-    begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
-    folder, key_pattern = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
-    keys = RemoteFolder(f"{scheme}://{bucket}").names(folder)
-    return [f"{scheme}://{bucket}/{name}" for name in keys if fnmatchcase(name, key_pattern)]
+    wildcard = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
+    folder, key_pattern = (
+        key[:wildcard].rpartition("/")[0],
+        key + "*" if key.endswith("/") or not key else key,
+    )
+    object_names = RemoteFolder(f"{scheme}://{bucket}").names(folder)
+    return [f"{scheme}://{bucket}/{name}" for name in object_names if fnmatchcase(name, key_pattern)]

@@ -38,17 +38,17 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
     @wraps(iter_blocks)
     def wrapper(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         pauses, reports = Pauses(), ReportsBack()
-        before: Trace | None = None
+        sample: Trace | None = None
         for block in iter_blocks(self, start_ns, end_ns):
             trace = block.trace
             pauses.add(trace.times_ns, trace.is_unknown)
             reports.add(trace)
             if self.max_gap_ns is not None and len(trace):
-                block = replace(block, trace=_without_gaps(before or Trace.empty(), trace, self.max_gap_ns))
-                before = trace.slice(len(trace) - 1, len(trace))
+                block = replace(block, trace=_without_gaps(sample or Trace.empty(), trace, self.max_gap_ns))
+                sample = trace.slice(len(trace) - 1, len(trace))
             yield block
-        pause = pauses.remark("samples", self.max_gap_ns)
-        remarks = [*([] if pause is None else [pause]), *reports.remarks()]
+        pause_remark = pauses.remark("samples", self.max_gap_ns)
+        remarks = [*([] if pause_remark is None else [pause_remark]), *reports.remarks()]
         if remarks:
             sentences = tuple(Sentence(f"{self.name}: ", remark) for remark in remarks)
             yield Block(Trace.empty(), remarks=sentences)
@@ -62,31 +62,33 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
     Args:
         before: the last sample before `trace`; empty at the beginning of the log.
     """
-    times = np.concatenate([before.times_ns, trace.times_ns])
-    gaps = np.flatnonzero(np.diff(times) > max_gap_ns).tolist()
-    parts, filled_to = [], 0
-    for gap in gaps:
-        begin = gap + 1 - len(before)
-        last = trace.slice(begin - 1, begin) if begin else before
-        first_ns, next_ns = times[gap : gap + 2].tolist()
+    times_ns = np.concatenate([before.times_ns, trace.times_ns])
+    gap_indices = np.flatnonzero(np.diff(times_ns) > max_gap_ns).tolist()
+    traces, filled_to = [], 0
+    for gap_index in gap_indices:
+        next_index = gap_index + 1 - len(before)
+        sample = trace.slice(next_index - 1, next_index) if next_index else before
+        first_ns, next_ns = times_ns[gap_index : gap_index + 2].tolist()
         step_ns = max(max_gap_ns // SAMPLES_A_GAP, (next_ns - first_ns) // _MOST_IN_GAP, 1)
         # also 1 ns from both neighbours, so that objects are unknown in the whole gap
-        steps = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
-        rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
-        signals = {name: np.full(len(steps), np.nan) for name in last.signals}
-        unknown = replace(
-            last,
-            times_ns=steps,
-            rows=rows,
+        fill_ns = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
+        unknown_rows = np.repeat(
+            np.where(sample.rows >= 0, -2 - sample.rows, sample.rows), len(fill_ns), axis=0
+        )
+        signals = {name: np.full(len(fill_ns), np.nan) for name in sample.signals}
+        unknown_samples = replace(
+            sample,
+            times_ns=fill_ns,
+            rows=unknown_rows,
             signals=signals,
             reported_ns=None,
             signals_reported_ns={},
             faults=(),
             remarks=(),
         )
-        parts += [trace.slice(filled_to, begin), unknown]
-        filled_to = begin
-    return Trace.concatenate([*parts, trace.slice(filled_to, len(trace))]) if gaps else trace
+        traces += [trace.slice(filled_to, next_index), unknown_samples]
+        filled_to = next_index
+    return Trace.concatenate([*traces, trace.slice(filled_to, len(trace))]) if gap_indices else trace
 
 
 _Read = TypeVar("_Read")
@@ -230,24 +232,24 @@ class TrackSource(FileSource):
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
         faults = FaultList()
-        any_sample = False
+        has_sample = False
         first_fault: str | None = None
         evidence = TrackEvidence()
         for trace in self.iter_traces(self.path, faults, concave=self.reading.concave):
-            any_sample = any_sample or len(trace) > 0
-            lost = faults.take()
-            first_fault = first_fault or next(iter(lost), None)
+            has_sample = has_sample or len(trace) > 0
+            new_faults = faults.take()
+            first_fault = first_fault or next(iter(new_faults), None)
             window = self.axes.convert_trace(within(trace, start_ns, end_ns))
             evidence.add(trace)
-            yield Block(replace(window, faults=lost))
+            yield Block(replace(window, faults=new_faults))
         if doubts := tuple(evidence.doubts()):
             yield Block(Trace.empty(), doubts=doubts)
-        rest = faults.take(last=True)
-        if not any_sample:
-            reason = first_fault or next(iter(rest), f"{self.name} is empty")
+        last_faults = faults.take(last=True)
+        if not has_sample:
+            reason = first_fault or next(iter(last_faults), f"{self.name} is empty")
             raise LogError(f"{self.name} holds no sample: {reason}")
-        if rest:
-            yield Block(replace(Trace.from_samples(()), faults=rest))
+        if last_faults:
+            yield Block(replace(Trace.from_samples(()), faults=last_faults))
 
 
 @dataclass(frozen=True)
@@ -298,10 +300,10 @@ def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     A short log has one or two blocks, and reading them takes less time than starting a thread.
     """
     for _ in range(2):
-        first = next(blocks, None)
-        if first is None:
+        early_block = next(blocks, None)
+        if early_block is None:
             return
-        yield first
+        yield early_block
     for block in each_ahead(lambda _: next(blocks, None), repeat(None)):
         if block is None:
             return

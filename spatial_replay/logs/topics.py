@@ -66,11 +66,11 @@ def copied_channel(channel: Channel) -> Channel:
 
 def remarks_on_copies(name: str, channels: Iterable[Channel]) -> list[str]:
     """Return remarks on channels of a log whose topics are renamed in a copy."""
-    topics = {channel.topic for channel in channels if copied_channel(channel) != channel}
+    renamed_topics = {channel.topic for channel in channels if copied_channel(channel) != channel}
     return [
         f"{name}: a copy has its messages on {topic} on {ORIGINAL_PREFIX}{topic},"
         " because a replay writes that topic"
-        for topic in sorted(topics)
+        for topic in sorted(renamed_topics)
     ]
 
 
@@ -158,8 +158,8 @@ _IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})
 def is_image_type(name: str) -> bool:
     """Return whether messages of a type are images or frames of a video: of ROS or of Foxglove."""
     # ROS writes sensor_msgs/msg/Image, Foxglove foxglove.RawImage
-    package, _, short = name.replace(".", "/").rpartition("/")
-    return short in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
+    package, _, short_name = name.replace(".", "/").rpartition("/")
+    return short_name in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
 
 
 def image_topics(channels: Iterable[Channel]) -> set[str]:
@@ -200,10 +200,10 @@ def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", data))
 
 
-def _with_dependencies(file: Any, files: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
+def _with_dependencies(file: Any, file_by_name: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
     """Return the descriptors of a file and its imports; each file follows its own imports."""
     for dependency in file.dependencies:
-        if dependency.name not in files:
-            _with_dependencies(dependency, files)
-    files[file.name] = file
-    return files.values()
+        if dependency.name not in file_by_name:
+            _with_dependencies(dependency, file_by_name)
+    file_by_name[file.name] = file
+    return file_by_name.values()

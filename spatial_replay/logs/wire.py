@@ -60,21 +60,21 @@ class WireTemplate:
         Raises:
             LayoutError: a message with fields that the schema does not have.
         """
-        first, second = (_encode(message, *sentinels) for sentinels in _SENTINELS)
-        if len(first) != len(second):
+        first_encoding, second_encoding = (_encode(message, *sentinels) for sentinels in _SENTINELS)
+        if len(first_encoding) != len(second_encoding):
             raise LayoutError("the message's length depends on its numbers")
-        differing = np.flatnonzero(first != second)
-        offsets = {8: list[int](), 1: list[int]()}
+        slot_bytes = np.flatnonzero(first_encoding != second_encoding)
+        offsets_by_width = {8: list[int](), 1: list[int]()}
         begin = 0
         for width in _slot_widths(message):
-            slot = differing[begin : begin + width]
+            slot = slot_bytes[begin : begin + width]
             if len(slot) < width or slot[-1] - slot[0] != width - 1:
                 raise LayoutError("the message's slots are not where its fields are")
-            offsets[width].append(int(slot[0]))
+            offsets_by_width[width].append(int(slot[0]))
             begin += width
-        payload = first.copy()
-        payload[differing] = 0
-        return cls(payload, np.array(offsets[8], np.int64), np.array(offsets[1], np.int64))
+        payload = first_encoding.copy()
+        payload[slot_bytes] = 0
+        return cls(payload, np.array(offsets_by_width[8], np.int64), np.array(offsets_by_width[1], np.int64))
 
     def __len__(self) -> int:
         return len(self.payload)
@@ -92,16 +92,16 @@ class WireTemplate:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
         rows = np.empty((len(words), len(self)), np.uint8)
         # rows are written twice, which takes half the time if they stay in the processor's cache
-        step = max(1, _CACHED_BYTES // max(len(self), 1))
-        for begin in range(0, len(rows), step):
-            part, own_words = rows[begin : begin + step], words[begin : begin + step]
-            part[:] = self.payload
+        batch_size = max(1, _CACHED_BYTES // max(len(self), 1))
+        for begin in range(0, len(rows), batch_size):
+            batch_rows, batch_words = rows[begin : begin + batch_size], words[begin : begin + batch_size]
+            batch_rows[:] = self.payload
             if words.size:
                 # a view of the 8 bytes from each offset of a row, since words are not aligned
-                anywhere = np.ndarray((len(part), len(self) - 7), "<u8", part, 0, (len(self), 1))
-                anywhere[:, self.word_offsets] = own_words
+                word_view = np.ndarray((len(batch_rows), len(self) - 7), "<u8", batch_rows, 0, (len(self), 1))
+                word_view[:, self.word_offsets] = batch_words
             if marks is not None:
-                part[:, self.mark_offsets] = marks[begin : begin + step]
+                batch_rows[:, self.mark_offsets] = marks[begin : begin + batch_size]
         return rows
 
     def encode(self, words: Words, marks: Bytes | None = None) -> Payloads:
@@ -117,8 +117,8 @@ class WireTemplate:
         """Return (n, W) the words of n messages (n, L) of this layout."""
         if not self.word_offsets.size:
             return np.empty((len(rows), 0), np.uint64)
-        anywhere = np.ndarray((len(rows), len(self) - 7), "<u8", rows, 0, (len(self), 1))
-        return np.asarray(anywhere[:, self.word_offsets], np.uint64)
+        word_view = np.ndarray((len(rows), len(self) - 7), "<u8", rows, 0, (len(self), 1))
+        return np.asarray(word_view[:, self.word_offsets], np.uint64)
 
 
 class Payloads(Sequence[bytes]):
@@ -139,22 +139,22 @@ class Payloads(Sequence[bytes]):
     def from_rows(cls, rows: Bytes) -> Payloads:
         """Return the rows (n, L) uint8 as n messages."""
         count, length = rows.shape
-        start = np.arange(count, dtype=np.int64) * length
-        return cls((rows.reshape(-1),), np.zeros(count, np.int64), start, np.full(count, length))
+        starts = np.arange(count, dtype=np.int64) * length
+        return cls((rows.reshape(-1),), np.zeros(count, np.int64), starts, np.full(count, length))
 
     @classmethod
     def of(cls, payloads: Sequence[bytes]) -> Payloads:
         """Convert messages: small ones are joined into one buffer, large ones keep a buffer each."""
         if isinstance(payloads, Payloads):
             return payloads
-        count = len(payloads)
-        size = np.fromiter(map(len, payloads), np.int64, count)
-        total = int(size.sum())
-        if total > _LARGE_BYTES * count:
+        message_count = len(payloads)
+        sizes = np.fromiter(map(len, payloads), np.int64, message_count)
+        total_bytes = int(sizes.sum())
+        if total_bytes > _LARGE_BYTES * message_count:
             buffers = [np.frombuffer(payload, np.uint8) for payload in payloads]
-            return cls(buffers, np.arange(count), np.zeros(count, np.int64), size)
-        joined = np.frombuffer(b"".join(payloads), np.uint8)
-        return cls((joined,), np.zeros(count, np.int64), np.cumsum(size) - size, size)
+            return cls(buffers, np.arange(message_count), np.zeros(message_count, np.int64), sizes)
+        joined_buffer = np.frombuffer(b"".join(payloads), np.uint8)
+        return cls((joined_buffer,), np.zeros(message_count, np.int64), np.cumsum(sizes) - sizes, sizes)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Sequence[bytes]]) -> Payloads:
@@ -165,23 +165,25 @@ class Payloads(Sequence[bytes]):
         ]
         buffers = [np.concatenate(small_buffers)] if small_buffers else []
         small_starts = iter(np.cumsum([0, *map(len, small_buffers)]).tolist())
-        new_buffers, new_starts = list[int](), list[int]()
+        new_indices, new_starts = list[int](), list[int]()
         for buffer in (buffer for group in groups for buffer in group.buffers):
             is_small = len(buffer) < _JOINED_BYTES
-            new_buffers.append(0 if is_small else len(buffers))
+            new_indices.append(0 if is_small else len(buffers))
             new_starts.append(next(small_starts) if is_small else 0)
             if not is_small:
                 buffers.append(buffer)
-        first_buffers = np.cumsum([0, *(len(group.buffers) for group in groups)]).tolist()
-        old_buffers = [
-            group.buffer + first_buffer for group, first_buffer in zip(groups, first_buffers, strict=False)
+        first_indices = np.cumsum([0, *(len(group.buffers) for group in groups)]).tolist()
+        group_indices = [
+            group.buffer + first_index for group, first_index in zip(groups, first_indices, strict=False)
         ]
-        old_buffer = np.concatenate([np.empty(0, np.int64), *old_buffers])
-        start = np.concatenate([np.empty(0, np.int64), *(group.start for group in groups)])
-        size = np.concatenate([np.empty(0, np.int64), *(group.size for group in groups)])
-        if not len(old_buffer):
-            return cls((), old_buffer, start, size)
-        return cls(buffers, np.array(new_buffers)[old_buffer], start + np.array(new_starts)[old_buffer], size)
+        old_indices = np.concatenate([np.empty(0, np.int64), *group_indices])
+        starts = np.concatenate([np.empty(0, np.int64), *(group.start for group in groups)])
+        sizes = np.concatenate([np.empty(0, np.int64), *(group.size for group in groups)])
+        if not len(old_indices):
+            return cls((), old_indices, starts, sizes)
+        return cls(
+            buffers, np.array(new_indices)[old_indices], starts + np.array(new_starts)[old_indices], sizes
+        )
 
     def __len__(self) -> int:
         return len(self.size)
@@ -212,23 +214,25 @@ class Payloads(Sequence[bytes]):
 
     def join(self, counts: Integers) -> Payloads:
         """Join runs of consecutive messages; `counts` (n,) has the number of messages in each run."""
-        ends = np.append(0, np.cumsum(self.size))
-        target = np.empty(ends[-1], np.uint8)
-        self.copy_into(target, ends[:-1])
-        edges = ends[np.append(0, np.cumsum(counts))]
-        return Payloads((target,), np.zeros(len(counts), np.int64), edges[:-1], np.diff(edges))
+        message_ends = np.append(0, np.cumsum(self.size))
+        joined_buffer = np.empty(message_ends[-1], np.uint8)
+        self.copy_into(joined_buffer, message_ends[:-1])
+        run_edges = message_ends[np.append(0, np.cumsum(counts))]
+        return Payloads((joined_buffer,), np.zeros(len(counts), np.int64), run_edges[:-1], np.diff(run_edges))
 
     def copy_into(self, target: Bytes, starts: Integers) -> None:
         """Copy each message into a buffer, at its offset in `starts` (M,)."""
-        for messages in equal_places(combined_code([self.buffer, self.size], len(self))):
-            source, size = self.buffers[self.buffer[messages[0]]], int(self.size[messages[0]])
-            if len(messages) < _FEW:
-                for begin, end in zip(self.start[messages].tolist(), starts[messages].tolist(), strict=True):
-                    target[end : end + size] = source[begin : begin + size]
+        for indices in equal_places(combined_code([self.buffer, self.size], len(self))):
+            source, size = self.buffers[self.buffer[indices[0]]], int(self.size[indices[0]])
+            if len(indices) < _FEW:
+                for start, new_start in zip(
+                    self.start[indices].tolist(), starts[indices].tolist(), strict=True
+                ):
+                    target[new_start : new_start + size] = source[start : start + size]
             elif size:
                 batch_size = max(1, _CACHED_BYTES // size)
-                for begin in range(0, len(messages), batch_size):
-                    batch = messages[begin : begin + batch_size]
+                for start in range(0, len(indices), batch_size):
+                    batch = indices[start : start + batch_size]
                     # void elements copy whole messages, without an index for each byte
                     stretches(target, size)[starts[batch]] = stretches(source, size)[self.start[batch]]
 
@@ -273,44 +277,46 @@ def round_numbers(numbers: Floats) -> Floats:
 
     Numbers below 1e-15, and from 1e15 on, stay unchanged.
     """
-    size = np.abs(numbers)
-    is_usual = (size >= 1e-15) & (size < 1e15)
+    magnitudes = np.abs(numbers)
+    is_usual = (magnitudes >= 1e-15) & (magnitudes < 1e15)
     usual = np.where(is_usual, numbers, 1.0)
-    digits = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
-    power = _POWERS[np.abs(digits)]
+    decimals = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
+    powers = _POWERS[np.abs(decimals)]
     # products and quotients of integers, so that the result is the double nearest to the decimal number
-    short_numbers = np.where(digits < 0, np.round(usual / power) * power, np.round(usual * power) / power)
+    short_numbers = np.where(
+        decimals < 0, np.round(usual / powers) * powers, np.round(usual * powers) / powers
+    )
     return np.where(is_usual, short_numbers, numbers)
 
 
 def _encode(message: Message, word: int, mark: int) -> Bytes:
     """Encode a message with sentinels in all slots."""
-    copy = type(message)()
-    copy.CopyFrom(message)
-    _write_sentinels(copy, word, mark)
-    return np.frombuffer(copy.SerializeToString(deterministic=True), np.uint8)
+    message_copy = type(message)()
+    message_copy.CopyFrom(message)
+    _write_sentinels(message_copy, word, mark)
+    return np.frombuffer(message_copy.SerializeToString(deterministic=True), np.uint8)
 
 
 def _write_sentinels(message: Message, word: int, mark: int) -> None:
     double = struct.unpack("<d", struct.pack("<Q", word))[0]
-    values = {FieldDescriptor.TYPE_DOUBLE: double, FieldDescriptor.TYPE_FIXED64: word, _NARROW: mark}
+    sentinels = {FieldDescriptor.TYPE_DOUBLE: double, FieldDescriptor.TYPE_FIXED64: word, _NARROW: mark}
     for field, value in message.ListFields():
-        single = isinstance(value, Message | int | float)
+        is_single = isinstance(value, Message | int | float)
         if field.type == FieldDescriptor.TYPE_MESSAGE:
-            for inner in (value,) if single else value:
-                _write_sentinels(inner, word, mark)
-        elif field.type in values and single:
-            setattr(message, field.name, values[field.type])
-        elif field.type in values:
-            value[:] = [values[field.type]] * len(value)
+            for submessage in (value,) if is_single else value:
+                _write_sentinels(submessage, word, mark)
+        elif field.type in sentinels and is_single:
+            setattr(message, field.name, sentinels[field.type])
+        elif field.type in sentinels:
+            value[:] = [sentinels[field.type]] * len(value)
 
 
 def _slot_widths(message: Message) -> Iterator[int]:
     """Yield the widths in bytes of all slots, in the order in which the library encodes fields."""
     for field, value in message.ListFields():
-        single = isinstance(value, Message | int | float)
+        is_single = isinstance(value, Message | int | float)
         if field.type == FieldDescriptor.TYPE_MESSAGE:
-            for inner in (value,) if single else value:
-                yield from _slot_widths(inner)
+            for submessage in (value,) if is_single else value:
+                yield from _slot_widths(submessage)
         elif field.type in (*_WIDE, _NARROW):
-            yield from [1 if field.type == _NARROW else 8] * (1 if single else len(value))
+            yield from [1 if field.type == _NARROW else 8] * (1 if is_single else len(value))

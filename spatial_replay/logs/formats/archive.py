@@ -120,23 +120,23 @@ class Group:
 
         group = self._group
         for name in filter(None, path.split("/")):
-            links, key = getattr(getattr(group, "id", None), "links", None), name.encode()
-            if not isinstance(group, h5py.Group) or links is None or not links.exists(key):
+            links, link_name = getattr(getattr(group, "id", None), "links", None), name.encode()
+            if not isinstance(group, h5py.Group) or links is None or not links.exists(link_name):
                 return None
             # the type of a link is checked before h5py follows the link
-            kind = links.get_info(key).type
-            if kind == h5py.h5l.TYPE_HARD:
+            link_type = links.get_info(link_name).type
+            if link_type == h5py.h5l.TYPE_HARD:
                 group = group[name]
                 continue
             place = f"{group.name.rstrip('/')}/{name}"
-            if kind != h5py.h5l.TYPE_SOFT or depth == _DEEPEST:
+            if link_type != h5py.h5l.TYPE_SOFT or depth == _DEEPEST:
                 raise LogError(f"{place} is a link to another file, which is not read; {_COPY}")
-            target = links.get_val(key).decode("utf-8", "replace")
-            home = self._top.name.rstrip("/") + "/"
-            absolute = target if target.startswith("/") else f"{group.name.rstrip('/')}/{target}"
-            if home == "/" or not absolute.startswith(home):
+            target = links.get_val(link_name).decode("utf-8", "replace")
+            top_path = self._top.name.rstrip("/") + "/"
+            target_path = target if target.startswith("/") else f"{group.name.rstrip('/')}/{target}"
+            if top_path == "/" or not target_path.startswith(top_path):
                 raise LogError(f"{place} is a link out of {self._top.name}, which is not followed; {_COPY}")
-            group = Group(self._top)._node(absolute.removeprefix(home), depth + 1)
+            group = Group(self._top)._node(target_path.removeprefix(top_path), depth + 1)
         return group
 
     def attribute(self, name: str) -> Any | None:
@@ -147,10 +147,11 @@ class Group:
         """
         if name not in self._group.attrs:
             return None
-        about = self._group.attrs.get_id(name)
-        if math.prod(about.shape or ()) * about.dtype.itemsize > _LARGEST_ATTRIBUTE:
+        attribute_id = self._group.attrs.get_id(name)
+        if math.prod(attribute_id.shape or ()) * attribute_id.dtype.itemsize > _LARGEST_ATTRIBUTE:
             raise LogError(
-                f"the attribute {name} of {self._group.name} claims the shape {about.shape}; it is damaged"
+                f"the attribute {name} of {self._group.name} claims the shape {attribute_id.shape};"
+                " it is damaged"
             )
         value = self._group.attrs[name]
         if isinstance(value, np.ndarray) and value.size == 1:
@@ -212,20 +213,20 @@ def row_count(array: Any) -> int:
 
     if array.is_virtual or array.external:
         raise LogError(f"{array.name} has its data in other files, which are not read; {_COPY}")
-    size = math.prod(array.shape) * array.dtype.itemsize
+    array_bytes = math.prod(array.shape) * array.dtype.itemsize
     # HDF5 decompresses a whole chunk, even for one row
-    largest = max(size, math.prod(array.chunks or ()) * array.dtype.itemsize)
-    file_size = array.file.id.get_filesize()
-    if largest > max(_SMALL, _BEST_RATIO * file_size) or largest > MOST_BYTES:
+    largest_bytes = max(array_bytes, math.prod(array.chunks or ()) * array.dtype.itemsize)
+    file_bytes = array.file.id.get_filesize()
+    if largest_bytes > max(_SMALL, _BEST_RATIO * file_bytes) or largest_bytes > MOST_BYTES:
         raise LogError(
-            f"{array.name} claims {largest:,} bytes ({array.shape}) in a file of {file_size:,}: it is"
+            f"{array.name} claims {largest_bytes:,} bytes ({array.shape}) in a file of {file_bytes:,}: it is"
             " damaged, or too large"
         )
-    settings = array.id.get_create_plist()
-    for index in range(settings.get_nfilters()):
-        code, _, _, name = settings.get_filter(index)
-        if not h5py.h5z.filter_avail(code):
-            filter_name = name.decode("utf-8", "replace").split(";")[0] or f"filter {code}"
+    creation_settings = array.id.get_create_plist()
+    for filter_index in range(creation_settings.get_nfilters()):
+        filter_code, _, _, name = creation_settings.get_filter(filter_index)
+        if not h5py.h5z.filter_avail(filter_code):
+            filter_name = name.decode("utf-8", "replace").split(";")[0] or f"filter {filter_code}"
             raise LogError(
                 f"{array.name} is compressed by {filter_name}, which this h5py does not have; rewrite the"
                 " file: h5repack -f GZIP=4 OLD NEW"

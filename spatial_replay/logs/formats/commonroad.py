@@ -64,26 +64,26 @@ def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iter
     """
     collector = _Collector(path.name, wanted)
     with open_text(path) as stream:
-        any_element = False
+        has_element = False
         for problem in _parse(stream, collector):
             for element in collector.take():
-                any_element = True
+                has_element = True
                 yield element
             if problem is not None:
-                what = f"{path.name}:{collector.line}: {problem}"
-                if not any_element:
-                    raise LogError(f"{what}; give a well-formed XML file")
-                faults.add(f"{what}; what follows is left out")
+                fault = f"{path.name}:{collector.line}: {problem}"
+                if not has_element:
+                    raise LogError(f"{fault}; give a well-formed XML file")
+                faults.add(f"{fault}; what follows is left out")
 
 
 def _parse(stream: BinaryIO, collector: _Collector) -> Iterator[str | None]:
     """Parse the file in pieces; yield None after each piece, or the fault that ends the parsing."""
-    read = 0
+    read_bytes = 0
     while True:
         try:
             piece = stream.read(_PIECE)
-            read += len(piece)
-            if read > LARGEST_FILE:
+            read_bytes += len(piece)
+            if read_bytes > LARGEST_FILE:
                 raise LogError(f"{collector.name} is larger than {LARGEST_FILE >> 20} MiB; split it")
             collector.parser.Parse(piece, not piece)
         except expat.ExpatError as error:
@@ -103,9 +103,9 @@ class _Collector:
 
     def __init__(self, name: str, element_names: frozenset[str]) -> None:
         self.name = name
-        self._wanted = element_names
-        self._open: list[Element] = []
-        self._depth = self._inside = 0
+        self._element_names = element_names
+        self._open_elements: list[Element] = []
+        self._depth = self._inner_count = 0
         self._finished: list[Element] = []
         self.parser = expat.ParserCreate()
         # one event for a text with line breaks:
@@ -139,31 +139,32 @@ class _Collector:
             raise LogError(f"{place}: elements are nested deeper than {DEEPEST}; flatten them")
         if self._depth == 1:
             self._finished.append(Element(name, attributes, self.line))
-        elif self._open or (self._depth == 2 and name in self._wanted):
+        elif self._open_elements or (self._depth == 2 and name in self._element_names):
             self._begin(Element(name, attributes, self.line))
 
     def _begin(self, element: Element) -> None:
-        self._inside = self._inside + 1 if self._open else 0
-        if self._inside > MOST_ELEMENTS:
-            first = self._open[0]
+        self._inner_count = self._inner_count + 1 if self._open_elements else 0
+        if self._inner_count > MOST_ELEMENTS:
+            outer_element = self._open_elements[0]
             raise LogError(
-                f"{self.name}:{first.line}: <{first.name}> has more than {MOST_ELEMENTS} elements; split it"
+                f"{self.name}:{outer_element.line}: <{outer_element.name}> has more than {MOST_ELEMENTS}"
+                " elements; split it"
             )
-        if self._open:
-            self._open[-1].children.append(element)
-        self._open.append(element)
+        if self._open_elements:
+            self._open_elements[-1].children.append(element)
+        self._open_elements.append(element)
 
     def _end(self, name: str) -> None:
         self._depth -= 1
-        if self._open:
-            element = self._open.pop()
+        if self._open_elements:
+            element = self._open_elements.pop()
             element.text = element.text.strip()
-            if not self._open:
+            if not self._open_elements:
                 self._finished.append(element)
 
     def _text(self, text: str) -> None:
-        if self._open and len(self._open[-1].text) < LONGEST_TEXT:
-            self._open[-1].text += text[:LONGEST_TEXT]
+        if self._open_elements and len(self._open_elements[-1].text) < LONGEST_TEXT:
+            self._open_elements[-1].text += text[:LONGEST_TEXT]
 
 
 Points = list[tuple[float, float]]
@@ -200,10 +201,8 @@ class OutlinePart:
         """Return the vertices in the obstacle's frame; `hitch_angle` is in radians."""
         if self.hitch_x is None:
             return self.vertices
-        along_x, along_y = cos(hitch_angle), sin(hitch_angle)
-        return [
-            (self.hitch_x + along_x * x - along_y * y, along_y * x + along_x * y) for x, y in self.vertices
-        ]
+        cosine, sine = cos(hitch_angle), sin(hitch_angle)
+        return [(self.hitch_x + cosine * x - sine * y, sine * x + cosine * y) for x, y in self.vertices]
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,10 +233,10 @@ class ObstacleState:
         if not self.known:
             return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
-        along_x, along_y = cos(self.angle), sin(self.angle)
+        cosine, sine = cos(self.angle), sin(self.angle)
         vertices: list[float] = []
         for x, y in (vertex for part in parts for vertex in part.turn(self.hitch_angle)):
-            vertices += (self.x + along_x * x - along_y * y, self.y + along_y * x + along_x * y)
+            vertices += (self.x + cosine * x - sine * y, self.y + sine * x + cosine * y)
         counts, radii = [len(part.vertices) for part in parts], [part.radius for part in parts]
         yaw = self.angle if self.oriented else nan
         return ObjectReport(name, class_name, vertices, counts, radii, yaw, self.uncertainty)
@@ -261,15 +260,15 @@ class _Obstacle:
 
     Attributes:
         parts: its outline, relative to its centre.
-        moving: states by time step.
-        fixed: state at every time step; None for a moving obstacle.
+        moving_states: states by time step.
+        fixed_state: state at every time step; None for a moving obstacle.
     """
 
     name: str
     class_name: str | None
     parts: list[OutlinePart]
-    moving: dict[int, ObstacleState] = field(default_factory=dict)
-    fixed: ObstacleState | None = None
+    moving_states: dict[int, ObstacleState] = field(default_factory=dict)
+    fixed_state: ObstacleState | None = None
 
 
 def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
@@ -286,28 +285,33 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     step_s = _step_size(path, next(elements))
     obstacles = list(_iter_obstacles(path, faults, elements))
     # a scenario of static obstacles only is one sample
-    steps = sorted({step for obstacle in obstacles for step in obstacle.moving}) or ([0] if obstacles else [])
+    time_steps = sorted({time_step for obstacle in obstacles for time_step in obstacle.moving_states}) or (
+        [0] if obstacles else []
+    )
     if not obstacles and not len(faults):
         raise UsageError(f"{path.name} is a scenario without obstacles; give one that has some")
-    samples = _iter_samples(path, faults, obstacles, steps, step_s)
+    samples = _iter_samples(path, faults, obstacles, time_steps, step_s)
     yield from iter_traces(samples, faults, concave, most_reports=_BLOCK_REPORTS)
 
 
 def _iter_samples(
-    path: Path, faults: FaultList, obstacles: Sequence[_Obstacle], steps: Sequence[int], step_s: Fraction
+    path: Path, faults: FaultList, obstacles: Sequence[_Obstacle], time_steps: Sequence[int], step_s: Fraction
 ) -> Iterator[ReportedSample]:
-    for step in steps:
-        time_ns = round(step * step_s * 10**9)
+    for time_step in time_steps:
+        time_ns = round(time_step * step_s * 10**9)
         if time_ns > LATEST_NS:
-            faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
+            faults.add(f"{path.name}: time step {time_step} lies beyond what a time can be; it is left out")
             continue
-        states = ((obstacle, obstacle.fixed or obstacle.moving.get(step)) for obstacle in obstacles)
+        states = (
+            (obstacle, obstacle.fixed_state or obstacle.moving_states.get(time_step))
+            for obstacle in obstacles
+        )
         reports = [
             state.report(obstacle.name, obstacle.class_name, obstacle.parts)
             for obstacle, state in states
             if state is not None
         ]
-        yield ReportedSample(time_ns, f"{path.name}: time step {step}", reports, {})
+        yield ReportedSample(time_ns, f"{path.name}: time step {time_step}", reports, {})
 
 
 def _step_size(path: Path, root: Element) -> Fraction:
@@ -315,50 +319,52 @@ def _step_size(path: Path, root: Element) -> Fraction:
         raise LogError(f"{path.name} is XML, but not a scenario: its root is <{root.name}>, not <commonRoad>")
     text = root.attributes.get("timeStepSize", "")
     try:
-        size = float(text)
+        step_size_s = float(text)
     except ValueError:
-        size = 0.0
-    if not 1e-9 <= size <= 1e9:
+        step_size_s = 0.0
+    if not 1e-9 <= step_size_s <= 1e9:
         place = f"{path.name}:{root.line}"
         raise LogError(f"{place}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9")
     # exactly as written: 0.1 s is 100 ms to the nanosecond
-    return Fraction(repr(size))
+    return Fraction(repr(step_size_s))
 
 
 def _iter_obstacles(path: Path, faults: FaultList, elements: Iterator[Element]) -> Iterator[_Obstacle]:
-    names = set[str]()
+    used_names = set[str]()
     for element in elements:
         name = element.attributes.get("id", "")
         place = f"{path.name}:{element.line}: <{element.name}>"
 
-        def report(line: int, what: str, obstacle: str = name) -> None:
-            faults.add(f"{path.name}:{line}: obstacle {obstacle}: {what}")
+        def report(line: int, fault: str, obstacle: str = name) -> None:
+            faults.add(f"{path.name}:{line}: obstacle {obstacle}: {fault}")
 
         try:
-            if not name or name in names:
+            if not name or name in used_names:
                 raise ScenarioError(f"id is {name[:60]!r}; give each obstacle one of its own")
             place = f"{path.name}:{element.line}: obstacle {name}"
             obstacle = _obstacle(name, element, report)
         except ScenarioError as error:
             faults.add(f"{place}: {error}; it is left out")
             continue
-        names.add(name)
+        used_names.add(name)
         yield obstacle
 
 
 def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
-    kind = element.child("type")
-    class_name = (kind.text or None) if kind is not None else None
+    type_element = element.child("type")
+    class_name = (type_element.text or None) if type_element is not None else None
     if element.name == "phantomObstacle":
         # a phantom may be present or not, so it is an object of unknown place in every open group
         return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
     outline = _outline_of(_required_child(element, "shape"))
     if element.name == "environmentObstacle":
-        return _Obstacle(name, class_name, outline, fixed=ObstacleState())
+        return _Obstacle(name, class_name, outline, fixed_state=ObstacleState())
     role = element.child("role")
     if element.name == "staticObstacle" or (role is not None and role.text == "static"):
-        initial = _required_child(element, "initialState")
-        return _Obstacle(name, class_name, outline, fixed=_state_or_unknown(initial, outline, report))
+        initial_state = _required_child(element, "initialState")
+        return _Obstacle(
+            name, class_name, outline, fixed_state=_state_or_unknown(initial_state, outline, report)
+        )
     return _Obstacle(name, class_name, outline, _moving_states(element, outline, report))
 
 
@@ -372,22 +378,22 @@ def _moving_states(
     """
     states: dict[int, ObstacleState] = {}
     initial, trajectory = obstacle.child("initialState"), obstacle.child("trajectory")
-    elements = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
-    for element in elements:
+    state_elements = [*([initial] if initial else []), *(trajectory.all("state") if trajectory else ())]
+    for state_element in state_elements:
         try:
-            step = _step(_required_child(element, "time"))
+            time_step = _step(_required_child(state_element, "time"))
         except ScenarioError as error:
-            report(element.line, f"{error}; the state is left out")
+            report(state_element.line, f"{error}; the state is left out")
             continue
-        if step in states:
-            report(element.line, f"time step {step} is there twice; the first state counts")
+        if time_step in states:
+            report(state_element.line, f"time step {time_step} is there twice; the first state counts")
             continue
-        states[step] = _state_or_unknown(element, outline, report)
-    occupied = obstacle.child("occupancySet")
-    for occupancy in occupied.all("occupancy") if occupied else ():
-        for step, state in _occupied_states(occupancy, report):
+        states[time_step] = _state_or_unknown(state_element, outline, report)
+    occupancy_set = obstacle.child("occupancySet")
+    for occupancy in occupancy_set.all("occupancy") if occupancy_set else ():
+        for time_step, state in _occupied_states(occupancy, report):
             # an exact state is better than an occupancy of the same time step
-            states.setdefault(step, state)
+            states.setdefault(time_step, state)
     return states
 
 
@@ -486,9 +492,9 @@ def _rectangle(element: Element, origin_x_shift: float = 0.0) -> OutlinePart:
 
 def _corners(length: float, width: float, center: tuple[float, float], angle: float = 0.0) -> Points:
     x, y = center
-    c, s = cos(angle) / 2, sin(angle) / 2
+    half_cosine, half_sine = cos(angle) / 2, sin(angle) / 2
     corners = ((-length, -width), (length, -width), (length, width), (-length, width))
-    return [(x + a * c - b * s, y + a * s + b * c) for a, b in corners]
+    return [(x + a * half_cosine - b * half_sine, y + a * half_sine + b * half_cosine) for a, b in corners]
 
 
 def _center(element: Element) -> tuple[float, float]:
@@ -516,20 +522,25 @@ def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
         return UNKNOWN
     else:
         x, y, place_uncertainty = _around(_parts_of(position))
-    low, high = _angle(element, "orientation", (-pi, pi))
-    hitch_low, hitch_high = _angle(element, "hitchAngle", (0.0, 0.0))
-    hitch_angle = (hitch_low + hitch_high) / 2
+    low_angle, high_angle = _angle(element, "orientation", (-pi, pi))
+    low_hitch, high_hitch = _angle(element, "hitchAngle", (0.0, 0.0))
+    hitch_angle = (low_hitch + high_hitch) / 2
     trailers = [part for part in outline if part.hitch_x is not None]
-    turn_uncertainty = _turned_away([part.turn(hitch_angle) for part in outline], high - low)
-    turn_uncertainty += _turned_away([trailer.vertices for trailer in trailers], hitch_high - hitch_low)
-    if not all(map(isfinite, (x, y, low, high, place_uncertainty, hitch_angle))):
+    turn_uncertainty = _turn_shift([part.turn(hitch_angle) for part in outline], high_angle - low_angle)
+    turn_uncertainty += _turn_shift([trailer.vertices for trailer in trailers], high_hitch - low_hitch)
+    if not all(map(isfinite, (x, y, low_angle, high_angle, place_uncertainty, hitch_angle))):
         return UNKNOWN
     return ObstacleState(
-        x, y, (low + high) / 2, hitch_angle, low == high, uncertainty=place_uncertainty + turn_uncertainty
+        x,
+        y,
+        (low_angle + high_angle) / 2,
+        hitch_angle,
+        low_angle == high_angle,
+        uncertainty=place_uncertainty + turn_uncertainty,
     )
 
 
-def _turned_away(outlines: Sequence[Points], angle: float) -> float:
+def _turn_shift(outlines: Sequence[Points], angle: float) -> float:
     """Return the largest shift of a vertex if outlines turn by up to half of `angle` in either direction."""
     # a turn by h moves a vertex at a distance r from the origin by 2 r sin(h / 2), and h is angle / 2
     reach = max((hypot(*vertex) for outline in outlines for vertex in outline), default=0.0)
@@ -538,13 +549,13 @@ def _turned_away(outlines: Sequence[Points], angle: float) -> float:
 
 def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[float, float]:
     """Return the interval of an angle, in radians; both ends are equal for an exact angle."""
-    angle = state.child(name)
-    if angle is None:
+    angle_element = state.child(name)
+    if angle_element is None:
         return default
-    if angle.child("exact") is not None:
-        exact = _number(angle, "exact")
-        return exact, exact
-    low, high = _number(angle, "intervalStart"), _number(angle, "intervalEnd")
+    if angle_element.child("exact") is not None:
+        exact_angle = _number(angle_element, "exact")
+        return exact_angle, exact_angle
+    low, high = _number(angle_element, "intervalStart"), _number(angle_element, "intervalEnd")
     if low > high:
         raise ScenarioError(f"{name} is from {low:g} to {high:g}; give its start before its end")
     return low, high
@@ -553,7 +564,7 @@ def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[flo
 def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
     """Yield the time steps of an occupancy, each with the state of an obstacle somewhere in its region."""
     try:
-        steps = _steps(_required_child(occupancy, "time"))
+        time_steps = _steps(_required_child(occupancy, "time"))
         parts = _parts_of(_required_child(occupancy, "shape"))
         # the true outline is inside the region, so every point of the region is within a diameter of it
         region = _hull(parts)
@@ -562,8 +573,8 @@ def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[
     except ScenarioError as error:
         report(occupancy.line, f"{error}; the occupancy is left out")
         return
-    for step in steps:
-        yield step, state
+    for time_step in time_steps:
+        yield time_step, state
 
 
 def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
@@ -593,11 +604,11 @@ def _steps(time: Element) -> range:
     if time.child("intervalStart") is None:
         step = _step(time)
         return range(step, step + 1)
-    first, last = (_whole(_required_child(time, name)) for name in ("intervalStart", "intervalEnd"))
-    if not 0 <= last - first <= _LONGEST_INTERVAL:
+    first_step, last_step = (_whole(_required_child(time, name)) for name in ("intervalStart", "intervalEnd"))
+    if not 0 <= last_step - first_step <= _LONGEST_INTERVAL:
         remedy = f"give an interval of 0 to {_LONGEST_INTERVAL}"
-        raise ScenarioError(f"time is from step {first} to {last}; {remedy}")
-    return range(first, last + 1)
+        raise ScenarioError(f"time is from step {first_step} to {last_step}; {remedy}")
+    return range(first_step, last_step + 1)
 
 
 def _step(time: Element) -> int:

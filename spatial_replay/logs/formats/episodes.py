@@ -197,14 +197,14 @@ class DataSet:
         with self._open_run(number, names, reading) as run:
             arrays, count = run.arrays, self.count_states(run)
             columns, success = self.poses(run, count), self._success(run, count)
-        values, remarks = dict[str, Floats](), list(columns.remarks)
+        feature_arrays, remarks = dict[str, Floats](), list(columns.remarks)
         for name in names:
             if name in arrays and len(arrays[name]) in (count, count - 1):
-                values[name] = _with_last(arrays[name], count)
+                feature_arrays[name] = _with_last(arrays[name], count)
             elif name in arrays:
-                rows = plural(len(arrays[name]), "row")
-                remarks.append(f"{name} has {rows} for {count} states; it is not read")
-        return replace(columns, features=values, success=success, remarks=tuple(remarks))
+                row_text = plural(len(arrays[name]), "row")
+                remarks.append(f"{name} has {row_text} for {count} states; it is not read")
+        return replace(columns, features=feature_arrays, success=success, remarks=tuple(remarks))
 
     def success(self, number: int, reading: EpisodeReading = AS_STORED) -> Booleans | None:
         """Read the label of an episode without its poses; see `EpisodeColumns.success`.
@@ -255,12 +255,12 @@ class DataSet:
             return None
         if label in run.arrays:
             return _success_of_states(run.arrays[label], count, f"{self.name}: {label}")
-        value = self.whole_label(run, label)
-        if value is None and run.reading.label is not None and self.feature(label) is None:
-            names = [feature.name for feature in self.features]
-            hint = nearest_hint(label, names) or f"it has {listing(names)}"
+        episode_label = self.whole_label(run, label)
+        if episode_label is None and run.reading.label is not None and self.feature(label) is None:
+            feature_names = [feature.name for feature in self.features]
+            hint = nearest_hint(label, feature_names) or f"it has {listing(feature_names)}"
             raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
-        return None if value is None else np.array(value)
+        return None if episode_label is None else np.array(episode_label)
 
     def shared_files(self) -> list[Path]:
         """Return the files that every episode depends on; by default, all files."""
@@ -284,8 +284,8 @@ class DataSet:
             UsageError: there is none.
         """
         # numbers usually count from 0, so this index is tried first
-        nearest = self.episodes[number : number + 1]
-        for episode in (*nearest, *self.episodes):
+        likely_episodes = self.episodes[number : number + 1]
+        for episode in (*likely_episodes, *self.episodes):
             if episode.number == number:
                 return episode
         raise UsageError(f"{self.name} has no episode {number}; {self.range_text}")
@@ -295,8 +295,11 @@ class DataSet:
         """The addresses of its episodes, in words."""
         if not self.episodes:
             return "it has no episodes"
-        first, last = self.episodes[0].number, self.episodes[-1].number
-        return f"it has {plural(len(self.episodes), 'episode')}, {self.name}#{first} to {self.name}#{last}"
+        first_number, last_number = self.episodes[0].number, self.episodes[-1].number
+        return (
+            f"it has {plural(len(self.episodes), 'episode')}, {self.name}#{first_number} to"
+            f" {self.name}#{last_number}"
+        )
 
     def feature(self, name: str) -> Feature | None:
         """Return the feature with a name; None if there is none."""
@@ -324,8 +327,8 @@ SECOND_RUN: Final = "more than one run is in the episode, so it is not judged; r
 
 def _with_last(values: Floats, count: int) -> Floats:
     """Append a row of NaN to an array of steps, for the state after the last step."""
-    lost = count - len(values)
-    return values if not lost else np.concatenate([values, np.full((lost, *values.shape[1:]), np.nan)])
+    extra = count - len(values)
+    return values if not extra else np.concatenate([values, np.full((extra, *values.shape[1:]), np.nan)])
 
 
 def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
@@ -348,13 +351,13 @@ def frame_times_ns(frames: Integers, fps: float) -> Integers:
     Raises:
         LogError: a negative frame, or a frame later than the latest time of a log.
     """
-    period = Fraction(10**9) / Fraction(repr(float(fps)))
-    if len(frames) and (frames.min() < 0 or int(frames.max()) * period > LATEST_NS):
+    period_ns = Fraction(10**9) / Fraction(repr(float(fps)))
+    if len(frames) and (frames.min() < 0 or int(frames.max()) * period_ns > LATEST_NS):
         raise LogError(f"frames {int(frames.min())} to {int(frames.max())} are no valid numbers of frames")
     # fast in int64, where products fit as checked above; other periods take fractions
-    if period.denominator == 1 and period.numerator < 2**31:
-        return frames.astype(np.int64) * period.numerator
-    return np.array([round(frame * period) for frame in frames.tolist()], np.int64)
+    if period_ns.denominator == 1 and period_ns.numerator < 2**31:
+        return frames.astype(np.int64) * period_ns.numerator
+    return np.array([round(frame * period_ns) for frame in frames.tolist()], np.int64)
 
 
 def integer_or_none(value: object) -> int | None:
@@ -375,10 +378,10 @@ def _as_label(values: Floats, place: str) -> Booleans:
         UsageError: the column has negative or different positive numbers, such as a shaped reward.
     """
     rows = np.nan_to_num(values.reshape(len(values), -1))
-    wrong = rows[(rows < 0) | (rows != rows.max(initial=0.0)) & (rows > 0)]
-    if wrong.size:
+    wrong_numbers = rows[(rows < 0) | (rows != rows.max(initial=0.0)) & (rows > 0)]
+    if wrong_numbers.size:
         raise UsageError(
-            f"{place} is no label: it has {wrong[0]:.4g}; a label has 0 and 1, or true and false"
+            f"{place} is no label: it has {wrong_numbers[0]:.4g}; a label has 0 and 1, or true and false"
         )
     return np.asarray((rows > 0).any(axis=1))
 

@@ -110,26 +110,31 @@ class _Demonstrations(InGroups):
     def list_episodes(self, path: Path, file: Group) -> Group:
         """Set `episodes`, and `features` from the first episode; return the group of the first episode."""
         self.path = path
-        home = file.group(self.folder) or file
-        keys = sorted((key for key in home.names if _NUMBERED.fullmatch(key)), key=natural_key)
-        places = [int(key.rpartition("_")[2]) for key in keys]
+        episodes_group = file.group(self.folder) or file
+        keys = sorted((key for key in episodes_group.names if _NUMBERED.fullmatch(key)), key=natural_key)
+        episode_numbers = [int(key.rpartition("_")[2]) for key in keys]
         # groups of several prefixes may share a number
-        places = places if len(set(places)) == len(keys) else list(range(len(keys)))
-        self.episodes = tuple(
-            self._describe(home, number, key) for number, key in zip(places, keys, strict=True)
+        episode_numbers = (
+            episode_numbers if len(set(episode_numbers)) == len(keys) else list(range(len(keys)))
         )
-        first = file.episode(f"{self.folder}/{keys[0]}", f"{self.name}#{places[0]}")
-        rows = self.count_states(Run(self.episodes[0], first, {}))
+        self.episodes = tuple(
+            self._describe(episodes_group, episode_number, key)
+            for episode_number, key in zip(episode_numbers, keys, strict=True)
+        )
+        first_group = file.episode(f"{self.folder}/{keys[0]}", f"{self.name}#{episode_numbers[0]}")
+        count = self.count_states(Run(self.episodes[0], first_group, {}))
         self.features = tuple(
             Feature(name, (), width_of(array))
-            for name, array in first.arrays()
-            if array.shape and array.shape[0] in (rows, rows - 1) and name.split("/")[0] not in self.left_out
+            for name, array in first_group.arrays()
+            if array.shape
+            and array.shape[0] in (count, count - 1)
+            and name.split("/")[0] not in self.left_out
         )
-        return first
+        return first_group
 
-    def _describe(self, home: Group, number: int, key: str) -> Episode:
+    def _describe(self, episodes_group: Group, number: int, key: str) -> Episode:
         try:
-            return self.describe(home, number, key)
+            return self.describe(episodes_group, number, key)
         except LogError:
             # reading the episode reports the damage
             return Episode(number, key)
@@ -146,9 +151,9 @@ class _Demonstrations(InGroups):
 
 def _first_group(group: Group | None, prefix: str) -> Group | None:
     """Return the first group whose name is the prefix and a number; None if there is none."""
-    keys = [] if group is None else [key for key in group.names if _NUMBERED.fullmatch(key)]
-    keys = [key for key in keys if key.startswith(prefix)]
-    return group.group(min(keys, key=natural_key)) if group is not None and keys else None
+    names = [] if group is None else [name for name in group.names if _NUMBERED.fullmatch(name)]
+    names = [name for name in names if name.startswith(prefix)]
+    return group.group(min(names, key=natural_key)) if group is not None and names else None
 
 
 def _body(poses: Any | None, name: str, place: str, component_order: str) -> Body:
@@ -157,27 +162,27 @@ def _body(poses: Any | None, name: str, place: str, component_order: str) -> Bod
     Raises:
         LogError: the array is missing or too narrow, or the quaternions are not of unit length.
     """
-    values = _pose_rows(poses, place)
-    quaternions = values[:, 3:7]
+    pose_rows = _pose_rows(poses, place)
+    quaternions = pose_rows[:, 3:7]
     lengths = np.linalg.norm(quaternions, axis=1)
-    off = np.flatnonzero(np.abs(lengths - 1) > 0.01)
-    if len(off):
+    wrong_rows = np.flatnonzero(np.abs(lengths - 1) > 0.01)
+    if len(wrong_rows):
         raise LogError(
-            f"{place} has a quaternion of length {lengths[off[0]]:.3g} at row {off[0]}; an orientation has"
-            " length 1, so these are other numbers"
+            f"{place} has a quaternion of length {lengths[wrong_rows[0]]:.3g} at row {wrong_rows[0]}; an"
+            " orientation has length 1, so these are other numbers"
         )
     return Body(
-        name, values[:, :3], quaternions if component_order == "xyzw" else quaternions[:, [1, 2, 3, 0]]
+        name, pose_rows[:, :3], quaternions if component_order == "xyzw" else quaternions[:, [1, 2, 3, 0]]
     )
 
 
 def _pose_rows(poses: Any | None, place: str, rows: slice = slice(None)) -> Floats:
     if poses is None:
         raise LogError(f"{place} is missing; record it again")
-    values = numbers(poses, rows)
-    if values.ndim != 2 or values.shape[1] < 7:
-        raise LogError(f"{place} has the shape {values.shape}; a pose has 7 numbers")
-    return values
+    pose_rows = numbers(poses, rows)
+    if pose_rows.ndim != 2 or pose_rows.shape[1] < 7:
+        raise LogError(f"{place} has the shape {pose_rows.shape}; a pose has 7 numbers")
+    return pose_rows
 
 
 def _object(value: object) -> Mapping[str, Any]:
@@ -195,12 +200,12 @@ class _ManiSkill(_Demonstrations):
     fps = 20.0
 
     def __init__(self, path: Path, file: Group) -> None:
-        about = path.with_suffix(".json")
-        info = read_json(about) if about.is_file() else {}
-        rows = info.get("episodes")
+        json_file = path.with_suffix(".json")
+        info = read_json(json_file) if json_file.is_file() else {}
+        episode_rows = info.get("episodes")
         self._rows = {
             f"traj_{row.get('episode_id')}": row
-            for row in (rows if isinstance(rows, list) else ())
+            for row in (episode_rows if isinstance(episode_rows, list) else ())
             if isinstance(row, dict)
         }
         environment = _object(info.get("env_info"))
@@ -209,41 +214,43 @@ class _ManiSkill(_Demonstrations):
         fps = options.get("control_freq") or _object(options.get("sim_config")).get("control_freq")
         if isinstance(fps, (int, float)) and 0 < fps <= 1e6:
             self.fps = float(fps)
-        first = self.list_episodes(path, file)
-        actors = first.group("env_states/actors")
+        first_group = self.list_episodes(path, file)
+        actors = first_group.group("env_states/actors")
         self.names_bodies = actors is not None and bool(actors.names)
         # the label of a step is moved to the state after it; the first state has no label
-        if first.array("success") is not None or any("success" in row for row in self._rows.values()):
+        if first_group.array("success") is not None or any("success" in row for row in self._rows.values()):
             self.label = Label("success")
-        self.remarks = tuple(self._remarks(about))
+        self.remarks = tuple(self._remarks(json_file))
 
     @staticmethod
     def is_layout(file: Group) -> bool:
         """Return whether a file has trajectories."""
-        first = _first_group(file, "traj_")
-        return first is not None and not {"env_states", "obs"}.isdisjoint(first.names)
+        first_group = _first_group(file, "traj_")
+        return first_group is not None and not {"env_states", "obs"}.isdisjoint(first_group.names)
 
-    def _remarks(self, about: Path) -> Iterator[str]:
-        keys = {episode.key for episode in self.episodes}
+    def _remarks(self, json_file: Path) -> Iterator[str]:
+        episode_keys = {episode.key for episode in self.episodes}
         if not self._rows:
-            yield f"{about.name} is missing or has no episodes: seeds are not known, and the rate is 20 Hz"
-        elif keys != self._rows.keys():
-            differing = sorted(keys ^ self._rows.keys(), key=natural_key)
-            yield f"{about.name} and {self.name} differ in their episodes: {listing(differing)}"
+            yield (
+                f"{json_file.name} is missing or has no episodes: seeds are not known, and the rate is 20 Hz"
+            )
+        elif episode_keys != self._rows.keys():
+            differing_keys = sorted(episode_keys ^ self._rows.keys(), key=natural_key)
+            yield f"{json_file.name} and {self.name} differ in their episodes: {listing(differing_keys)}"
         if not self.names_bodies:
             yield "env_states has no actors by name; name objects by `features:`"
 
     def describe(self, home: Group, number: int, key: str) -> Episode:
         row = self._rows.get(key, {})
-        seed, steps = integer_or_none(row.get("episode_seed")), integer_or_none(row.get("elapsed_steps"))
-        return Episode(number, key, None if steps is None else steps + 1, self.task, seed)
+        seed, step_count = integer_or_none(row.get("episode_seed")), integer_or_none(row.get("elapsed_steps"))
+        return Episode(number, key, None if step_count is None else step_count + 1, self.task, seed)
 
     def count_states(self, run: Run) -> int:
         for folder in ("env_states", "obs"):
-            states, whole = run.group.group(folder), run.group.array(folder)
-            first = whole if states is None else next((array for _, array in states.arrays()), None)
-            if first is not None and first.shape:
-                return row_count(first)
+            states, single = run.group.group(folder), run.group.array(folder)
+            first_array = single if states is None else next((array for _, array in states.arrays()), None)
+            if first_array is not None and first_array.shape:
+                return row_count(first_array)
         place = f"{self.name}#{run.episode.number}"
         raise LogError(f"{place} has neither env_states nor obs; record with `record_env_state=True`")
 
@@ -263,9 +270,9 @@ class _ManiSkill(_Demonstrations):
 
     def whole_label(self, run: Run, label: str) -> bool | None:
         """Return the label from an attribute or the JSON file; see `DataSet.whole_label`."""
-        value = super().whole_label(run, label)
+        attribute = super().whole_label(run, label)
         row = self._rows.get(run.episode.key, {})
-        return row["success"] if value is None and isinstance(row.get("success"), bool) else value
+        return row["success"] if attribute is None and isinstance(row.get("success"), bool) else attribute
 
 
 # -------------------------------------------------------------------------------------------------- Isaac Lab
@@ -289,25 +296,25 @@ class _IsaacLab(_Demonstrations):
     left_out = frozenset({"initial_state"})
 
     def __init__(self, path: Path, file: Group) -> None:
-        data = file.group("data") or file
-        about = data.json("env_args")
-        self.task = str(about.get("env_name") or "") or None
-        steps = _object(about.get("sim_args"))
+        data_group = file.group("data") or file
+        env_args = data_group.json("env_args")
+        self.task = str(env_args.get("env_name") or "") or None
+        sim_args = _object(env_args.get("sim_args"))
         try:
             # a step of the environment has `decimation` steps of physics
-            self.fps = 1 / (float(steps["dt"]) * int(steps["decimation"]))
+            self.fps = 1 / (float(sim_args["dt"]) * int(sim_args["decimation"]))
         except (KeyError, TypeError, ValueError, ZeroDivisionError):
             self.fps = None
         self.list_episodes(path, file)
-        if _has_success(data, self.episodes):
+        if _has_success(data_group, self.episodes):
             self.label = Label("success")
-        self._order: str | None = None
+        self._component_order: str | None = None
 
     @staticmethod
     def is_layout(file: Group) -> bool:
         """Return whether a file has demonstrations with bodies by name."""
-        first = _first_group(file.group("data"), "demo_")
-        bodies = None if first is None else first.group(_BODIES)
+        first_group = _first_group(file.group("data"), "demo_")
+        bodies = None if first_group is None else first_group.group(_BODIES)
         return bodies is not None and bool(bodies.names)
 
     def count_states(self, run: Run) -> int:
@@ -342,16 +349,16 @@ class _IsaacLab(_Demonstrations):
         Raises:
             UsageError: the quaternions are ambiguous.
         """
-        if self._order is None:
+        if self._component_order is None:
             # objects stand still and upright at the start of most episodes
-            starts = quaternion_order(self._quaternions(slice(1)))
-            self._order = starts or quaternion_order(self._quaternions(slice(None)))
-        if self._order is None:
+            order_at_start = quaternion_order(self._quaternions(slice(1)))
+            self._component_order = order_at_start or quaternion_order(self._quaternions(slice(None)))
+        if self._component_order is None:
             raise UsageError(
                 f"{self.name} does not show the order of its quaternions; say `order: xyzw` (Isaac Lab since"
                 " 2026) or `order: wxyz` (before) in the mapping"
             )
-        return self._order
+        return self._component_order
 
     def _quaternions(self, rows: slice) -> Iterator[Floats]:
         for episode in self.episodes[:_MOST_EXAMINED]:
@@ -385,33 +392,33 @@ class _Robosuite(_Demonstrations):
     always_read = ("states",)
 
     def __init__(self, path: Path, file: Group) -> None:
-        home = file.group("data") or file
-        about = home.json("env_args")
-        options = _object(about.get("env_kwargs"))
-        version = home.text("repository_version")
-        is_libero = home.attribute("bddl_file_name") is not None
+        data_group = file.group("data") or file
+        env_args = data_group.json("env_args")
+        env_kwargs = _object(env_args.get("env_kwargs"))
+        version = data_group.text("repository_version")
+        is_libero = data_group.attribute("bddl_file_name") is not None
         self.kind = "LIBERO" if is_libero else f"robosuite {version}" if version else "robomimic"
-        self.robot = str(robots) if isinstance(robots := options.get("robots"), str) else ""
-        name = home.text("env") or str(about.get("env_name") or "")
-        self.task = str(home.json("problem_info").get("language_instruction") or name) or None
+        self.robot = str(robots) if isinstance(robots := env_kwargs.get("robots"), str) else ""
+        environment = data_group.text("env") or str(env_args.get("env_name") or "")
+        self.task = str(data_group.json("problem_info").get("language_instruction") or environment) or None
         self.list_episodes(path, file)
-        if _has_success(home, self.episodes):
-            field = "success"
-        elif options.get("reward_shaping") is False and self.feature("rewards") is not None:
-            field = "rewards"
+        if _has_success(data_group, self.episodes):
+            label_field = "success"
+        elif env_kwargs.get("reward_shaping") is False and self.feature("rewards") is not None:
+            label_field = "rewards"
         else:
             is_recent = tuple(map(int, re.findall(r"\d+", version)[:2])) >= _SUCCESSES_ONLY
-            field = "successful" if is_recent else ""
-        if field:
-            self.label = Label(field, is_about_next=True, is_stored=False)
-        if field == "successful":
+            label_field = "successful" if is_recent else ""
+        if label_field:
+            self.label = Label(label_field, is_about_next=True, is_stored=False)
+        if label_field == "successful":
             self.remarks = ("it holds successes only: robosuite's recorder drops failed episodes",)
 
     @staticmethod
     def is_layout(file: Group) -> bool:
         """Return whether a file has demonstrations with states."""
-        first = _first_group(file.group("data"), "demo_")
-        return first is not None and first.array("states") is not None
+        first_group = _first_group(file.group("data"), "demo_")
+        return first_group is not None and first_group.array("states") is not None
 
     def count_states(self, run: Run) -> int:
         states = run.group.array("states")
@@ -427,19 +434,19 @@ class _Robosuite(_Demonstrations):
             model = model_from_xml(xml, f"the model_file of {self.name}", run.reading.assets)
         else:
             raise UsageError(f"{place} has no model_file; give the MuJoCo model by `model: scene.xml`")
-        seconds, bodies = model.states(run.arrays["states"], f"{place}: states")
-        if not np.isfinite(seconds).all():
-            row = int(np.flatnonzero(~np.isfinite(seconds))[0])
-            raise LogError(f"{place}: the time of state {row} is {seconds[row]}")
-        times_ns: Integers = np.round(seconds * 1e9).astype(np.int64)
-        remarks, unjudged, back = list(model.remarks), "", np.flatnonzero(np.diff(times_ns) <= 0)
-        if len(back):
-            row = int(back[0])
-            jump = f"from {seconds[row]:g} s to {seconds[row + 1]:g} s at state {row + 1}"
+        times_s, bodies = model.states(run.arrays["states"], f"{place}: states")
+        if not np.isfinite(times_s).all():
+            row = int(np.flatnonzero(~np.isfinite(times_s))[0])
+            raise LogError(f"{place}: the time of state {row} is {times_s[row]}")
+        times_ns: Integers = np.round(times_s * 1e9).astype(np.int64)
+        remarks, unjudged, jump_rows = list(model.remarks), "", np.flatnonzero(np.diff(times_ns) <= 0)
+        if len(jump_rows):
+            row = int(jump_rows[0])
+            jump = f"from {times_s[row]:g} s to {times_s[row + 1]:g} s at state {row + 1}"
             unjudged = f"its time goes {jump}: {SECOND_RUN}"
             times_ns = frame_times_ns(np.arange(count, dtype=np.int64), run.reading.fps or 20.0)
-        elif count and seconds[0] > 0:
-            remarks.append(f"its time starts at {seconds[0]:.3f} s")
+        elif count and times_s[0] > 0:
+            remarks.append(f"its time starts at {times_s[0]:.3f} s")
         return EpisodeColumns(times_ns, bodies=tuple(bodies), remarks=tuple(remarks), unjudged=unjudged)
 
     def whole_label(self, run: Run, label: str) -> bool | None:

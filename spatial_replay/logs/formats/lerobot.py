@@ -88,15 +88,16 @@ class _LeRobot(DataSet):
         self._rows: dict[Path, Mapping[int, _Rows]] = {}
         # some third-party copies have the metadata of versions 2 and 3, and file names of neither
         is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
-        lost = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
-        if lost and not is_third_party:
+        missing = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
+        if missing and not is_third_party:
             remarks.append(
-                f"meta names files that are not in data/: {listing(lost, 3)}; rows are found by episode_index"
+                f"meta names files that are not in data/: {listing(missing, 3)}; rows are found by"
+                " episode_index"
             )
-        total = info.get("total_episodes")
-        if isinstance(total, int) and total != len(self.episodes):
+        stated_count = info.get("total_episodes")
+        if isinstance(stated_count, int) and stated_count != len(self.episodes):
             remarks.append(
-                f"meta/info.json says {plural(total, 'episode')}, and meta has {len(self.episodes)}"
+                f"meta/info.json says {plural(stated_count, 'episode')}, and meta has {len(self.episodes)}"
             )
         if info.get("chunks_size") == 1 and _lacks_files(path):
             remarks.append(
@@ -118,8 +119,8 @@ class _LeRobot(DataSet):
         ]
         if len(pieces) == 1:
             return pieces[0]
-        common = set.intersection(*(set(piece) for piece in pieces))
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in common}
+        common_names = set.intersection(*(set(piece) for piece in pieces))
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in common_names}
 
     def count_states(self, run: Run) -> int:
         return len(run.arrays["episode_index"])
@@ -130,23 +131,28 @@ class _LeRobot(DataSet):
         fps, all_frames = self.required_fps(run.reading), np.arange(count, dtype=np.float64)
         frames = arrays.get("frame_index", all_frames)
         remarks, unjudged = tuple(_remarks(arrays, frames, fps, episode.frames)), ""
-        named, files = self._file_by_end.get(self._file_of[episode.number]), [rows.file for rows in run.group]
-        if named is not None and named not in files:
-            place = files[0].relative_to(self.path)
-            remarks += (f"its rows are in {place}, and not in {named.relative_to(self.path)} as meta says",)
-        back = np.flatnonzero(np.diff(frames) <= 0)
-        if len(back):
-            at = int(back[0])
-            jump = f"from {frames[at]:g} to {frames[at + 1]:g} at row {at + 1}"
+        named_file, row_files = (
+            self._file_by_end.get(self._file_of[episode.number]),
+            [rows.file for rows in run.group],
+        )
+        if named_file is not None and named_file not in row_files:
+            row_file = row_files[0].relative_to(self.path)
+            remarks += (
+                f"its rows are in {row_file}, and not in {named_file.relative_to(self.path)} as meta says",
+            )
+        jump_rows = np.flatnonzero(np.diff(frames) <= 0)
+        if len(jump_rows):
+            row = int(jump_rows[0])
+            jump = f"from {frames[row]:g} to {frames[row + 1]:g} at row {row + 1}"
             unjudged = f"its frame_index goes {jump}: {SECOND_RUN}"
             frames = all_frames
         times_ns = frame_times_ns(frames.astype(np.int64), fps)
         return EpisodeColumns(times_ns, remarks=remarks, unjudged=unjudged)
 
     def shared_files(self) -> list[Path]:
-        meta = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
-        meta += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
-        return [file for file in meta if file.exists()]
+        files = [self.path / "meta" / "info.json", self.path / "meta" / "episodes.jsonl"]
+        files += sorted((self.path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
+        return [file for file in files if file.exists()]
 
     def files_of(self, number: int) -> list[Path]:
         return [rows.file for rows in self._places(number)]
@@ -157,15 +163,19 @@ class _LeRobot(DataSet):
         Raises:
             LogError: no file has its rows, or other episodes are between them.
         """
-        likely = self._file_of[number]
-        named = self._file_by_end.get(likely)
+        likely_ending = self._file_of[number]
+        named_file = self._file_by_end.get(likely_ending)
         # a file of version 2 that holds its episode needs no search
-        is_alone = named is not None and named.name == likely and number in self._rows_of(named)
+        is_alone = (
+            named_file is not None
+            and named_file.name == likely_ending
+            and number in self._rows_of(named_file)
+        )
         # metadata of copied or merged data sets names wrong files, so all files are searched
-        files = [named] if named is not None and is_alone else self._files
+        files = [named_file] if named_file is not None and is_alone else self._files
         places = [rows for file in files if (rows := self._rows_of(file).get(number)) is not None]
         if not places:
-            file = "" if named else f" ({likely} is missing)"
+            file = "" if named_file else f" ({likely_ending} is missing)"
             raise LogError(
                 f"{self.name}#{number}: no file in data/ has its rows{file}; download the whole data set"
             )
@@ -176,18 +186,20 @@ class _LeRobot(DataSet):
     def _rows_of(self, file: Path) -> Mapping[int, _Rows]:
         """Return the rows of each episode in a file."""
         if file not in self._rows:
-            numbers = _read_columns(file, {"episode_index"}).get("episode_index")
-            if numbers is None:
+            episode_numbers = _read_columns(file, {"episode_index"}).get("episode_index")
+            if episode_numbers is None:
                 raise LogError(f"{file.name} has no column episode_index")
             # NaN differs from every number, so row 0 is a first row, too
-            firsts = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0)
-            ends = [*firsts[1:].tolist(), len(numbers)]
+            first_rows = np.flatnonzero(np.diff(episode_numbers, prepend=np.nan) != 0)
+            end_rows = [*first_rows[1:].tolist(), len(episode_numbers)]
             rows_by_number: dict[int, _Rows] = {}
-            for first, end in zip(firsts.tolist(), ends, strict=True):
-                number = int(numbers[first])
-                earlier = rows_by_number.get(number)
+            for first_row, end_row in zip(first_rows.tolist(), end_rows, strict=True):
+                number = int(episode_numbers[first_row])
+                earlier_rows = rows_by_number.get(number)
                 rows_by_number[number] = (
-                    _Rows(file, first, end) if earlier is None else _Rows(file, earlier.begin, end, False)
+                    _Rows(file, first_row, end_row)
+                    if earlier_rows is None
+                    else _Rows(file, earlier_rows.begin, end_row, False)
                 )
             self._rows[file] = rows_by_number
         return self._rows[file]
@@ -195,10 +207,10 @@ class _LeRobot(DataSet):
     def _table(self, file: Path, names: AbstractSet[str]) -> Mapping[str, Floats]:
         """Return columns of a file; the columns of the last file are cached."""
         # columns are read whole and filtered in memory: 0.06 ms for an episode of 85 frames
-        key = (file, file.stat().st_mtime_ns)
-        read, table = self._loaded[1:] if self._loaded[0] == key else (frozenset[str](), {})
-        if unread := names - read:
-            self._loaded = (key, read | names, {**table, **_read_columns(file, unread)})
+        file_version = (file, file.stat().st_mtime_ns)
+        read_names, table = self._loaded[1:] if self._loaded[0] == file_version else (frozenset[str](), {})
+        if unread_names := names - read_names:
+            self._loaded = (file_version, read_names | names, {**table, **_read_columns(file, unread_names)})
         return self._loaded[2]
 
 
@@ -209,12 +221,12 @@ def _lacks_files(path: Path) -> bool:
 
 
 def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
-    for name, about in features.items():
-        about = about if isinstance(about, dict) else {}
-        shape = about.get("shape")
+    for name, description in features.items():
+        description = description if isinstance(description, dict) else {}
+        shape = description.get("shape")
         shape = [1] if not isinstance(shape, list) else [size for size in shape if isinstance(size, int)]
-        width = int(np.prod(shape)) if about.get("dtype") not in ("video", "image", "string") else 0
-        yield Feature(name, _places_of(about.get("names"), width), width)
+        width = int(np.prod(shape)) if description.get("dtype") not in ("video", "image", "string") else 0
+        yield Feature(name, _places_of(description.get("names"), width), width)
 
 
 def _places_of(names: object, width: int) -> tuple[str, ...]:
@@ -229,8 +241,8 @@ def _places_of(names: object, width: int) -> tuple[str, ...]:
 
 def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str]]:
     """Return path endings of files by episode number, the episodes, and remarks."""
-    rows, remarks = list(_episode_rows(path)), []
-    if not rows:
+    episode_rows, remarks = list(_episode_rows(path)), []
+    if not episode_rows:
         remarks.append("meta has no episodes; their numbers are those in data/")
         files = sorted((path / "data").rglob("*.parquet"))
         numbers = {
@@ -238,26 +250,27 @@ def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str
             for file in files
             for number in _read_columns(file, {"episode_index"})["episode_index"]
         }
-        rows = [{"episode_index": number} for number in numbers]
-    by_number: dict[int, Mapping[str, Any]] = {}
-    for row in rows:
+        episode_rows = [{"episode_index": number} for number in numbers]
+    row_by_number: dict[int, Mapping[str, Any]] = {}
+    for row in episode_rows:
         if isinstance(row.get("episode_index"), int):
-            by_number.setdefault(row["episode_index"], row)
-    if len(by_number) < len(rows):
+            row_by_number.setdefault(row["episode_index"], row)
+    if len(row_by_number) < len(episode_rows):
         remarks.append(
-            f"meta lists {plural(len(rows) - len(by_number), 'episode')} twice or without a number"
+            f"meta lists {plural(len(episode_rows) - len(row_by_number), 'episode')} twice or without a"
+            " number"
         )
     episodes, file_of = [], {}
-    for number, row in sorted(by_number.items()):
+    for number, row in sorted(row_by_number.items()):
         tasks = row.get("tasks")
         task = next(iter(tasks), None) if isinstance(tasks, list) else tasks
         frames = integer_or_none(row.get("length"))
         episodes.append(Episode(number, str(number), frames, str(task) if task else None))
-        places = row.get("data/chunk_index"), row.get("data/file_index")
+        file_numbers = row.get("data/chunk_index"), row.get("data/file_index")
         # version 2 names files by episode, version 3 by chunk and file number
         file_of[number] = f"episode_{number:06d}.parquet"
-        if all(isinstance(place, int) for place in places):
-            file_of[number] = "chunk-{:03d}/file-{:03d}.parquet".format(*places)
+        if all(isinstance(file_number, int) for file_number in file_numbers):
+            file_of[number] = "chunk-{:03d}/file-{:03d}.parquet".format(*file_numbers)
     return file_of, tuple(episodes), remarks
 
 
@@ -268,8 +281,8 @@ def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
         library = arrow()
         for file in files:
             try:
-                names = library.parquet.read_schema(file).names
-                columns = [name for name in names if name in _EPISODE_COLUMNS]
+                column_names = library.parquet.read_schema(file).names
+                columns = [name for name in column_names if name in _EPISODE_COLUMNS]
                 yield from library.parquet.read_table(file, columns=columns).to_pylist()
             except library.ArrowException as error:
                 raise LogError(f"{file.relative_to(path)} cannot be read: {error}") from None
@@ -293,11 +306,11 @@ def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
     library = arrow()
     try:
         with library.parquet.ParquetFile(file) as parquet:
-            schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
-            present = [name for name in schema.names if name in names]
-            if 8 * rows * max(1, len(present)) > MOST_BYTES:
-                raise LogError(f"{file.name} has {rows:,} rows; split it into smaller files")
-            table = parquet.read(columns=present)
+            schema, row_count = parquet.schema_arrow, parquet.metadata.num_rows
+            present_names = [name for name in schema.names if name in names]
+            if 8 * row_count * max(1, len(present_names)) > MOST_BYTES:
+                raise LogError(f"{file.name} has {row_count:,} rows; split it into smaller files")
+            table = parquet.read(columns=present_names)
     except (OSError, library.ArrowException) as error:
         raise LogError(
             f"{file.name} cannot be read: {str(error).splitlines()[0].rstrip('.')}; download it again"
@@ -312,22 +325,24 @@ def _remarks(
     """Yield remarks on unusual values in the rows of an episode; all rows are read nevertheless."""
     if expected is not None and expected != len(frames):
         yield f"meta says {plural(expected, 'frame')}, and data has {len(frames)}"
-    steps = np.diff(frames)
-    odd = np.flatnonzero(steps != 1)
+    frame_steps = np.diff(frames)
+    irregular_rows = np.flatnonzero(frame_steps != 1)
     if len(frames) and frames[0] != 0:
         yield f"its frame_index starts at {frames[0]:g}, and so its time at {frames[0] / fps:.3f} s"
-    if len(odd) and (steps > 0).all():
-        at = int(odd[0])
-        yield f"its frame_index goes from {frames[at]:g} to {frames[at + 1]:g}: frames are missing"
+    if len(irregular_rows) and (frame_steps > 0).all():
+        row = int(irregular_rows[0])
+        yield f"its frame_index goes from {frames[row]:g} to {frames[row + 1]:g}: frames are missing"
     if "timestamp" in columns:
-        off = np.abs(columns["timestamp"].reshape(-1) - frames / fps)
-        at = int(np.nan_to_num(off, nan=0.0).argmax()) if len(off) else 0
+        time_errors_s = np.abs(columns["timestamp"].reshape(-1) - frames / fps)
+        row = int(np.nan_to_num(time_errors_s, nan=0.0).argmax()) if len(time_errors_s) else 0
         # late times in float32 are less exact than the usual error
-        if len(off) and off[at] > max(_TIME_ERROR_S, float(np.spacing(np.float32(frames[at] / fps)))):
+        if len(time_errors_s) and time_errors_s[row] > max(
+            _TIME_ERROR_S, float(np.spacing(np.float32(frames[row] / fps)))
+        ):
             yield (
-                f"its timestamp is {columns['timestamp'].reshape(-1)[at]:.6g} s at frame {frames[at]:g},"
-                f" which is {frames[at] / fps:.6g} s by frame_index and {fps:g} fps; frame_index counts"
+                f"its timestamp is {columns['timestamp'].reshape(-1)[row]:.6g} s at frame {frames[row]:g},"
+                f" which is {frames[row] / fps:.6g} s by frame_index and {fps:g} fps; frame_index counts"
             )
     if "next.done" in columns and columns["next.done"].reshape(-1)[:-1].any():
-        at = int(columns["next.done"].reshape(-1).argmax())
-        yield f"its next.done is true at frame {frames[at]:g}, before its last one"
+        row = int(columns["next.done"].reshape(-1).argmax())
+        yield f"its next.done is true at frame {frames[row]:g}, before its last one"

@@ -46,12 +46,12 @@ def open_minari(path: Path) -> DataSet | None:
     folder = path / "data" if (path / "data" / "metadata.json").is_file() else path
     if b'"minari_version"' not in read_head(folder / "metadata.json"):
         return None
-    about = read_json(folder / "metadata.json")
-    storage = str(about.get("data_format", "hdf5"))
+    metadata = read_json(folder / "metadata.json")
+    storage = str(metadata.get("data_format", "hdf5"))
     if storage == "hdf5":
-        return _Hdf5(path, folder, about)
+        return _Hdf5(path, folder, metadata)
     if storage in ("arrow", "parquet"):
-        return _Tables(path, folder, about)
+        return _Tables(path, folder, metadata)
     raise UsageError(f"{path.name} is stored as {storage}; hdf5, arrow and parquet are read")
 
 
@@ -60,25 +60,28 @@ class _Minari(DataSet):
 
     always_read = _ENDS
 
-    def __init__(self, path: Path, folder: Path, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, folder: Path, metadata: Mapping[str, Any]) -> None:
         self.path, self.home = path, folder
-        self.kind = f"Minari {about.get('minari_version')} ({about.get('data_format', 'hdf5')})"
-        self.episodes = tuple(self.list_episodes(_task(about)))
+        self.kind = f"Minari {metadata.get('minari_version')} ({metadata.get('data_format', 'hdf5')})"
+        self.episodes = tuple(self.list_episodes(_task(metadata)))
         if not self.episodes:
             raise LogError(f"{path.name} has no episodes")
         widths = self.widths(self.episodes[0])
         self.features = tuple(Feature(name, (), width) for name, width in widths.items() if name not in _ENDS)
         label = next((name for name in _LABELS if widths.get(name)), None)
         self.label = Label(label) if label else None
-        self.remarks = tuple(self._remarks(about))
+        self.remarks = tuple(self._remarks(metadata))
 
-    def _remarks(self, about: Mapping[str, Any]) -> Iterator[str]:
-        total, combined = about.get("total_episodes"), about.get("combined_datasets")
-        if isinstance(total, int) and total != len(self.episodes):
-            yield f"metadata.json says {plural(total, 'episode')}, and the data have {len(self.episodes)}"
+    def _remarks(self, metadata: Mapping[str, Any]) -> Iterator[str]:
+        stated_count, combined = metadata.get("total_episodes"), metadata.get("combined_datasets")
+        if isinstance(stated_count, int) and stated_count != len(self.episodes):
+            yield (
+                f"metadata.json says {plural(stated_count, 'episode')}, and the data have"
+                f" {len(self.episodes)}"
+            )
         if isinstance(combined, list):
-            names = listing(list(dict.fromkeys(map(str, combined))))
-            yield f"it combines {names}: episodes that were filtered out of these are in it again"
+            data_set_names = listing(list(dict.fromkeys(map(str, combined))))
+            yield f"it combines {data_set_names}: episodes that were filtered out of these are in it again"
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
         """Yield the episodes in the order of their numbers."""
@@ -98,9 +101,9 @@ class _Minari(DataSet):
         return EpisodeColumns(times_ns, unjudged=unjudged)
 
 
-def _task(about: Mapping[str, Any]) -> str | None:
+def _task(metadata: Mapping[str, Any]) -> str | None:
     try:
-        specification = json.loads(about.get("env_spec") or "{}")
+        specification = json.loads(metadata.get("env_spec") or "{}")
     except (TypeError, ValueError):
         return None
     name = specification.get("id") if isinstance(specification, dict) else None
@@ -117,9 +120,9 @@ def _second_run(arrays: Mapping[str, Floats], steps: int, count: int) -> str:
     When a data set is updated, Minari appends a run to an existing episode of the same number.
     """
     for name in _ENDS:
-        ends = np.flatnonzero(arrays.get(name, np.empty(0))[:-1] > 0)
-        if len(ends):
-            return f"its {name} end a run at step {ends[0]} of {steps}: {SECOND_RUN}"
+        end_steps = np.flatnonzero(arrays.get(name, np.empty(0))[:-1] > 0)
+        if len(end_steps):
+            return f"its {name} end a run at step {end_steps[0]} of {steps}: {SECOND_RUN}"
     if count != steps + 1:
         return f"it has {plural(count, 'state')} for {plural(steps, 'step')}: {SECOND_RUN}"
     return ""
@@ -134,12 +137,14 @@ class _Hdf5(_Minari, InGroups):
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
         with open_archive(self.archive) as file:
-            names = [name.removeprefix("episode_") for name in file.names]
-            for number in sorted(int(name) for name in names if name.isdecimal()):
-                key = f"episode_{number}"
-                group = file.episode(key, f"{self.name}#{number}")
+            episode_names = [name.removeprefix("episode_") for name in file.names]
+            for number in sorted(int(name) for name in episode_names if name.isdecimal()):
+                group_name = f"episode_{number}"
+                group = file.episode(group_name, f"{self.name}#{number}")
                 steps = group.integer("total_steps")
-                yield Episode(number, key, None if steps is None else steps + 1, task, group.integer("seed"))
+                yield Episode(
+                    number, group_name, None if steps is None else steps + 1, task, group.integer("seed")
+                )
 
     def widths(self, episode: Episode) -> dict[str, int]:
         """See `_Minari.widths`; elements of a tuple are named by their index, as in Arrow."""
@@ -158,18 +163,20 @@ class _Tables(_Minari):
     """A data set with a folder of Arrow or Parquet files for each episode."""
 
     def list_episodes(self, task: str | None) -> Iterator[Episode]:
-        names = [child.name for child in self.home.iterdir() if child.name.isdecimal() and child.is_dir()]
-        for number in sorted(map(int, names)):
+        folder_names = [
+            child.name for child in self.home.iterdir() if child.name.isdecimal() and child.is_dir()
+        ]
+        for number in sorted(map(int, folder_names)):
             file = self.home / str(number) / "metadata.json"
-            about = read_json(file) if file.is_file() else {}
-            steps, seed = integer_or_none(about.get("total_steps")), integer_or_none(about.get("seed"))
+            metadata = read_json(file) if file.is_file() else {}
+            steps, seed = integer_or_none(metadata.get("total_steps")), integer_or_none(metadata.get("seed"))
             yield Episode(number, str(number), None if steps is None else steps + 1, task, seed)
 
     def widths(self, episode: Episode) -> dict[str, int]:
         widths = {}
         for name, column in self._columns(episode).items():
-            values = numbers_from_column(column)
-            widths[name] = 0 if values is None else int(np.prod(values.shape[1:]))
+            numbers = numbers_from_column(column)
+            widths[name] = 0 if numbers is None else int(np.prod(numbers.shape[1:]))
         return widths
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Episode]:
@@ -178,11 +185,11 @@ class _Tables(_Minari):
     def read(self, group: Episode, names: AbstractSet[str]) -> dict[str, Floats]:
         episode, arrays = group, dict[str, Floats]()
         for name, column in self._columns(episode).items():
-            values = numbers_from_column(column) if name in names else None
-            if values is not None:
+            numbers = numbers_from_column(column) if name in names else None
+            if numbers is not None:
                 # the last row of steps is padding: nothing follows the last state
                 is_of_steps = name.split("/")[0] in _OF_STEPS
-                arrays[name] = values[: (episode.frames or len(values)) - 1] if is_of_steps else values
+                arrays[name] = numbers[: (episode.frames or len(numbers)) - 1] if is_of_steps else numbers
         return arrays
 
     def _columns(self, episode: Episode) -> dict[str, Any]:
@@ -209,10 +216,10 @@ def _leaves(table: Any, library: Any) -> Iterator[tuple[str, Any]]:
         if not library.types.is_struct(column.type):
             yield name, column
             continue
-        fields = [column.type.field(index).name for index in range(column.type.num_fields)]
+        field_names = [column.type.field(index).name for index in range(column.type.num_fields)]
         pending += [
-            (f"{name}/{field}", library.compute.struct_field(column, [index]))
-            for index, field in reversed(list(enumerate(fields)))
+            (f"{name}/{field_name}", library.compute.struct_field(column, [index]))
+            for index, field_name in reversed(list(enumerate(field_names)))
         ]
 
 

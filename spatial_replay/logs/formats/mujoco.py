@@ -95,59 +95,59 @@ class SceneModel:
             import mujoco
         self._mujoco, self._model, self._place = mujoco, model, place
         self.nq, self.nv = int(model.nq), int(model.nv)
-        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        free_joints = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         self._bodies: dict[str, int] = {
-            model.body(body).name or f"body {body}": body for body in model.jnt_bodyid[free].tolist()
+            model.body(body).name or f"body {body}": body for body in model.jnt_bodyid[free_joints].tolist()
         }
         self.names = tuple(self._bodies)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         # poses in the default state give the geoms in the frames of their bodies
         self._geoms = {name: self._geoms_of(body, data) for name, body in self._bodies.items()}
-        mocap = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
+        mocap_names = [model.body(body).name for body in np.flatnonzero(model.body_mocapid >= 0).tolist()]
         self.remarks = tuple(remarks)
-        if mocap:
+        if mocap_names:
             self.remarks += (
-                f"mocap bodies are not in the states of the model: {', '.join(mocap)}; name such goals by"
-                " `features:`, from observations",
+                f"mocap bodies are not in the states of the model: {', '.join(mocap_names)}; name such goals"
+                " by `features:`, from observations",
             )
 
     def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...]:
         """Return the geoms of a body's footprint; () if one of their meshes is missing."""
-        model, kinds = self._model, self._mujoco.mjtGeom
-        indices = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
-        indices = indices[~np.isin(model.geom_type[indices], (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD))]
+        model, types = self._model, self._mujoco.mjtGeom
+        geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
+        geoms = geoms[~np.isin(model.geom_type[geoms], (types.mjGEOM_PLANE, types.mjGEOM_HFIELD))]
         # geoms for display count only if no geom collides
-        collides = (model.geom_contype[indices] != 0) | (model.geom_conaffinity[indices] != 0)
-        counting = (indices[collides] if collides.any() else indices).tolist()
-        if any(model.geom(index).name.startswith(_LOST) for index in counting):
+        collides = (model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)
+        footprint_geoms = (geoms[collides] if collides.any() else geoms).tolist()
+        if any(model.geom(index).name.startswith(_LOST) for index in footprint_geoms):
             return ()
-        turn = data.xmat[body].reshape(3, 3).T
+        body_from_world = data.xmat[body].reshape(3, 3).T
         return tuple(
             _Geom(
                 kind=int(model.geom_type[index]),
                 size=model.geom_size[index].copy(),
-                position=turn @ (data.geom_xpos[index] - data.xpos[body]),
-                rotation=turn @ data.geom_xmat[index].reshape(3, 3),
+                position=body_from_world @ (data.geom_xpos[index] - data.xpos[body]),
+                rotation=body_from_world @ data.geom_xmat[index].reshape(3, 3),
                 vertices=self._vertices_of(index),
             )
-            for index in counting
+            for index in footprint_geoms
         )
 
-    def _vertices_of(self, geom: int) -> Floats:
+    def _vertices_of(self, geom_index: int) -> Floats:
         """Return the vertices (v, 3) of a geom's mesh, or of its convex hull if MuJoCo computed one."""
         model = self._model
-        mesh = int(model.geom_dataid[geom])
-        if model.geom_type[geom] != self._mujoco.mjtGeom.mjGEOM_MESH or mesh < 0:
+        mesh_index = int(model.geom_dataid[geom_index])
+        if model.geom_type[geom_index] != self._mujoco.mjtGeom.mjGEOM_MESH or mesh_index < 0:
             return np.empty((0, 3))
-        begin, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-        vertices = np.asarray(model.mesh_vert[begin : begin + count], np.float64)
-        graph = int(model.mesh_graphadr[mesh])
+        first_vertex, vertex_count = int(model.mesh_vertadr[mesh_index]), int(model.mesh_vertnum[mesh_index])
+        vertices = np.asarray(model.mesh_vert[first_vertex : first_vertex + vertex_count], np.float64)
+        graph = int(model.mesh_graphadr[mesh_index])
         if graph < 0:
             return vertices
         # a graph holds numvert, numface, vert_edgeadr[numvert], vert_globalid[numvert], edges and faces
-        corners = int(model.mesh_graph[graph])
-        return np.asarray(vertices[model.mesh_graph[graph + 2 + corners : graph + 2 + 2 * corners]])
+        hull_count = int(model.mesh_graph[graph])
+        return np.asarray(vertices[model.mesh_graph[graph + 2 + hull_count : graph + 2 + 2 * hull_count]])
 
     def states(self, states: Floats, place: str) -> tuple[Floats, list[Body]]:
         """Return times (n,), in seconds, and free bodies of states (n, 1 + nq + nv): time, qpos, qvel.
@@ -155,11 +155,11 @@ class SceneModel:
         Raises:
             LogError: states of another length.
         """
-        expected = 1 + self.nq + self.nv
-        if states.ndim != 2 or states.shape[1] != expected:
+        expected_width = 1 + self.nq + self.nv
+        if states.ndim != 2 or states.shape[1] != expected_width:
             raise LogError(
                 f"{place} has the shape {states.shape}, but a state of {self._place} has"
-                f" {expected} numbers: time, {self.nq} of qpos, {self.nv} of qvel;"
+                f" {expected_width} numbers: time, {self.nq} of qpos, {self.nv} of qvel;"
                 " give the model that recorded these states"
             )
         return np.asarray(states[:, 0], np.float64), self.bodies(states[:, 1 : 1 + self.nq], place)
@@ -181,24 +181,24 @@ class SceneModel:
         return [
             Body(
                 name,
-                positions[:, column],
-                quaternions[:, column][:, [1, 2, 3, 0]],
-                footprints_of(self._geoms[name], positions[:, column], quaternions[:, column]),
+                positions[:, body_index],
+                quaternions[:, body_index][:, [1, 2, 3, 0]],
+                footprints_of(self._geoms[name], positions[:, body_index], quaternions[:, body_index]),
             )
-            for column, name in enumerate(self._bodies)
+            for body_index, name in enumerate(self._bodies)
         ]
 
     def _kinematics(self, qpos: Floats) -> tuple[Floats, Floats]:
         """Return positions (n, b, 3) and quaternions (n, b, 4), w x y z; NaN where a state is not finite."""
         mujoco, model = self._mujoco, self._model
-        data, indices = mujoco.MjData(model), list(self._bodies.values())
-        positions = np.full((len(qpos), len(indices), 3), np.nan)
-        quaternions = np.full((len(qpos), len(indices), 4), np.nan)
-        state = int(mujoco.mjtState.mjSTATE_QPOS)
+        data, body_indices = mujoco.MjData(model), list(self._bodies.values())
+        positions = np.full((len(qpos), len(body_indices), 3), np.nan)
+        quaternions = np.full((len(qpos), len(body_indices), 4), np.nan)
+        state_kind = int(mujoco.mjtState.mjSTATE_QPOS)
         for row in np.flatnonzero(np.isfinite(qpos).all(axis=1)).tolist():
-            mujoco.mj_setState(model, data, qpos[row], state)
+            mujoco.mj_setState(model, data, qpos[row], state_kind)
             mujoco.mj_kinematics(model, data)
-            positions[row], quaternions[row] = data.xpos[indices], data.xquat[indices]
+            positions[row], quaternions[row] = data.xpos[body_indices], data.xquat[body_indices]
         return positions, quaternions
 
 
@@ -215,35 +215,35 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
     if not geoms:
         return None
     is_finite = np.asarray(np.isfinite(np.hstack([positions, quaternions])).all(axis=1))
-    turns, places = _rotations(quaternions[is_finite]), positions[is_finite]
-    count = len(places)
-    parts = FootprintBatch.concatenate(
-        [_projection(geom, places + turns @ geom.position, turns @ geom.rotation) for geom in geoms]
+    rotations, centres = _rotations(quaternions[is_finite]), positions[is_finite]
+    state_count = len(centres)
+    projections = FootprintBatch.concatenate(
+        [_projection(geom, centres + rotations @ geom.position, rotations @ geom.rotation) for geom in geoms]
     )
     # the rows are sorted by geom and state; they become sorted by state and geom
-    by_state = np.arange(len(geoms) * count).reshape(len(geoms), count).T.reshape(-1)
-    joined = parts.select(by_state)
+    state_order = np.arange(len(geoms) * state_count).reshape(len(geoms), state_count).T.reshape(-1)
+    sorted_projections = projections.select(state_order)
     merged = replace(
-        joined,
-        part_start=np.arange(count + 1, dtype=np.int64) * len(geoms),
-        bottom=parts.bottom.reshape(len(geoms), count).min(axis=0),
-        top=parts.top.reshape(len(geoms), count).max(axis=0),
+        sorted_projections,
+        part_start=np.arange(state_count + 1, dtype=np.int64) * len(geoms),
+        bottom=projections.bottom.reshape(len(geoms), state_count).min(axis=0),
+        top=projections.top.reshape(len(geoms), state_count).max(axis=0),
     )
     if is_finite.all():
         return merged
-    rows = np.where(is_finite, np.cumsum(is_finite) - 1, count)
-    return FootprintBatch.concatenate([merged, FootprintBatch.unknown(1)]).select(rows)
+    source_rows = np.where(is_finite, np.cumsum(is_finite) - 1, state_count)
+    return FootprintBatch.concatenate([merged, FootprintBatch.unknown(1)]).select(source_rows)
 
 
 def _rotations(quaternions: Floats) -> Floats:
     """Return the rotation matrices (n, 3, 3) of unit quaternions (n, 4), w x y z."""
     w, x, y, z = quaternions.T
-    rows = [
+    matrix_rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.moveaxis(np.array(rows).reshape(3, 3, -1), 2, 0)
+    return np.moveaxis(np.array(matrix_rows).reshape(3, 3, -1), 2, 0)
 
 
 def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
@@ -255,18 +255,18 @@ def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
     if geom.kind == mjtGeom.mjGEOM_SPHERE:
         return _hulls(centres[:, None, :2], size[0], height - size[0], height + size[0])
     if geom.kind == mjtGeom.mjGEOM_CAPSULE:
-        reach = size[0] + size[1] * np.abs(axis[:, 2])
-        return _hulls(_ends(centres, axis * size[1]), size[0], height - reach, height + reach)
+        half_height = size[0] + size[1] * np.abs(axis[:, 2])
+        return _hulls(_ends(centres, axis * size[1]), size[0], height - half_height, height + half_height)
     if geom.kind == mjtGeom.mjGEOM_CYLINDER:
         return _cylinders(size, centres, turns)
     if geom.kind == mjtGeom.mjGEOM_ELLIPSOID:
-        reach = np.linalg.norm(turns[:, 2] * size, axis=1)
+        half_height = np.linalg.norm(turns[:, 2] * size, axis=1)
         outline = centres[:, None, :2] + _ellipses(turns[:, :2] * size)
-        return _hulls(outline, 0.0, height - reach, height + reach)
-    local = geom.vertices
+        return _hulls(outline, 0.0, height - half_height, height + half_height)
+    local_vertices = geom.vertices
     if geom.kind == mjtGeom.mjGEOM_BOX:
-        local = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
-    points = centres[:, None] + local @ turns.transpose(0, 2, 1)
+        local_vertices = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
+    points = centres[:, None] + local_vertices @ turns.transpose(0, 2, 1)
     return _hulls(points[..., :2], 0.0, points[..., 2].min(axis=1), points[..., 2].max(axis=1))
 
 
@@ -276,53 +276,62 @@ def _ends(centres: Floats, halves: Floats) -> Floats:
 
 
 def _cylinders(size: Floats, centres: Floats, turns: Floats) -> FootprintBatch:
-    radius, half = float(size[0]), float(size[1])
+    radius, half_length = float(size[0]), float(size[1])
     axis, height = turns[:, :, 2], centres[:, 2]
-    reach = half * np.abs(axis[:, 2]) + radius * np.sqrt(np.maximum(0.0, 1.0 - axis[:, 2] ** 2))
+    half_height = half_length * np.abs(axis[:, 2]) + radius * np.sqrt(np.maximum(0.0, 1.0 - axis[:, 2] ** 2))
     angles = np.arange(RIM_CORNERS) * (2 * np.pi / RIM_CORNERS)
     x, y = radius * np.cos(angles), radius * np.sin(angles)
-    rims = np.concatenate([np.stack([x, y, np.full(RIM_CORNERS, z)], axis=1) for z in (half, -half)])
-    upright = np.abs(axis[:, 2]) > UPRIGHT_COSINE
-    tilted = ~upright
-    corners = centres[tilted][:, None] + rims @ turns[tilted].transpose(0, 2, 1)
-    bottom, top = height - reach, height + reach
+    rims = np.concatenate(
+        [np.stack([x, y, np.full(RIM_CORNERS, z)], axis=1) for z in (half_length, -half_length)]
+    )
+    is_upright = np.abs(axis[:, 2]) > UPRIGHT_COSINE
+    is_tilted = ~is_upright
+    rim_points = centres[is_tilted][:, None] + rims @ turns[is_tilted].transpose(0, 2, 1)
+    bottom, top = height - half_height, height + half_height
     batches = [
-        _hulls(_ends(centres[upright], axis[upright] * half), radius, bottom[upright], top[upright]),
-        _hulls(corners[..., :2], 0.0, bottom[tilted], top[tilted]),
+        _hulls(
+            _ends(centres[is_upright], axis[is_upright] * half_length),
+            radius,
+            bottom[is_upright],
+            top[is_upright],
+        ),
+        _hulls(rim_points[..., :2], 0.0, bottom[is_tilted], top[is_tilted]),
     ]
-    order = np.argsort(np.concatenate([np.flatnonzero(upright), np.flatnonzero(tilted)]))
-    return FootprintBatch.concatenate(batches).select(order)
+    input_order = np.argsort(np.concatenate([np.flatnonzero(is_upright), np.flatnonzero(is_tilted)]))
+    return FootprintBatch.concatenate(batches).select(input_order)
 
 
 def _ellipses(axes: Floats) -> Floats:
     """Return outlines (n, k, 2) of ellipses, the projections of the unit ball by matrices (n, 2, 3)."""
     # the Cholesky factor of A A^T maps the unit circle to the outline of the projection by A
-    squared = axes @ axes.transpose(0, 2, 1)
-    first = np.sqrt(squared[:, 0, 0])
-    across = squared[:, 0, 1] / first
-    second = np.sqrt(np.maximum(0.0, squared[:, 1, 1] - across**2))
+    shape_matrices = axes @ axes.transpose(0, 2, 1)
+    factor_xx = np.sqrt(shape_matrices[:, 0, 0])
+    factor_yx = shape_matrices[:, 0, 1] / factor_xx
+    factor_yy = np.sqrt(np.maximum(0.0, shape_matrices[:, 1, 1] - factor_yx**2))
     angles = np.arange(ELLIPSE_CORNERS) * (2 * np.pi / ELLIPSE_CORNERS)
     cosines, sines = np.cos(angles), np.sin(angles)
-    return np.stack([first[:, None] * cosines, across[:, None] * cosines + second[:, None] * sines], axis=-1)
+    return np.stack(
+        [factor_xx[:, None] * cosines, factor_yx[:, None] * cosines + factor_yy[:, None] * sines], axis=-1
+    )
 
 
 def _hulls(points: Floats, radius: float, bottom: Floats, top: Floats) -> FootprintBatch:
     """Return n footprints, hulls of k points each (n, k, 2), rounded by a radius."""
     import shapely
 
-    count, corners, _ = points.shape
-    start, flat = np.arange(count + 1) * corners, np.ascontiguousarray(points).reshape(-1, 2)
-    if corners > 2 and count:
+    hull_count, point_count, _ = points.shape
+    starts, vertices = np.arange(hull_count + 1) * point_count, np.ascontiguousarray(points).reshape(-1, 2)
+    if point_count > 2 and hull_count:
         # lines instead of polygons, because the points may be on one line
-        lines = shapely.linestrings(flat, indices=np.repeat(np.arange(count), corners))
-        flat, owner = shapely.get_coordinates(shapely.convex_hull(lines), return_index=True)
-        start = starts_from_counts(np.bincount(owner, minlength=count))
-    outlines = normalise_polygons(start, flat)
+        lines = shapely.linestrings(vertices, indices=np.repeat(np.arange(hull_count), point_count))
+        vertices, hull_indices = shapely.get_coordinates(shapely.convex_hull(lines), return_index=True)
+        starts = starts_from_counts(np.bincount(hull_indices, minlength=hull_count))
+    outlines = normalise_polygons(starts, vertices)
     return FootprintBatch(
-        part_start=np.arange(count + 1, dtype=np.int64),
+        part_start=np.arange(hull_count + 1, dtype=np.int64),
         vertex_start=outlines.vertex_start,
         vertices=outlines.vertices,
-        radius=np.full(count, float(radius)),
+        radius=np.full(hull_count, float(radius)),
         bottom=bottom,
         top=top,
     )
@@ -371,15 +380,15 @@ def identity_of_model(model: Path | None, assets: Path | None) -> str:
     """
     if model is not None:
         source = _source(_text_of(model), model.name, assets or model.absolute().parent)
-        parts = [source.xml.encode(), *(content for _, content in source.files)]
+        contents = [source.xml.encode(), *(content for _, content in source.files)]
     else:
         # the models in a data set may name any file of the folder as a mesh
         files = sorted(file for file in assets.rglob("*") if file.is_file()) if assets is not None else []
         states = [(str(file), state.st_size, state.st_mtime_ns) for file in files for state in [file.stat()]]
-        parts = [repr(states).encode("utf-8", "surrogatepass")]
+        contents = [repr(states).encode("utf-8", "surrogatepass")]
     digest = hashlib.sha256()
-    for part in parts:
-        digest.update(hashlib.sha256(part).digest())
+    for data in contents:
+        digest.update(hashlib.sha256(data).digest())
     return digest.hexdigest()
 
 
@@ -426,27 +435,28 @@ class _Folder:
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = None if folder is None else folder.resolve()
-        self._too_large: list[str] = []
+        self._too_large_names: list[str] = []
 
     def read(self, name: str, directory: str = "") -> bytes | None:
         """Return the content of a file; None if it is missing in the folder or too large."""
         if self._folder is None:
             return None
         path = PurePosixPath(directory.replace("\\", "/")) / name.replace("\\", "/")
-        parts = [part for part in path.parts if part not in ("/", ".", "..")]
-        for begin in range(len(parts)):
-            file = self._folder.joinpath(*parts[begin:]).resolve()
+        path_parts = [part for part in path.parts if part not in ("/", ".", "..")]
+        for begin in range(len(path_parts)):
+            file = self._folder.joinpath(*path_parts[begin:]).resolve()
             if not file.is_relative_to(self._folder) or not file.is_file():
                 continue
             if file.stat().st_size > LARGEST_ASSET:
-                self._too_large.append(file.name)
+                self._too_large_names.append(file.name)
                 return None
             return file.read_bytes()
         return None
 
     def remarks(self) -> list[str]:
         return [
-            f"the mesh {name} has over {LARGEST_ASSET >> 20} MiB, and is left out" for name in self._too_large
+            f"the mesh {name} has over {LARGEST_ASSET >> 20} MiB, and is left out"
+            for name in self._too_large_names
         ]
 
 
@@ -459,9 +469,9 @@ def _element(text: str, place: str) -> ElementTree.Element:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise LogError(f"the XML of {place} is broken ({error}); give a model of MuJoCo") from None
-    level, depth = [root], 0
-    while level:
-        level, depth = [child for element in level for child in element], depth + 1
+    level_elements, depth = [root], 0
+    while level_elements:
+        level_elements, depth = [child for element in level_elements for child in element], depth + 1
     if depth > DEEPEST:
         raise LogError(f"{place} has elements nested more than {DEEPEST} deep; give a model of MuJoCo")
     if root.tag != "mujoco":
@@ -489,8 +499,8 @@ def _refuse_many(root: ElementTree.Element, place: str) -> None:
     """Refuse a model that would generate more elements than memory holds."""
 
     def copies(element: ElementTree.Element) -> float:
-        numbers = (_number(text) for text in element.get("count", "1").split())
-        return math.prod(numbers) * max([1.0, *map(copies, element)])
+        counts = (_number(text) for text in element.get("count", "1").split())
+        return math.prod(counts) * max([1.0, *map(copies, element)])
 
     if copies(root) > MOST_COPIES:
         raise LogError(f"{place} copies elements more than {MOST_COPIES:,} times; give a smaller model")
@@ -510,14 +520,14 @@ def _strip(root: ElementTree.Element, folder: _Folder, directory: str) -> dict[s
             if child.tag in _UNUSED or "hfield" in child.attrib:
                 parent.remove(child)
     files: dict[str, bytes] = {}
-    lost: set[str] = set()
+    missing_meshes: set[str] = set()
     for asset in root.findall("asset"):
         for mesh in asset.findall("mesh"):
             if not _has_content(mesh, folder, directory, files):
                 asset.remove(mesh)
-                lost.add(mesh.get("name", PurePosixPath(mesh.get("file", "")).stem))
+                missing_meshes.add(mesh.get("name", PurePosixPath(mesh.get("file", "")).stem))
     for number, geom in enumerate(root.iter("geom")):
-        if geom.get("mesh") in lost:
+        if geom.get("mesh") in missing_meshes:
             _lose_mesh(geom, number)
     for element in root.iter():
         element.attrib.pop("material", None)
@@ -544,8 +554,8 @@ def _has_content(mesh: ElementTree.Element, folder: _Folder, directory: str, fil
 
 def _lose_mesh(geom: ElementTree.Element, number: int) -> None:
     """Replace a geom whose mesh is missing by a small sphere with the name prefix `_LOST`."""
-    for key in ("mesh", "fromto", "fitscale"):
-        geom.attrib.pop(key, None)
+    for attribute in ("mesh", "fromto", "fitscale"):
+        geom.attrib.pop(attribute, None)
     geom.attrib |= {"type": "sphere", "size": "0.001", "name": f"{_LOST}{number}"}
 
 

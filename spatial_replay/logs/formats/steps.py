@@ -41,12 +41,12 @@ class _Steps(DataSet):
         """Divide the steps into episodes; `missing` says in a remark what a last episode lacks at its end."""
         ends = np.flatnonzero(is_end)
         if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
-            last = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
-            self.remarks += (f"its last episode, of {plural(last, 'step')}, {missing}",)
+            last_step_count = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
+            self.remarks += (f"its last episode, of {plural(last_step_count, 'step')}, {missing}",)
             ends = np.append(ends, len(is_end) - 1)
         self._bounds = [0, *(ends + 1).tolist()]
-        steps = enumerate(np.diff(self._bounds).tolist())
-        self.episodes = tuple(Episode(number, str(number), count) for number, count in steps)
+        numbered_counts = enumerate(np.diff(self._bounds).tolist())
+        self.episodes = tuple(Episode(number, str(number), count) for number, count in numbered_counts)
 
     def rows_of(self, episode: Episode) -> slice:
         """Return the rows of an episode."""
@@ -77,8 +77,8 @@ class D4rl(_Steps):
 
     def __init__(self, path: Path, file: Group) -> None:
         self.path = path
-        ends, timeouts = file.array("terminals"), file.array("timeouts")
-        is_end = numbers(ends).reshape(-1) > 0
+        terminals, timeouts = file.array("terminals"), file.array("timeouts")
+        is_end = numbers(terminals).reshape(-1) > 0
         if timeouts is not None:
             is_end |= numbers(timeouts).reshape(-1) > 0
         self.divide(is_end, "has no terminal and no timeout")
@@ -110,8 +110,8 @@ def open_npz(path: Path) -> DataSet | None:
     if path.suffix != ".npz" or not path.is_file():
         return None
     with _raising_log_errors(path), zipfile.ZipFile(path) as archive:
-        is_ours = "terminals.npy" in archive.namelist()
-    return _Npz(path) if is_ours else None
+        is_ogbench = "terminals.npy" in archive.namelist()
+    return _Npz(path) if is_ogbench else None
 
 
 class _Npz(_Steps):
@@ -160,8 +160,8 @@ class _Npz(_Steps):
     def _array(self, name: str) -> Floats:
         if name not in self._arrays:
             with _raising_log_errors(self.path), np.load(self.path, allow_pickle=False) as arrays:
-                values = np.asarray(arrays[name], np.float64)
-            self._arrays[name] = values.reshape(len(values), -1) if values.ndim > 1 else values
+                array = np.asarray(arrays[name], np.float64)
+            self._arrays[name] = array.reshape(len(array), -1) if array.ndim > 1 else array
         return self._arrays[name]
 
 
@@ -174,17 +174,17 @@ def _raising_log_errors(path: Path) -> Iterator[None]:
         raise LogError(f"{path.name} cannot be read: {error}; copy the file again") from None
 
 
-def _npy_header(stream: BinaryIO, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _npy_header(stream: BinaryIO, place: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Read the shape and the type of an array, without its numbers.
 
     Raises:
         LogError: the stream is not an array of NumPy.
     """
-    headers = np.lib.format
+    npy_format = np.lib.format
     try:
-        is_first = headers.read_magic(stream) == (1, 0)
-        read_header = headers.read_array_header_1_0 if is_first else headers.read_array_header_2_0
+        is_version_1 = npy_format.read_magic(stream) == (1, 0)
+        read_header = npy_format.read_array_header_1_0 if is_version_1 else npy_format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
     except ValueError as error:
-        raise LogError(f"{what} is no array of NumPy: {error}") from None
+        raise LogError(f"{place} is no array of NumPy: {error}") from None
     return shape, dtype

@@ -61,7 +61,7 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     array, widths = column.combine_chunks(), list[int]()
     if isinstance(array, library.ChunkedArray):
         array = array.chunk(0) if array.num_chunks else library.array([], column.type)
-    count, is_null = len(array), np.zeros(0, np.bool_)
+    row_count, is_null = len(array), np.zeros(0, np.bool_)
     while (
         types.is_list(array.type) or types.is_large_list(array.type) or types.is_fixed_size_list(array.type)
     ):
@@ -83,8 +83,8 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
         return cast("Floats", numbers)
     width = int(np.prod(widths))
     if len(is_null) == 0:
-        return cast("Floats", numbers.reshape(count, width))
+        return cast("Floats", numbers.reshape(row_count, width))
     # `flatten` drops lists that are null
-    filled = np.full((count, width), np.nan)
-    filled[~is_null] = numbers.reshape(-1, width)
-    return filled
+    padded_numbers = np.full((row_count, width), np.nan)
+    padded_numbers[~is_null] = numbers.reshape(-1, width)
+    return padded_numbers

@@ -46,35 +46,37 @@ def open_text(path: Path) -> BinaryIO:
 
 def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
     """Yield the lines that are not blank, with numbers from 1; unreadable lines go to `faults`."""
-    number = blank = 0
+    line_number = blank_count = 0
     with open_text(path) as stream:
         while True:
-            number += 1
+            line_number += 1
             try:
                 line = stream.readline(LONGEST_LINE)
-                too_long = len(line) == LONGEST_LINE and not line.endswith(b"\n")
-                while too_long and (rest := stream.readline(LONGEST_LINE)) and not rest.endswith(b"\n"):
+                is_too_long = len(line) == LONGEST_LINE and not line.endswith(b"\n")
+                while is_too_long and (piece := stream.readline(LONGEST_LINE)) and not piece.endswith(b"\n"):
                     pass
             except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-                faults.add(f"{path.name}:{number}: the compressed data breaks off here ({error})")
+                faults.add(f"{path.name}:{line_number}: the compressed data breaks off here ({error})")
                 return
             if not line:
                 return
-            if too_long:
-                faults.add(f"{path.name}:{number}: the line is longer than {LONGEST_LINE} bytes")
+            if is_too_long:
+                faults.add(f"{path.name}:{line_number}: the line is longer than {LONGEST_LINE} bytes")
                 continue
             try:
-                text = line.decode("utf-8-sig" if number == 1 else "utf-8")
+                text = line.decode("utf-8-sig" if line_number == 1 else "utf-8")
             except UnicodeDecodeError as error:
-                faults.add(f"{path.name}:{number}: byte {error.start + 1} of the line is not UTF-8")
+                faults.add(f"{path.name}:{line_number}: byte {error.start + 1} of the line is not UTF-8")
                 continue
             if not text.isspace():
-                yield number, text
+                yield line_number, text
                 continue
-            blank += 1
-            if blank > MOST_BLANK_LINES:
-                most = f"{MOST_BLANK_LINES:,}"
-                faults.add(f"{path.name}:{number}: it has more than {most} blank lines; the rest is not read")
+            blank_count += 1
+            if blank_count > MOST_BLANK_LINES:
+                limit = f"{MOST_BLANK_LINES:,}"
+                faults.add(
+                    f"{path.name}:{line_number}: it has more than {limit} blank lines; the rest is not read"
+                )
                 return
 
 
@@ -111,25 +113,25 @@ class ReportedSample(NamedTuple):
 
 def _observations_from_samples(samples: Sequence[ReportedSample]) -> Observations:
     reports = [report for sample in samples for report in sample.reports]
-    names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
-    classes = class_order(r.class_name for r in reports)
-    code = {name: index for index, name in enumerate(classes)}
-    signals = sorted({name for sample in samples for name in sample.signals})
-    require_few(names, signals)
+    name_indices = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
+    class_names = class_order(r.class_name for r in reports)
+    class_codes = {name: index for index, name in enumerate(class_names)}
+    signal_names = sorted({name for sample in samples for name in sample.signals})
+    require_few(name_indices, signal_names)
     return Observations(
         times_ns=np.array([sample.time_ns for sample in samples], np.int64),
         sample=np.repeat(np.arange(len(samples)), [len(sample.reports) for sample in samples]),
-        name=np.array([names[r.name] for r in reports], np.int64),
-        names=list(names),
-        class_code=np.array([code[r.class_name] for r in reports], np.int64),
-        classes=classes,
+        name=np.array([name_indices[r.name] for r in reports], np.int64),
+        names=list(name_indices),
+        class_code=np.array([class_codes[r.class_name] for r in reports], np.int64),
+        classes=class_names,
         yaw=np.array([r.yaw for r in reports], np.float64),
         uncertainty=np.array([r.uncertainty for r in reports], np.float64),
         shapes=_shapes(reports),
         invalid=np.array([r.invalid for r in reports], np.bool_),
         signals={
             name: np.array([sample.signals.get(name, nan) for sample in samples], np.float64)
-            for name in signals
+            for name in signal_names
         },
     )
 
@@ -167,38 +169,40 @@ def iter_traces(
     Args:
         most_reports: number of object reports at which a block is closed.
     """
-    block, count = list[ReportedSample](), 0
+    block, report_count = list[ReportedSample](), 0
     for sample in samples:
         block.append(sample)
-        count += len(sample.reports)
-        if len(block) == BLOCK_SAMPLES or count >= most_reports:
+        report_count += len(sample.reports)
+        if len(block) == BLOCK_SAMPLES or report_count >= most_reports:
             yield _trace_of(block, faults, concave)
-            block, count = [], 0
+            block, report_count = [], 0
     if block:
         yield _trace_of(block, faults, concave)
 
 
 def _trace_of(samples: Sequence[ReportedSample], faults: FaultList, concave: Concave) -> Trace:
-    trace, left_out = trace_from_observations(_observations_from_samples(samples), concave=concave)
-    for index, what in sorted(left_out.items()):
-        faults.add(f"{samples[index].place}: {what}")
+    trace, fault_by_index = trace_from_observations(_observations_from_samples(samples), concave=concave)
+    for index, fault in sorted(fault_by_index.items()):
+        faults.add(f"{samples[index].place}: {fault}")
     return trace
 
 
 def _jsonl_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
-    latest = -1
-    for number, line in iter_lines(path, faults):
-        place = f"{path.name}:{number}"
+    latest_ns = -1
+    for line_number, line in iter_lines(path, faults):
+        place = f"{path.name}:{line_number}"
         try:
             time_ns, reports, signals = _sample(line)
-            if time_ns <= latest:
-                at, before = times_apart(time_ns, latest)
-                what = Sentence("its time is ", at, ", not after ", before, "; give times that increase")
-                raise _NoSampleError(what)
+            if time_ns <= latest_ns:
+                instant, latest = times_apart(time_ns, latest_ns)
+                fault = Sentence(
+                    "its time is ", instant, ", not after ", latest, "; give times that increase"
+                )
+                raise _NoSampleError(fault)
         except _NoSampleError as error:
             faults.add(Sentence(f"{place}: ", *error.args))
             continue
-        latest = time_ns
+        latest_ns = time_ns
         yield ReportedSample(time_ns, place, reports, signals)
 
 
@@ -218,8 +222,8 @@ def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
     reports = [_report(entry) for entry in _list(sample.get("objects", []), "objects")]
     names = [report.name for report in reports]
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise _NoSampleError(f"object {twice!r} is there twice; name each object once")
+        repeated_name = next(name for name in names if names.count(name) > 1)
+        raise _NoSampleError(f"object {repeated_name!r} is there twice; name each object once")
     return time_ns, reports, _signals(sample.get("signals", {}))
 
 
@@ -229,48 +233,48 @@ def _report(entry: Any) -> ObjectReport:
     name = entry.get("name")
     if not isinstance(name, str) or not _is_text(name):
         raise _NoSampleError(f"an object's name is {_short(name)}; give a string that is not empty")
-    what = f"object {name!r}"
-    _check_keys(entry, _OBJECT_KEYS, what)
+    object_text = f"object {name!r}"
+    _check_keys(entry, _OBJECT_KEYS, object_text)
     class_name = entry.get("class")
     if class_name is not None and not (isinstance(class_name, str) and _is_text(class_name, empty=True)):
-        raise _NoSampleError(f"{what}: class is {_short(class_name)}; give a string or leave it out")
+        raise _NoSampleError(f"{object_text}: class is {_short(class_name)}; give a string or leave it out")
     report = ObjectReport(name, class_name)
     if ("polygon" in entry) == ("parts" in entry):
-        raise _NoSampleError(f"{what}: give one of polygon and parts")
+        raise _NoSampleError(f"{object_text}: give one of polygon and parts")
     if "polygon" in entry:
-        _add_part(report, entry["polygon"], 0.0, f"{what}: polygon")
+        _add_part(report, entry["polygon"], 0.0, f"{object_text}: polygon")
     else:
-        for part in _list(entry["parts"], f"{what}: parts"):
+        for part in _list(entry["parts"], f"{object_text}: parts"):
             if not isinstance(part, dict):
                 example = '{"vertices": […], "radius": r}'
-                raise _NoSampleError(f"{what}: a part is {_kind(part)}; give {example}")
-            _check_keys(part, _PART_KEYS, f"a part of {what}")
-            radius = _number(part.get("radius", 0.0), f"{what}: radius")
-            _add_part(report, part.get("vertices"), radius, f"{what}: vertices")
-    report.uncertainty = _number(entry.get("uncertainty", 0.0), f"{what}: uncertainty")
+                raise _NoSampleError(f"{object_text}: a part is {_kind(part)}; give {example}")
+            _check_keys(part, _PART_KEYS, f"a part of {object_text}")
+            radius = _number(part.get("radius", 0.0), f"{object_text}: radius")
+            _add_part(report, part.get("vertices"), radius, f"{object_text}: vertices")
+    report.uncertainty = _number(entry.get("uncertainty", 0.0), f"{object_text}: uncertainty")
     if entry.get("height") is not None:
-        height = _list(entry["height"], f"{what}: height")
+        height = _list(entry["height"], f"{object_text}: height")
         if len(height) != 2:
-            raise _NoSampleError(f"{what}: height has {len(height)} numbers; give [bottom, top]")
-        report.bottom, report.top = (_number(value, f"{what}: height") for value in height)
+            raise _NoSampleError(f"{object_text}: height has {len(height)} numbers; give [bottom, top]")
+        report.bottom, report.top = (_number(value, f"{object_text}: height") for value in height)
         # given, but unknown: NaN differs from itself
         report.invalid = report.bottom != report.bottom and report.top != report.top
     if entry.get("yaw") is not None:
-        report.yaw = _number(entry["yaw"], f"{what}: yaw")
+        report.yaw = _number(entry["yaw"], f"{object_text}: yaw")
         report.invalid |= report.yaw != report.yaw
     return report
 
 
-def _add_part(report: ObjectReport, vertices: Any, radius: float, what: str) -> None:
-    points = _list(vertices, what)
-    flat = report.vertices
+def _add_part(report: ObjectReport, vertices: Any, radius: float, place: str) -> None:
+    points = _list(vertices, place)
+    coordinates = report.vertices
     for point in points:
         if type(point) is not list or len(point) != 2:
-            raise _NoSampleError(f"{what} holds {_short(point)}; give [x, y] pairs")
+            raise _NoSampleError(f"{place} holds {_short(point)}; give [x, y] pairs")
         x, y = point
         # most numbers are floats, which need no check
-        flat.append(x if type(x) is float else _number(x, what))
-        flat.append(y if type(y) is float else _number(y, what))
+        coordinates.append(x if type(x) is float else _number(x, place))
+        coordinates.append(y if type(y) is float else _number(y, place))
     report.vertex_counts.append(len(points))
     report.radii.append(radius)
 
@@ -287,29 +291,29 @@ def _signals(entry: Any) -> dict[str, float]:
     }
 
 
-def _number(value: Any, what: str) -> float:
+def _number(value: Any, subject: str) -> float:
     """Return the number; null and NaN stand for an unknown number."""
     if value is None:
         return nan
     if type(value) is not int and type(value) is not float:
-        raise _NoSampleError(f"{what} holds {_short(value)}; give a number, or null where it is not known")
+        raise _NoSampleError(f"{subject} holds {_short(value)}; give a number, or null where it is not known")
     try:
         return float(value)
     except OverflowError:
         remedy = "give a number that fits a double"
-        raise _NoSampleError(f"{what} holds an integer beyond 1.8e308; {remedy}") from None
+        raise _NoSampleError(f"{subject} holds an integer beyond 1.8e308; {remedy}") from None
 
 
-def _list(value: Any, what: str) -> list[Any]:
+def _list(value: Any, subject: str) -> list[Any]:
     if not isinstance(value, list):
-        raise _NoSampleError(f"{what}: {_short(value)}; give a list")
+        raise _NoSampleError(f"{subject}: {_short(value)}; give a list")
     return value
 
 
-def _check_keys(entry: dict[str, Any], keys: set[str], what: str) -> None:
+def _check_keys(entry: dict[str, Any], keys: set[str], subject: str) -> None:
     if not entry.keys() <= keys:
         unknown, allowed = ", ".join(map(repr, sorted(entry.keys() - keys))), ", ".join(sorted(keys))
-        raise _NoSampleError(f"{what} has the unknown key {cut(unknown, 60)}; known are {allowed}")
+        raise _NoSampleError(f"{subject} has the unknown key {cut(unknown, 60)}; known are {allowed}")
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
@@ -347,55 +351,59 @@ def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -
 
 def _csv_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
     lines = iter_lines(path, faults)
-    order = _column_order(path, next(lines, (1, ""))[1])
-    time_ns, place, reports, broken = -1, "", dict[str, ObjectReport](), False
-    for number, line in lines:
-        line_place = f"{path.name}:{number}"
+    column_order = _column_order(path, next(lines, (1, ""))[1])
+    time_ns, place, reports, is_broken = -1, "", dict[str, ObjectReport](), False
+    for line_number, line in lines:
+        line_place = f"{path.name}:{line_number}"
         try:
-            row = _row(line, order)
-            at = _time(row["time_ns"])
-            if at < time_ns:
-                this, last = times_apart(at, time_ns)
-                what = Sentence("its time is ", this, ", before ", last, "; give times that do not go back")
-                raise _NoSampleError(what)
+            row = _row(line, column_order)
+            row_time_ns = _time(row["time_ns"])
+            if row_time_ns < time_ns:
+                row_instant, last_instant = times_apart(row_time_ns, time_ns)
+                fault = Sentence(
+                    "its time is ", row_instant, ", before ", last_instant, "; give times that do not go back"
+                )
+                raise _NoSampleError(fault)
         except _NoSampleError as error:
             faults.add(Sentence(f"{line_place}: ", *error.args))
             continue
-        if at > time_ns:
-            if reports and not broken:
+        if row_time_ns > time_ns:
+            if reports and not is_broken:
                 yield ReportedSample(time_ns, place, list(reports.values()), {})
-            time_ns, place, reports, broken = at, line_place, {}, False
+            time_ns, place, reports, is_broken = row_time_ns, line_place, {}, False
         try:
             report = _row_report(row)
             if report.name in reports:
                 raise _NoSampleError(f"object {report.name!r} is there twice; name each object once a sample")
             reports[report.name] = report
         except _NoSampleError as error:
-            faults.add(Sentence(f"{line_place}: {error}; the sample at ", Instant(at, 0), " is left out"))
-            broken = True
-    if reports and not broken:
+            faults.add(
+                Sentence(f"{line_place}: {error}; the sample at ", Instant(row_time_ns, 0), " is left out")
+            )
+            is_broken = True
+    if reports and not is_broken:
         yield ReportedSample(time_ns, place, list(reports.values()), {})
 
 
 def _column_order(path: Path, header: str) -> list[str]:
-    order = [name.strip() for name in header.strip().split(",")]
-    if sorted(order) != sorted(CSV_COLUMNS):
+    columns = [name.strip() for name in header.strip().split(",")]
+    if sorted(columns) != sorted(CSV_COLUMNS):
         raise LogError(
-            f"{path.name}:1: the columns are {', '.join(order)[:200]!r}; a track CSV has"
+            f"{path.name}:1: the columns are {', '.join(columns)[:200]!r}; a track CSV has"
             f" {','.join(CSV_COLUMNS)}"
         )
-    return order
+    return columns
 
 
-def _row(line: str, order: list[str]) -> dict[str, str]:
+def _row(line: str, columns: list[str]) -> dict[str, str]:
     try:
         # one line at a time, so that an open quote does not swallow later lines
         cells = next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
         raise _NoSampleError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
-    if len(cells) != len(order):
-        raise _NoSampleError(f"the line has {len(cells)} cells; give {len(order)}")
-    return dict(zip(order, cells, strict=True))
+    if len(cells) != len(columns):
+        raise _NoSampleError(f"the line has {len(cells)} cells; give {len(columns)}")
+    return dict(zip(columns, cells, strict=True))
 
 
 def _time(text: str) -> int:
@@ -416,10 +424,15 @@ def _row_report(row: dict[str, str]) -> ObjectReport:
     if length < 0 or width < 0:
         raise _NoSampleError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
     # for an orientation that is not finite, NaN as cosine and sine makes the box unknown
-    c, s = (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
+    cosine, sine = (
+        (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
+    )
     vertices: list[float] = []
-    for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
-        vertices += (x + a * length * c + b * width * -s, y + a * length * s + b * width * c)
+    for unit_x, unit_y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
+        vertices += (
+            x + unit_x * length * cosine + unit_y * width * -sine,
+            y + unit_x * length * sine + unit_y * width * cosine,
+        )
     return ObjectReport(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
 
 
@@ -477,26 +490,30 @@ def iter_annotations(
         rate: frames per second; frame 0 is at time 0.
         lost: whether rows marked as out of the picture are dropped or kept.
     """
-    boxes, labels, broken = _read_boxes(path, faults, _last_frame(rate))
-    frames, starts = np.unique(boxes["frame"], return_index=True)
-    sound = ~np.isin(frames, np.fromiter(broken, np.int64))
-    frames, starts, ends = frames[sound], starts[sound], np.append(starts, len(boxes))[1:][sound]
-    classes, period = tuple(label or None for label in labels), frame_times(rate)
-    after = 0
-    while after < len(frames):
-        first = after
-        filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
-        after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
-        counts = ends[first:after] - starts[first:after]
-        rows = boxes[flat_index(starts[first:after], counts)]
-        sample = np.repeat(np.arange(after - first, dtype=np.int64), counts)
+    boxes, labels, broken_frames = _read_boxes(path, faults, _last_frame(rate))
+    frames, first_boxes = np.unique(boxes["frame"], return_index=True)
+    is_complete = ~np.isin(frames, np.fromiter(broken_frames, np.int64))
+    frames, first_boxes, end_boxes = (
+        frames[is_complete],
+        first_boxes[is_complete],
+        np.append(first_boxes, len(boxes))[1:][is_complete],
+    )
+    classes, period_ns = tuple(label or None for label in labels), frame_times(rate)
+    end = 0
+    while end < len(frames):
+        begin = end
+        filled_end = int(np.searchsorted(end_boxes, first_boxes[begin] + _BLOCK_BOXES, side="right"))
+        end = min(begin + BLOCK_SAMPLES, max(filled_end, begin + 1))
+        box_counts = end_boxes[begin:end] - first_boxes[begin:end]
+        block = boxes[flat_index(first_boxes[begin:end], box_counts)]
+        sample_indices = np.repeat(np.arange(end - begin, dtype=np.int64), box_counts)
         if lost == "drop":
-            rows, sample = rows[~rows["lost"]], sample[~rows["lost"]]
-        times_ns = np.array([round(frame * period) for frame in frames[first:after].tolist()], np.int64)
-        observations = _observations(times_ns, sample, rows, classes)
-        trace, left_out = trace_from_observations(observations, concave=concave)
-        for index, what in sorted(left_out.items()):
-            faults.add(f"{path.name}: frame {frames[first + index]}: {what}")
+            block, sample_indices = block[~block["lost"]], sample_indices[~block["lost"]]
+        times_ns = np.array([round(frame * period_ns) for frame in frames[begin:end].tolist()], np.int64)
+        observations = _observations(times_ns, sample_indices, block, classes)
+        trace, fault_by_index = trace_from_observations(observations, concave=concave)
+        for index, fault in sorted(fault_by_index.items()):
+            faults.add(f"{path.name}: frame {frames[begin + index]}: {fault}")
         yield trace
 
 
@@ -506,29 +523,31 @@ def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes,
     Returns:
         the boxes sorted by frame, in file order within a frame; their labels; the frames of unreadable lines.
     """
-    packed, labels, broken = bytearray(), dict[str, int](), set[int]()
-    for number, line in iter_lines(path, faults):
+    packed_boxes, label_codes, broken_frames = bytearray(), dict[str, int](), set[int]()
+    for line_number, line in iter_lines(path, faults):
         cells = line.split(None, len(DRONE_COLUMNS) - 1)
         try:
             if len(cells) != len(DRONE_COLUMNS):
                 raise _NoSampleError(f"the line has {len(cells)} columns; give {' '.join(DRONE_COLUMNS)}")
             frame = _integer(cells[5], "frame", last_frame)
         except _NoSampleError as error:
-            faults.add(f"{path.name}:{number}: {error}")
+            faults.add(f"{path.name}:{line_number}: {error}")
             continue
         try:
-            identity, corners, is_lost, label = _box(cells)
+            object_id, corners, is_lost, label = _box(cells)
         except _NoSampleError as error:
-            faults.add(f"{path.name}:{number}: {error}; frame {frame} is left out")
-            broken.add(frame)
+            faults.add(f"{path.name}:{line_number}: {error}; frame {frame} is left out")
+            broken_frames.add(frame)
             continue
-        packed += _PACKED.pack(identity, frame, labels.setdefault(label, len(labels)), is_lost, *corners)
-    boxes = np.frombuffer(packed, _BOX)
-    return boxes[np.argsort(boxes["frame"], kind="stable")], list(labels), broken
+        packed_boxes += _PACKED.pack(
+            object_id, frame, label_codes.setdefault(label, len(label_codes)), is_lost, *corners
+        )
+    boxes = np.frombuffer(packed_boxes, _BOX)
+    return boxes[np.argsort(boxes["frame"], kind="stable")], list(label_codes), broken_frames
 
 
 def _box(cells: list[str]) -> tuple[int, list[float], bool, str]:
-    number = _integer(cells[0], "id", _LARGEST)
+    object_id = _integer(cells[0], "id", _LARGEST)
     try:
         corners = [float(cell) for cell in cells[1:5]]
     except ValueError:
@@ -540,48 +559,48 @@ def _box(cells: list[str]) -> tuple[int, list[float], bool, str]:
     label = cells[9].strip()
     if len(label) >= 2 and label[0] == label[-1] == '"':
         label = label[1:-1]
-    return number, corners, cells[6] == "1", label
+    return object_id, corners, cells[6] == "1", label
 
 
-def _integer(text: str, what: str, last: int) -> int:
+def _integer(text: str, field_name: str, largest: int) -> int:
     # `int` also accepts signs, spaces, underscores and digits of other scripts
     is_number = len(text) <= len(str(_LARGEST)) and text.isascii() and text.isdecimal()
-    if not is_number or int(text) > last:
-        raise _NoSampleError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
+    if not is_number or int(text) > largest:
+        raise _NoSampleError(f"{field_name} is {text[:60]!r}; give an integer from 0 to {largest}")
     return int(text)
 
 
 def _last_frame(rate: float) -> int:
     """Return the last frame whose time a sample can have."""
-    last = LATEST_NS // frame_times(rate) - 1
-    return min(max(last, 0), _LARGEST)
+    last_frame = LATEST_NS // frame_times(rate) - 1
+    return min(max(last_frame, 0), _LARGEST)
 
 
 def _observations(
-    times_ns: Integers, sample: Integers, boxes: _Boxes, classes: tuple[str | None, ...]
+    times_ns: Integers, sample_indices: Integers, boxes: _Boxes, classes: tuple[str | None, ...]
 ) -> Observations:
     """Return boxes as observations; `sample` is the sample index of each box."""
-    numbers, name = np.unique(boxes["id"], return_inverse=True)
-    count, corners = len(boxes), boxes["corners"]
+    object_ids, name_indices = np.unique(boxes["id"], return_inverse=True)
+    box_count, corners = len(boxes), boxes["corners"]
     return Observations(
         times_ns=times_ns,
-        sample=sample,
-        name=name,
-        names=[str(number) for number in numbers.tolist()],
+        sample=sample_indices,
+        name=name_indices,
+        names=[str(object_id) for object_id in object_ids.tolist()],
         class_code=boxes["label"],
         classes=classes,
-        yaw=np.full(count, np.nan),
-        uncertainty=np.zeros(count),
+        yaw=np.full(box_count, np.nan),
+        uncertainty=np.zeros(box_count),
         # counter-clockwise corners if y points up
         shapes=FootprintBatch(
-            part_start=np.arange(count + 1, dtype=np.int64),
-            vertex_start=np.arange(count + 1, dtype=np.int64) * 4,
+            part_start=np.arange(box_count + 1, dtype=np.int64),
+            vertex_start=np.arange(box_count + 1, dtype=np.int64) * 4,
             vertices=corners[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2),
-            radius=np.zeros(count),
-            bottom=np.full(count, np.nan),
-            top=np.full(count, np.nan),
+            radius=np.zeros(box_count),
+            bottom=np.full(box_count, np.nan),
+            top=np.full(box_count, np.nan),
         ),
-        invalid=np.zeros(count, np.bool_),
+        invalid=np.zeros(box_count, np.bool_),
         signals={},
     )
 

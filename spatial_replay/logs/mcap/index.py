@@ -93,26 +93,26 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
     Raises:
         DamageError: the head of the chunk is inconsistent.
     """
-    fixed = RECORD_HEAD.size + CHUNK_HEAD.size
-    if len(record) < fixed:
+    fixed_bytes = RECORD_HEAD.size + CHUNK_HEAD.size
+    if len(record) < fixed_bytes:
         raise DamageError("a chunk breaks off")
-    start, end, size, _, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
-    data_length = fixed + name_length
-    if name_length > 16 or len(record) < data_length + 8:
+    start_ns, end_ns, size, _, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    size_offset = fixed_bytes + name_length
+    if name_length > 16 or len(record) < size_offset + 8:
         raise DamageError("a chunk's head is inconsistent")
-    stored = int.from_bytes(record[data_length : data_length + 8], "little")
-    if data_length + 8 + stored != length or size > LARGEST_CHUNK or not start <= end < 2**63:
+    data_bytes = int.from_bytes(record[size_offset : size_offset + 8], "little")
+    if size_offset + 8 + data_bytes != length or size > LARGEST_CHUNK or not start_ns <= end_ns < 2**63:
         raise DamageError("a chunk's head is inconsistent")
-    return ChunkPlace(offset, length, start, end, size=size)
+    return ChunkPlace(offset, length, start_ns, end_ns, size=size)
 
 
-def _uncompressed_content(offset: int, record: bytes, following: int) -> int | None:
+def _uncompressed_content(offset: int, record: bytes, next_offset: int) -> int | None:
     """Return the offset of the records in an uncompressed chunk; None for another record."""
     if record[0] != Opcode.CHUNK:
         return None
     with suppress(DamageError):
-        size = chunk_place(offset, record, following - offset).size
-        if following - offset == _UNCOMPRESSED_HEAD_BYTES + size:
+        size = chunk_place(offset, record, next_offset - offset).size
+        if next_offset - offset == _UNCOMPRESSED_HEAD_BYTES + size:
             return offset + _UNCOMPRESSED_HEAD_BYTES
     return None
 
@@ -225,7 +225,7 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
     position = 0
     while position < len(section):
         opcode, body = _body(section, position)
-        _take_in(directory, opcode, body)
+        _add_record(directory, opcode, body)
         position += RECORD_HEAD.size + len(body)
     _check_complete(directory, footer.summary_start)
     directory.chunks.sort(key=lambda place: place.offset)
@@ -255,7 +255,7 @@ def _body(section: bytes, position: int) -> tuple[int, bytes]:
     return opcode, section[position : position + length]
 
 
-def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
+def _add_record(directory: Directory, opcode: int, body: bytes) -> None:
     if opcode == Opcode.SCHEMA:
         schema = decode_record(records.Schema.read, body)
         directory.schemas[schema.id] = schema
@@ -267,8 +267,8 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
     elif opcode == Opcode.CHUNK_INDEX:
         if len(body) < _CHUNK_INDEX.size:
             raise DamageError("the index breaks off")
-        start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
-        channels = _indexed_channels(body, indexed)
+        start_ns, end_ns, offset, length, index_bytes = _CHUNK_INDEX.unpack_from(body)
+        channels = _indexed_channels(body, index_bytes)
         size = int.from_bytes(body[-_SIZE_BYTES:], "little")
         place = ChunkPlace(offset, length, start_ns, end_ns, channels=channels, size=size)
         directory.chunks.append(place)
@@ -288,7 +288,7 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
     return frozenset([channel for (channel,) in _MESSAGE_INDEX.iter_unpack(entries)])
 
 
-def _check_complete(directory: Directory, end: int) -> None:
+def _check_complete(directory: Directory, data_end: int) -> None:
     """Check that a summary is complete; other writers may leave out parts of it.
 
     Raises:
@@ -297,14 +297,16 @@ def _check_complete(directory: Directory, end: int) -> None:
     """
     statistics = directory.statistics
     kinds = ("schema", "channel", "chunk", "attachment", "metadata")
-    counts = [getattr(statistics, f"{kind}_count", None) for kind in kinds]
-    outside = len(directory.schemas), len(directory.channels), len(directory.chunks)
-    if statistics is None or counts != [*outside, len(directory.attachments), len(directory.metadata)]:
+    stated = [getattr(statistics, f"{kind}_count", None) for kind in kinds]
+    read_counts = len(directory.schemas), len(directory.channels), len(directory.chunks)
+    if statistics is None or stated != [*read_counts, len(directory.attachments), len(directory.metadata)]:
         raise _NoSummaryError
     if statistics.message_count > 0 and not directory.chunks:
         raise _NoSummaryError
-    places = [(place.offset, place.length) for place in directory.chunks]
-    if any(offset + length > end for offset, length in places + directory.attachments + directory.metadata):
+    spans = [(place.offset, place.length) for place in directory.chunks]
+    if any(
+        offset + length > data_end for offset, length in spans + directory.attachments + directory.metadata
+    ):
         raise DamageError("the summary points outside the file")
 
 
@@ -323,42 +325,46 @@ class _Scan:
         self._name = name
         self._directory = Directory()
         self._loose: ChunkPlace | None = None
-        self._ended = False
+        self._is_over = False
 
     def directory(self) -> Directory:
-        position = sound = len(MAGIC)
-        gaps = 0
-        while position < self._end and not self._ended:
+        position = sound_end = len(MAGIC)
+        gap_count = 0
+        while position < self._end and not self._is_over:
             try:
                 position = self._record(position)
             except DamageError as damage:
-                gaps += 1
-                following = self._next_chunk(sound) if gaps < _MOST_GAPS else None
-                self._lose(position, following, damage)
+                gap_count += 1
+                next_chunk = self._next_chunk(sound_end) if gap_count < _MOST_GAPS else None
+                self._lose(position, next_chunk, damage)
                 self._end = self._size
-                if following is None:
+                if next_chunk is None:
                     break
-                position = following.offset
+                position = next_chunk.offset
             if self._directory.chunks and self._directory.chunks[-1].compressed:
-                sound = max(sound, self._directory.chunks[-1].offset + self._directory.chunks[-1].length)
+                sound_end = max(
+                    sound_end, self._directory.chunks[-1].offset + self._directory.chunks[-1].length
+                )
         self._end_loose()
         return self._directory
 
-    def _lose(self, position: int, following: ChunkPlace | None, damage: DamageError) -> None:
+    def _lose(self, position: int, next_chunk: ChunkPlace | None, damage: DamageError) -> None:
         """Report the bytes from a position to the next chunk as lost, with the times around them."""
-        lost = max(0, (following.offset if following else self._end) - position)
+        lost_bytes = max(0, (next_chunk.offset if next_chunk else self._end) - position)
         readable_ends_ns = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
-        after = [Instant(max(readable_ends_ns), 0)] if readable_ends_ns else []
-        before = [Instant(following.start_ns, 0)] if following else []
-        when: tuple[str | Instant, ...] = ()
-        if after and before:
+        ends_before = [Instant(max(readable_ends_ns), 0)] if readable_ends_ns else []
+        starts_after = [Instant(next_chunk.start_ns, 0)] if next_chunk else []
+        time_words: tuple[str | Instant, ...] = ()
+        if ends_before and starts_after:
             # chunks may overlap in time
-            first, last = sorted([*after, *before], key=lambda instant: instant.time_ns)
-            when = (" between ", first, " and ", last)
-        elif after or before:
-            when = (" after " if after else " before ", *after, *before)
-        what = f"{self._name}: at byte {position}: {damage}; {lost} bytes"
-        self._faults.add(Sentence(what, *when, " cannot be read"))
+            first_instant, last_instant = sorted(
+                [*ends_before, *starts_after], key=lambda instant: instant.time_ns
+            )
+            time_words = (" between ", first_instant, " and ", last_instant)
+        elif ends_before or starts_after:
+            time_words = (" after " if ends_before else " before ", *ends_before, *starts_after)
+        fault_text = f"{self._name}: at byte {position}: {damage}; {lost_bytes} bytes"
+        self._faults.add(Sentence(fault_text, *time_words, " cannot be read"))
 
     def _record(self, position: int) -> int:
         """Read the record at a position; return the position of the next record."""
@@ -367,24 +373,24 @@ class _Scan:
         if len(beginning) < RECORD_HEAD.size:
             raise DamageError("the file breaks off")
         opcode, length = RECORD_HEAD.unpack_from(beginning)
-        following = int(position + RECORD_HEAD.size + length)
+        next_position = int(position + RECORD_HEAD.size + length)
         if opcode == 0:
             raise DamageError(f"there is no record (opcode {opcode})")
-        if following > self._size:
-            content = _uncompressed_content(position, beginning, following)
-            if content is None or self._end > self._size:
-                raise DamageError("the file breaks off in a " + ("chunk" if content else "record"))
+        if next_position > self._size:
+            content_position = _uncompressed_content(position, beginning, next_position)
+            if content_position is None or self._end > self._size:
+                raise DamageError("the file breaks off in a " + ("chunk" if content_position else "record"))
             self._end_loose()
-            self._end = following
-            return content
+            self._end = next_position
+            return content_position
         # opcodes below 0x80 are reserved for later versions of the format: https://mcap.dev/spec#records
         if max(Opcode) < opcode < 0x80:
-            self._skip(opcode, beginning, following)
+            self._skip(opcode, beginning, next_position)
         if opcode == Opcode.CHUNK:
             self._end_loose()
             self._directory.chunks.append(chunk_place(position, beginning, RECORD_HEAD.size + length))
         elif opcode == Opcode.MESSAGE:
-            self._message(position, beginning, following)
+            self._message(position, beginning, next_position)
         elif opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
             if length > _LARGEST_RECORD:
                 raise DamageError(f"a record claims to hold {length} bytes")
@@ -393,33 +399,35 @@ class _Scan:
             if opcode == Opcode.HEADER:
                 self._directory.header = decode_record(records.Header.read, body)
             else:
-                _take_in(self._directory, opcode, body)
+                _add_record(self._directory, opcode, body)
         elif opcode == Opcode.ATTACHMENT:
-            self._directory.attachments.append((position, following - position))
+            self._directory.attachments.append((position, next_position - position))
         elif opcode == Opcode.METADATA:
-            self._directory.metadata.append((position, following - position))
+            self._directory.metadata.append((position, next_position - position))
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
             if self._end > self._size:
                 raise DamageError("the data end within a chunk")
             # damage can look like the end of the data
-            if self._next_chunk(following) is not None:
+            if self._next_chunk(next_position) is not None:
                 raise DamageError("the data end before the last chunk")
             # the summary section repeats records that were read already
-            self._ended = True
-        return following
+            self._is_over = True
+        return next_position
 
-    def _skip(self, opcode: int, beginning: bytes, following: int) -> None:
+    def _skip(self, opcode: int, beginning: bytes, next_position: int) -> None:
         """Count a record with a reserved opcode.
 
         Raises:
             DamageError: no record follows it, or the bytes are a chunk with a damaged opcode.
         """
-        self._stream.seek(following)
+        self._stream.seek(next_position)
         head = self._stream.read(RECORD_HEAD.size)
-        is_followed = following == self._size - len(MAGIC)
+        is_followed = next_position == self._size - len(MAGIC)
         if len(head) == RECORD_HEAD.size:
-            after, length = RECORD_HEAD.unpack(head)
-            is_followed = is_followed or (after != 0 and following + RECORD_HEAD.size + length <= self._size)
+            next_opcode, next_length = RECORD_HEAD.unpack(head)
+            is_followed = is_followed or (
+                next_opcode != 0 and next_position + RECORD_HEAD.size + next_length <= self._size
+            )
         with suppress(DamageError):
             # the head fits a chunk, so only its opcode is damaged
             chunk_place(0, beginning, RECORD_HEAD.size + RECORD_HEAD.unpack_from(beginning)[1])
@@ -428,19 +436,19 @@ class _Scan:
             raise DamageError(f"there is no record (opcode {opcode})")
         self._directory.skipped += 1
 
-    def _message(self, position: int, beginning: bytes, following: int) -> None:
+    def _message(self, position: int, beginning: bytes, next_position: int) -> None:
         """Add a message outside chunks to the place of the messages before it."""
-        if len(beginning) < RECORD_HEAD.size + 22 or following - position < RECORD_HEAD.size + 22:
+        if len(beginning) < RECORD_HEAD.size + 22 or next_position - position < RECORD_HEAD.size + 22:
             raise DamageError("a message breaks off")
         time_ns = int.from_bytes(beginning[RECORD_HEAD.size + 6 : RECORD_HEAD.size + 14], "little")
         loose = self._loose
         if loose and loose.offset + loose.length == position and loose.length < _LOOSE_BYTES:
             start_ns, end_ns = min(loose.start_ns, time_ns), max(loose.end_ns, time_ns)
-            length = following - loose.offset
+            length = next_position - loose.offset
             self._loose = ChunkPlace(loose.offset, length, start_ns, end_ns, compressed=False)
         else:
             self._end_loose()
-            self._loose = ChunkPlace(position, following - position, time_ns, time_ns, compressed=False)
+            self._loose = ChunkPlace(position, next_position - position, time_ns, time_ns, compressed=False)
 
     def _end_loose(self) -> None:
         if self._loose:
@@ -450,18 +458,21 @@ class _Scan:
     def _next_chunk(self, position: int) -> ChunkPlace | None:
         """Return the next chunk with a consistent head, from a position on; None if there is none."""
         # a chunk at the end of a window needs bytes of the next one
-        overlap = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
+        overlap_bytes = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
-            window = self._stream.read(_STRIDE + overlap)
+            window = self._stream.read(_STRIDE + overlap_bytes)
             # in file order, whatever the compression
-            for place in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
-                record = window[place : place + _CHUNK_HEAD_BYTES]
+            for window_offset in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
+                record = window[window_offset : window_offset + _CHUNK_HEAD_BYTES]
                 opcode, length = RECORD_HEAD.unpack_from(record)
-                if opcode != Opcode.CHUNK or position + place + RECORD_HEAD.size + length > self._size:
+                if (
+                    opcode != Opcode.CHUNK
+                    or position + window_offset + RECORD_HEAD.size + length > self._size
+                ):
                     continue
                 try:
-                    return chunk_place(position + place, record, RECORD_HEAD.size + length)
+                    return chunk_place(position + window_offset, record, RECORD_HEAD.size + length)
                 except DamageError:
                     continue
             position += _STRIDE
@@ -470,11 +481,11 @@ class _Scan:
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
     """Yield the possible offsets of chunks, in order, from the name of their compression."""
-    at = window.find(mark)
-    while at >= 0:
-        if at >= _BEFORE_COMPRESSION:
-            yield at - _BEFORE_COMPRESSION
-        at = window.find(mark, at + 1)
+    mark_offset = window.find(mark)
+    while mark_offset >= 0:
+        if mark_offset >= _BEFORE_COMPRESSION:
+            yield mark_offset - _BEFORE_COMPRESSION
+        mark_offset = window.find(mark, mark_offset + 1)
 
 
 _ATTACHMENT_NUMBERS = 32
@@ -491,10 +502,10 @@ def iter_attachments(
         try:
             record = decode_record(records.Attachment.read, body)
             # later versions of the format may append fields: https://mcap.dev/spec#records
-            texts = len(record.name.encode()) + len(record.media_type.encode())
-            size = _ATTACHMENT_NUMBERS + texts + len(record.data)
-            checksum = int.from_bytes(body[size : size + 4], "little")
-            if (checksum or _is_own(directory.header)) and crc32(body[:size]) != checksum:
+            text_bytes = len(record.name.encode()) + len(record.media_type.encode())
+            checked_bytes = _ATTACHMENT_NUMBERS + text_bytes + len(record.data)
+            checksum = int.from_bytes(body[checked_bytes : checked_bytes + 4], "little")
+            if (checksum or _is_own(directory.header)) and crc32(body[:checked_bytes]) != checksum:
                 raise DamageError("an attachment's checksum does not fit")
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")

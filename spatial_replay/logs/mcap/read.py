@@ -112,9 +112,11 @@ def _content(place: ChunkPlace, record: bytes) -> bytes:
     _, _, size, checksum, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
     if size > max(place.size, _LEAST_BOUND):
         raise DamageError(f"the chunk claims to hold {size} bytes, but the index says {place.size}")
-    begin = RECORD_HEAD.size + CHUNK_HEAD.size
-    data = begin + name_length + 8
-    content = _decompress(record[begin : begin + name_length], memoryview(record)[data:], size)
+    name_offset = RECORD_HEAD.size + CHUNK_HEAD.size
+    data_offset = name_offset + name_length + 8
+    content = _decompress(
+        record[name_offset : name_offset + name_length], memoryview(record)[data_offset:], size
+    )
     if len(content) != size:
         raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
     if (checksum or place.has_checksum) and crc32(content) != checksum:
@@ -152,10 +154,10 @@ def iter_records(
     Threads read ahead from the stream, so the caller must not use it.
     """
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
-    reading, is_over = RLock(), False
+    stream_lock, is_over = RLock(), False
 
     def read(place: ChunkPlace) -> bytes | DamageError:
-        with reading:
+        with stream_lock:
             # the caller may have closed the stream
             if is_over:
                 return b""
@@ -167,13 +169,13 @@ def iter_records(
             return damage
 
     # a short log has one chunk, which needs no thread
-    records: Iterator[bytes | DamageError] = map(read, places)
+    results: Iterator[bytes | DamageError] = map(read, places)
     if len(places) > 1:
-        records = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
+        results = each_ahead(read, places, cores(), _AHEAD_BYTES, lambda place: max(place.length, place.size))
     try:
-        yield from zip(places, records, strict=True)
+        yield from zip(places, results, strict=True)
     finally:
-        with reading:
+        with stream_lock:
             is_over = True
 
 
@@ -220,9 +222,9 @@ def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
         position = begin + length
         if opcode == _MESSAGE:
             if length >= _HEAD_BYTES and content[begin] | content[begin + 1] << 8 not in passed_over:
-                after = begin + _HEAD_BYTES
-                heads.append(content[begin:after])
-                payloads.append(slice(after, position))
+                payload_offset = begin + _HEAD_BYTES
+                heads.append(content[begin:payload_offset])
+                payloads.append(slice(payload_offset, position))
         elif opcode in (_SCHEMA, _CHANNEL):
             declarations.append((opcode, content[begin:position]))
     return Records(np.frombuffer(b"".join(heads), _HEAD), payloads, declarations, position < size)
@@ -262,17 +264,17 @@ class ChunkWalk:
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
     ) -> Iterator[tuple[ChunkPlace, Messages]]:
         """Yield the messages of wanted topics in each place; losses go to `faults`."""
-        declared, passed_over = -1, set[int]()
+        declared_count, unwanted = -1, set[int]()
         for place, content in iter_records(self.stream, places):
-            if declared < len(self.channels):
-                declared = len(self.channels)
-                passed_over = {n for n, channel in self.channels.items() if not is_wanted(channel.topic)}
+            if declared_count < len(self.channels):
+                declared_count = len(self.channels)
+                unwanted = {n for n, channel in self.channels.items() if not is_wanted(channel.topic)}
             if isinstance(content, DamageError):
                 self._fault(place, f"{content}; the ", " are lost")
                 yield place, Messages(self.channels)
                 continue
-            messages = self._messages(place, split_records(content, passed_over), content)
-            if declared < len(self.channels):
+            messages = self._messages(place, split_records(content, unwanted), content)
+            if declared_count < len(self.channels):
                 # this chunk declares channels, whose topics may not be wanted
                 topics = [self.channels[n].topic for n in messages.channel.tolist()]
                 messages = select(messages, np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
@@ -282,20 +284,22 @@ class ChunkWalk:
         """Count the samples among messages."""
         return int(np.count_nonzero(self._is_objects[messages.channel]))
 
-    def _messages(self, place: ChunkPlace, split: Records, content: bytes) -> Messages:
+    def _messages(self, place: ChunkPlace, chunk: Records, content: bytes) -> Messages:
         """Return the valid messages of a place; report the number of invalid ones."""
-        damage = self._take_in(split.declarations) or ("a record breaks off" if split.breaks_off else "")
-        if damage:
-            self._fault(place, f"{damage}; of the ", f", {len(split.heads)} could be read")
-        is_usable = self._is_declared[split.heads["channel"]] & (split.heads["log_time"] <= LATEST_NS)
-        if not is_usable.all():
-            lost = len(is_usable) - np.count_nonzero(is_usable)
-            self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
-        names = ("channel", "sequence", "log_time", "publish_time")
-        channel, sequence, log_ns, publish_ns = (
-            split.heads[name][is_usable].astype(np.int64) for name in names
+        damage = self._add_declarations(chunk.declarations) or (
+            "a record breaks off" if chunk.breaks_off else ""
         )
-        payloads = [content[span] for span in compress(split.payloads, is_usable)]
+        if damage:
+            self._fault(place, f"{damage}; of the ", f", {len(chunk.heads)} could be read")
+        is_usable = self._is_declared[chunk.heads["channel"]] & (chunk.heads["log_time"] <= LATEST_NS)
+        if not is_usable.all():
+            lost_count = len(is_usable) - np.count_nonzero(is_usable)
+            self._fault(place, f"{lost_count} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
+        field_names = ("channel", "sequence", "log_time", "publish_time")
+        channel, sequence, log_ns, publish_ns = (
+            chunk.heads[name][is_usable].astype(np.int64) for name in field_names
+        )
+        payloads = [content[span] for span in compress(chunk.payloads, is_usable)]
         return Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def _find_channels(self) -> None:
@@ -306,9 +310,9 @@ class ChunkWalk:
         for _, content in iter_records(self.stream, sorted(self.places, key=lambda place: place.offset)):
             # damage is reported when the chunk is read again for its messages
             if not isinstance(content, DamageError):
-                self._take_in(split_records(content).declarations)
+                self._add_declarations(split_records(content).declarations)
 
-    def _take_in(self, declarations: Iterable[tuple[int, bytes]]) -> str:
+    def _add_declarations(self, declarations: Iterable[tuple[int, bytes]]) -> str:
         """Store new declarations; return the damage of the first invalid one, or ""."""
         damage = ""
         for opcode, body in declarations:
@@ -325,19 +329,19 @@ class ChunkWalk:
     def _declare(self, channel: records.Channel) -> None:
         schema = self._schemas.get(channel.schema_id)
         self._is_declared[channel.id], self._is_objects[channel.id] = True, channel.topic == OBJECTS
-        declared = Channel(
+        log_channel = Channel(
             channel.topic,
             channel.message_encoding,
             Schema(schema.name, schema.encoding, schema.data) if schema else None,
             MappingProxyType(channel.metadata),
         )
-        self.channels[channel.id] = self._renamed(declared)
+        self.channels[channel.id] = self._renamed(log_channel)
 
     def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
         """Report a fault of the messages in a place, in words before and after their times."""
-        span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
-        where = f"{self.name}: at byte {place.offset}: "
-        self.faults.add(Sentence(where, Sentence(before, *span, after)))
+        time_words = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
+        place_text = f"{self.name}: at byte {place.offset}: "
+        self.faults.add(Sentence(place_text, Sentence(before, *time_words, after)))
 
 
 @dataclass(frozen=True)
@@ -369,24 +373,24 @@ class McapSource(FileSource):
         """
         renamed = set[Channel]()
         with self.open_walk(lambda channel: self._channel_of_copy(channel, renamed)) as walk:
-            window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
+            window_ns = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
-            for messages in _blocks(walk, window, self.is_wanted):
+            for messages in _blocks(walk, window_ns, self.is_wanted):
                 yield decoder.block(messages)
-            if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
+            if not isinstance(self.path, RemoteFile) or window_ns == (0, AFTER_ALL_NS):
                 # a window of a remote log is not worth downloading all attachments
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
-            rest = walk.faults.take(last=True)
-            fault = decoder.first_fault or next(iter(rest), None)
+            last_faults = walk.faults.take(last=True)
+            first_fault = decoder.first_fault or next(iter(last_faults), None)
             if not decoder.any_sample and all(channel.topic != OBJECTS for channel in walk.channels.values()):
-                raise self._without_objects(walk, fault)
-            if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
-                raise LogError(f"{self.name} holds no sample: {fault}")
+                raise self._without_objects(walk, first_fault)
+            if not decoder.any_sample and window_ns == (0, AFTER_ALL_NS) and first_fault is not None:
+                raise LogError(f"{self.name} holds no sample: {first_fault}")
             remarks = directory_remarks(self.name, walk.directory, self.metadata())
             remarks = (*remarks, *remarks_on_copies(self.name, renamed))
             doubts = tuple(doubts_from_metadata(dict(self.metadata()).get(DOUBTS, {})))
-            if rest or remarks or doubts:
-                trace = replace(Trace.from_samples(()), faults=rest)
+            if last_faults or remarks or doubts:
+                trace = replace(Trace.from_samples(()), faults=last_faults)
                 yield Block(trace, remarks=remarks, doubts=doubts)
 
     def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
@@ -398,11 +402,11 @@ class McapSource(FileSource):
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`; damaged attachments are left out."""
-        return self._beside[0]
+        return self._outside_chunks[0]
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`; damaged records are left out."""
-        return self._beside[1]
+        return self._outside_chunks[1]
 
     @property
     def axes(self) -> Axes:
@@ -413,8 +417,12 @@ class McapSource(FileSource):
     def begin_ns(self) -> int | None:
         """Start of the first chunk with samples; None if the index lists no channels."""
         with self.open_walk() as walk:
-            numbers = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
-            return next((p.start_ns for p in walk.places if p.channels and p.channels & numbers), None)
+            sample_channels = {
+                number for number, channel in walk.channels.items() if channel.topic == OBJECTS
+            }
+            return next(
+                (p.start_ns for p in walk.places if p.channels and p.channels & sample_channels), None
+            )
 
     @property
     def has_samples(self) -> bool:
@@ -424,9 +432,9 @@ class McapSource(FileSource):
 
     def is_wanted(self, topic: str) -> bool:
         """Return whether the blocks hold messages of a topic."""
-        names = {topic, topic.removeprefix(ORIGINAL_PREFIX)}
+        topic_names = {topic, topic.removeprefix(ORIGINAL_PREFIX)}
         return topic == OBJECTS or (
-            topic not in DERIVED and any(is_kept(name, self.keep, ()) for name in names)
+            topic not in DERIVED and any(is_kept(name, self.keep, ()) for name in topic_names)
         )
 
     @contextmanager
@@ -447,11 +455,11 @@ class McapSource(FileSource):
             return read_directory(stream, faults, self.name), faults
 
     @cached_property
-    def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
+    def _outside_chunks(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
         directory, _ = self._index
         with open_file(self.path) as stream:
-            beside = [*directory.attachments, *directory.metadata]
-            plan_reads(stream, ((offset, offset + length) for offset, length in beside))
+            record_spans = [*directory.attachments, *directory.metadata]
+            plan_reads(stream, ((offset, offset + length) for offset, length in record_spans))
             attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
             return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
 
@@ -469,15 +477,15 @@ class McapSource(FileSource):
         topics = sorted({channel.topic for channel in walk.channels.values()})
         if not topics:
             return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
-        what = f"no topic {OBJECTS!r} in {self.name}; it has {listing([*map(repr, topics)])}"
+        fault_text = f"no topic {OBJECTS!r} in {self.name}; it has {listing([*map(repr, topics)])}"
         if fault:
-            return LogError(f"{what}: {fault}")
+            return LogError(f"{fault_text}: {fault}")
         if METADATA in dict(self.metadata()):
             remedy = (
                 "no sample was recorded in it, or it is a layer: give the log that the layer was made from"
             )
-            return UsageError(f"{what}; {remedy}")
-        return UsageError(f"{what}; a mapping file says which of them carry objects")
+            return UsageError(f"{fault_text}; {remedy}")
+        return UsageError(f"{fault_text}; a mapping file says which of them carry objects")
 
 
 def is_samples(channel: Channel) -> bool:
@@ -489,62 +497,64 @@ def directory_remarks(
     name: str, directory: Directory, metadata: Sequence[tuple[str, Mapping[str, str]]]
 ) -> tuple[str, ...]:
     """Return remarks on skipped records, and on the recovery of the log from a damaged one."""
-    skipped = (
+    skip_remarks = (
         (f"{name}: {plural(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
         if directory.skipped
         else ()
     )
-    return skipped + tuple(
+    return skip_remarks + tuple(
         f"{name} was recovered from {data.get('source', 'a damaged log')}:"
         f" {data.get('losses', 'how much is missing is not known')}"
-        for record, data in metadata
-        if record == RECOVERY
+        for record_name, data in metadata
+        if record_name == RECOVERY
     )
 
 
-def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]) -> Iterator[Messages]:
+def _blocks(
+    walk: ChunkWalk, window_ns: tuple[int, int], is_wanted: Callable[[str], bool]
+) -> Iterator[Messages]:
     """Yield the messages of wanted topics in time order, in blocks of bounded size."""
-    start_ns, end_ns = window
-    numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
+    start_ns, end_ns = window_ns
+    wanted_channels = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
     places = [
         place
         for place in walk.places
         if place.start_ns < end_ns
         and place.end_ns >= start_ns
-        and (place.channels is None or not place.channels.isdisjoint(numbers))
+        and (place.channels is None or not place.channels.isdisjoint(wanted_channels))
     ]
     waiting: list[Messages] = []
-    most = most_waiting(place.length for place in places)
-    size = samples = 0
+    waiting_limit = most_waiting(place.length for place in places)
+    waiting_bytes = sample_count = 0
     for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
         if place.start_ns < start_ns or place.end_ns >= end_ns:
             messages = messages.within(start_ns, end_ns)
         waiting.append(messages)
-        size += messages.nbytes
-        samples += walk.sample_count(messages)
-        if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
+        waiting_bytes += messages.nbytes
+        sample_count += walk.sample_count(messages)
+        if number < len(places) and (waiting_bytes >= BLOCK_BYTES or sample_count >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
             # chunks are sorted by start, so no later chunk has a message before the start of the next one
-            ready = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
+            ready_count = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
             waiting = [ordered]
-            if ready:
-                yield select(ordered, slice(ready))
-                rest = select(ordered, slice(ready, None))
-                waiting, size, samples = [rest], rest.nbytes, walk.sample_count(rest)
-            if size > most:
-                raise too_many_waiting(walk.name, most)
-    rest = _in_order(waiting)
-    if len(rest):
-        yield rest
+            if ready_count:
+                yield select(ordered, slice(ready_count))
+                later = select(ordered, slice(ready_count, None))
+                waiting, waiting_bytes, sample_count = [later], later.nbytes, walk.sample_count(later)
+            if waiting_bytes > waiting_limit:
+                raise too_many_waiting(walk.name, waiting_limit)
+    later = _in_order(waiting)
+    if len(later):
+        yield later
 
 
-def _in_order(several: Sequence[Messages]) -> Messages:
+def _in_order(streams: Sequence[Messages]) -> Messages:
     """Join and sort messages by log time, channel and sequence; equal ones stay in their order."""
-    joined = concatenate_tables([Messages(), *several])
-    times = joined.log_time_ns
-    if (times[1:] > times[:-1]).all():
+    joined = concatenate_tables([Messages(), *streams])
+    times_ns = joined.log_time_ns
+    if (times_ns[1:] > times_ns[:-1]).all():
         return joined
-    return select(joined, np.lexsort((joined.sequence, joined.channel, times)))
+    return select(joined, np.lexsort((joined.sequence, joined.channel, times_ns)))
 
 
 def decode_samples(
@@ -561,15 +571,17 @@ def decode_samples(
         latest_ns: time of the previous sample; valid samples are later.
         report: receiver of the faults of invalid samples.
     """
-    times = messages.log_time_ns[places]
-    before = np.maximum.accumulate(np.append(latest_ns, times))[:-1]
-    for time_ns in times[times <= before].tolist():
+    times_ns = messages.log_time_ns[places]
+    latest_before_ns = np.maximum.accumulate(np.append(latest_ns, times_ns))[:-1]
+    for time_ns in times_ns[times_ns <= latest_before_ns].tolist():
         report(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
-    places, times = places[times > before], times[times > before]
-    trace, faults = decode_objects([messages.payloads[at] for at in places.tolist()], times, concave=concave)
+    places, times_ns = places[times_ns > latest_before_ns], times_ns[times_ns > latest_before_ns]
+    trace, faults = decode_objects(
+        [messages.payloads[place] for place in places.tolist()], times_ns, concave=concave
+    )
     for fault in faults:
         report(fault)
-    return trace, places[np.isin(times, trace.times_ns)]
+    return trace, places[np.isin(times_ns, trace.times_ns)]
 
 
 def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
@@ -592,20 +604,20 @@ class _BlockDecoder:
         channels = {
             n: channel for n, channel in messages.channels.items() if self._source.is_wanted(channel.topic)
         }
-        columns = replace(messages, channels=MappingProxyType(channels))
-        samples = [number for number, channel in channels.items() if self._is_objects(channel)]
-        sample_places = np.flatnonzero(np.isin(columns.channel, samples))
-        trace, sound = decode_samples(
-            columns, sample_places, self._latest_ns, self._fault, self._source.reading.concave
+        wanted_messages = replace(messages, channels=MappingProxyType(channels))
+        sample_channels = [number for number, channel in channels.items() if self._is_objects(channel)]
+        sample_places = np.flatnonzero(np.isin(wanted_messages.channel, sample_channels))
+        trace, valid_places = decode_samples(
+            wanted_messages, sample_places, self._latest_ns, self._fault, self._source.reading.concave
         )
-        self._latest_ns = int(columns.log_time_ns[sample_places].max(initial=self._latest_ns))
-        if len(sound) < len(sample_places):
+        self._latest_ns = int(wanted_messages.log_time_ns[sample_places].max(initial=self._latest_ns))
+        if len(valid_places) < len(sample_places):
             # a copy must be sound, so it gets the valid samples only
-            columns = select(columns, without(columns, sample_places, sound))
+            wanted_messages = select(wanted_messages, without(wanted_messages, sample_places, valid_places))
         self.any_sample = self.any_sample or len(trace) > 0
-        lost = self._walk.faults.take()
-        self.first_fault = self.first_fault or next(iter(lost), None)
-        return Block(replace(trace, faults=lost), columns)
+        new_faults = self._walk.faults.take()
+        self.first_fault = self.first_fault or next(iter(new_faults), None)
+        return Block(replace(trace, faults=new_faults), wanted_messages)
 
     def _is_objects(self, channel: Channel) -> bool:
         if channel.topic != OBJECTS or is_samples(channel):
@@ -662,13 +674,13 @@ class LogSummary:
 def summarise_mcap(source: McapSource) -> LogSummary:
     """Summarise an MCAP log; a log without a summary section is read as a whole."""
     with source.open_walk() as walk:
-        counts, opened = _counts(walk), (walk.stream, walk.directory, walk.faults, source.name)
+        counts, log_parts = _counts(walk), (walk.stream, walk.directory, walk.faults, source.name)
         channels = [ChannelSummary(channel, counts[number]) for number, channel in walk.channels.items()]
         return LogSummary(
-            channels=tuple(sorted(channels, key=lambda each: each.channel.topic)),
-            metadata=tuple(iter_metadata(*opened)),
+            channels=tuple(sorted(channels, key=lambda summary: summary.channel.topic)),
+            metadata=tuple(iter_metadata(*log_parts)),
             attachments=tuple(
-                AttachmentSummary(a.name, a.media_type, len(a.data)) for a in iter_attachments(*opened)
+                AttachmentSummary(a.name, a.media_type, len(a.data)) for a in iter_attachments(*log_parts)
             ),
             faults=walk.faults.take(last=True),
         )

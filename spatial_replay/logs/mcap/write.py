@@ -129,40 +129,40 @@ class _PackedChunk(NamedTuple):
     counts: dict[int, int]
 
 
-def _pack(lane: _Lane, declaring: bytes) -> _PackedChunk:
+def _pack(lane: _Lane, declarations: bytes) -> _PackedChunk:
     """Compress the declarations and the messages of a lane to a chunk, and build its index."""
     contents, *columns = zip(*lane.records, strict=True)
     channels, times_ns, sizes = map(np.concatenate, columns)
-    content = b"".join([declaring, *contents])
+    content = b"".join([declarations, *contents])
     compressed = _compressor(lane.is_own).compress(content)
     start_ns, end_ns = int(times_ns.min()), int(times_ns.max())
     length = _CHUNK.size - RECORD_HEAD.size + len(compressed)
-    about = start_ns, end_ns, len(content), crc32(content), len(_ZSTD), _ZSTD.encode(), len(compressed)
-    parts = [_CHUNK.pack(Opcode.CHUNK, length, *about), compressed]
-    entries = np.stack([times_ns, len(declaring) + np.cumsum(sizes) - sizes], axis=1).astype("<u8")
-    record_bytes = at = RECORD_HEAD.size + length
-    offsets, counts = dict[int, int](), dict[int, int]()
+    head_fields = start_ns, end_ns, len(content), crc32(content), len(_ZSTD), _ZSTD.encode(), len(compressed)
+    chunk_pieces = [_CHUNK.pack(Opcode.CHUNK, length, *head_fields), compressed]
+    entries = np.stack([times_ns, len(declarations) + np.cumsum(sizes) - sizes], axis=1).astype("<u8")
+    record_bytes = index_offset = RECORD_HEAD.size + length
+    index_offsets, message_counts = dict[int, int](), dict[int, int]()
     for channel in np.unique(channels).tolist():
         entry_bytes = entries[channels == channel].tobytes()
-        offsets[channel] = at
-        counts[channel] = len(entry_bytes) // _INDEX_ENTRY
-        parts += (
+        index_offsets[channel] = index_offset
+        message_counts[channel] = len(entry_bytes) // _INDEX_ENTRY
+        chunk_pieces += (
             _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, len(entry_bytes) + 6, channel, len(entry_bytes)),
             entry_bytes,
         )
-        at += _INDEX_HEAD.size + len(entry_bytes)
+        index_offset += _INDEX_HEAD.size + len(entry_bytes)
     index = records.ChunkIndex(
         chunk_length=record_bytes,
         chunk_start_offset=0,
         compression=_ZSTD,
         compressed_size=len(compressed),
         message_end_time=end_ns,
-        message_index_length=at - record_bytes,
-        message_index_offsets=offsets,
+        message_index_length=index_offset - record_bytes,
+        message_index_offsets=index_offsets,
         message_start_time=start_ns,
         uncompressed_size=len(content),
     )
-    return _PackedChunk(b"".join(parts), index, counts)
+    return _PackedChunk(b"".join(chunk_pieces), index, message_counts)
 
 
 _local = local()
@@ -197,9 +197,11 @@ class _Summary:
     def add(self, chunk: _PackedChunk, offset: int) -> None:
         """Add a chunk at its offset in the file."""
         index = chunk.summary
-        places = {channel: offset + at for channel, at in index.message_index_offsets.items()}
+        file_offsets = {
+            channel: offset + chunk_offset for channel, chunk_offset in index.message_index_offsets.items()
+        }
         self.chunks.append(
-            encode_records(replace(index, chunk_start_offset=offset, message_index_offsets=places))
+            encode_records(replace(index, chunk_start_offset=offset, message_index_offsets=file_offsets))
         )
         self.counts.update(chunk.counts)
         self.start_ns = min(self.start_ns, index.message_start_time)
@@ -215,13 +217,13 @@ class _Summary:
             (Opcode.ATTACHMENT_INDEX, encode_records(*self.attachments)),
             (Opcode.METADATA_INDEX, encode_records(*self.metadata)),
         )
-        section, offsets = b"", []
+        section, summary_offsets = b"", []
         for opcode, content in groups:
             if content:
-                offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
+                summary_offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
-        section += encode_records(*offsets) + footer
+        section += encode_records(*summary_offsets) + footer
         # the checksum covers the footer up to itself: https://mcap.dev/spec#footer-op0x02
         return section + struct.pack("<I", crc32(section))
 
@@ -292,7 +294,7 @@ class LogWriter:
         self._threads = ThreadPoolExecutor(cores(), "packing")
         self._packing: deque[tuple[int, Future[_PackedChunk]]] = deque()
         self._packing_bytes = 0
-        self._closed = False
+        self._is_closed = False
         self._write(MAGIC)
         self._write_record(records.Header(profile, LIBRARY))
 
@@ -316,19 +318,19 @@ class LogWriter:
         """Add messages in the order given."""
         if not len(messages):
             return
-        numbers, lanes = self._numbers(messages)
-        for number, lane in enumerate(self._lanes):
+        channel_numbers, lanes = self._numbers(messages)
+        for lane_number, lane in enumerate(self._lanes):
             if lane.records and self._clock and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS:
-                self._end(number)
+                self._end(lane_number)
         payloads = Payloads.of(messages.payloads)
-        ends = np.cumsum(payloads.size)
+        payload_ends = np.cumsum(payloads.size)
         begin = 0
         while begin < len(messages):
             # in parts, because the memory of a part is reused: new memory takes as long as filling it
-            filled = int(ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
-            end = max(begin + 1, int(np.searchsorted(ends, filled)))
+            filled_bytes = int(payload_ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
+            end = max(begin + 1, int(np.searchsorted(payload_ends, filled_bytes)))
             part = select(replace(messages, payloads=payloads), slice(begin, end))
-            self._write_part(part, numbers[begin:end], lanes[begin:end])
+            self._write_part(part, channel_numbers[begin:end], lanes[begin:end])
             begin = end
 
     def _write_part(self, messages: Messages, numbers: Integers, lanes: Integers) -> None:
@@ -343,45 +345,45 @@ class LogWriter:
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
         # records of one lane are adjacent, so that a run of messages is one slice
-        order = np.argsort(lanes, kind="stable")
-        starts = np.empty(len(messages), np.int64)
-        starts[order] = np.cumsum(sizes[order]) - sizes[order]
+        lane_order = np.argsort(lanes, kind="stable")
+        record_starts = np.empty(len(messages), np.int64)
+        record_starts[lane_order] = np.cumsum(sizes[lane_order]) - sizes[lane_order]
         content = np.empty(int(sizes.sum()), np.uint8)
-        stretches(content, _HEAD_BYTES)[starts] = heads.view(f"V{_HEAD_BYTES}")
-        payloads.copy_into(content, starts + _HEAD_BYTES)
+        stretches(content, _HEAD_BYTES)[record_starts] = heads.view(f"V{_HEAD_BYTES}")
+        payloads.copy_into(content, record_starts + _HEAD_BYTES)
         records_of_part = _Records(content, numbers, messages.log_time_ns, sizes)
         begin = 0
         for end in _run_ends(messages.log_time_ns, lanes):
-            self._fill(int(lanes[begin]), records_of_part, starts, begin, end)
+            self._fill(int(lanes[begin]), records_of_part, record_starts, begin, end)
             begin = end
 
-    def _fill(self, number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
+    def _fill(self, lane_number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
         """Add messages of one lane with times that do not decrease; each step fills the open chunk."""
         times_ns = part.times_ns
         while begin < end:
             time_ns = int(times_ns[begin])
-            for place, lane in enumerate(self._lanes):
+            for open_lane, lane in enumerate(self._lanes):
                 if lane.records and time_ns - lane.first_ns >= self._chunk_ns:
-                    self._end(place)
-            lane = self._lanes[number]
+                    self._end(open_lane)
+            lane = self._lanes[lane_number]
             if not lane.records:
                 lane.began_s = self._clock() if self._clock else 0.0
                 lane.first_ns = time_ns
             first_ns = min([time_ns, *(lane.first_ns for lane in self._lanes if lane.records)])
             # all messages up to the end of the chunk at once: one by one, they take 2 µs each
             stop = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
-            start, last = int(starts[begin]), stop - 1
-            size = int(starts[last] + part.sizes[last]) - start
-            if size + lane.size >= CHUNK_BYTES:
-                full = start + CHUNK_BYTES - lane.size
-                stop = begin + 1 + int(np.searchsorted(starts[begin + 1 : stop], full))
-                last = stop - 1
-                size = int(starts[last] + part.sizes[last]) - start
+            start_offset, last_index = int(starts[begin]), stop - 1
+            added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
+            if added_bytes + lane.size >= CHUNK_BYTES:
+                full_offset = start_offset + CHUNK_BYTES - lane.size
+                stop = begin + 1 + int(np.searchsorted(starts[begin + 1 : stop], full_offset))
+                last_index = stop - 1
+                added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
             columns = (column[begin:stop] for column in part[1:])
-            lane.records.append(_Records(part.content[start : start + size], *columns))
-            lane.size += size
+            lane.records.append(_Records(part.content[start_offset : start_offset + added_bytes], *columns))
+            lane.size += added_bytes
             if lane.size >= CHUNK_BYTES:
-                self._end(number)
+                self._end(lane_number)
             begin = stop
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
@@ -395,14 +397,14 @@ class LogWriter:
     ) -> None:
         """Close the chunks, and add an attachment; unknown times are 0."""
         self.flush()
-        about: dict[str, Any] = {
+        attributes: dict[str, Any] = {
             "create_time": create_time_ns,
             "log_time": log_time_ns,
             "name": name,
             "media_type": media_type,
         }
-        offset, length = self._write_record(records.Attachment(data=data, **about))
-        index = records.AttachmentIndex(offset=offset, length=length, data_size=len(data), **about)
+        offset, length = self._write_record(records.Attachment(data=data, **attributes))
+        index = records.AttachmentIndex(offset=offset, length=length, data_size=len(data), **attributes)
         self._summary.attachments.append(index)
 
     def flush(self) -> None:
@@ -414,9 +416,9 @@ class LogWriter:
 
     def close(self) -> None:
         """Finish the log: summary, index and footer. Closing twice does nothing."""
-        if self._closed:
+        if self._is_closed:
             return
-        self._closed = True
+        self._is_closed = True
         try:
             self.flush()
             # 0: no checksum of the data section, as each chunk has one: https://mcap.dev/spec#data-end-op0x0f
@@ -428,69 +430,71 @@ class LogWriter:
 
     def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
         """Return (M,) channel numbers and (M,) lanes; new channels are numbered in order of appearance."""
-        local_numbers, first = np.unique(messages.channel, return_index=True)
-        number = np.zeros(int(local_numbers.max()) + 1, np.int64)
-        lane = np.zeros(len(number), np.int64)
-        for local_number in local_numbers[np.argsort(first)].tolist():
+        local_numbers, first_indices = np.unique(messages.channel, return_index=True)
+        log_numbers = np.zeros(int(local_numbers.max()) + 1, np.int64)
+        lane_by_number = np.zeros(len(log_numbers), np.int64)
+        for local_number in local_numbers[np.argsort(first_indices)].tolist():
             channel = messages.channels[local_number]
-            lane[local_number] = not channel.topic.startswith(OWN_PREFIX)
+            lane_by_number[local_number] = not channel.topic.startswith(OWN_PREFIX)
             if channel not in self._channels:
                 self._declare(channel)
-            number[local_number] = self._channels[channel]
-        return number[messages.channel], lane[messages.channel]
+            log_numbers[local_number] = self._channels[channel]
+        return log_numbers[messages.channel], lane_by_number[messages.channel]
 
     def _declare(self, channel: Channel) -> None:
         """Number a channel and its schema, and encode their declarations."""
-        schema, described = channel.schema, b""
+        schema, schema_bytes = channel.schema, b""
         if schema is not None:
             is_new = schema not in self._schemas
             number = self._schemas.setdefault(schema, len(self._schemas) + 1)
-            record = records.Schema(id=number, data=schema.data, encoding=schema.encoding, name=schema.name)
+            schema_record = records.Schema(
+                id=number, data=schema.data, encoding=schema.encoding, name=schema.name
+            )
             if is_new:
-                self._summary.schemas.append(record)
-            described = encode_records(record)
+                self._summary.schemas.append(schema_record)
+            schema_bytes = encode_records(schema_record)
         self._channels[channel] = len(self._channels) + 1
-        declared = records.Channel(
+        channel_record = records.Channel(
             id=self._channels[channel],
             topic=channel.topic,
             message_encoding=channel.encoding,
             metadata=dict(channel.metadata),
             schema_id=0 if schema is None else self._schemas[schema],
         )
-        self._summary.channels.append(declared)
-        self._declarations[declared.id] = _Declaration(described, encode_records(declared))
+        self._summary.channels.append(channel_record)
+        self._declarations[channel_record.id] = _Declaration(schema_bytes, encode_records(channel_record))
 
-    def _end(self, number: int) -> None:
+    def _end(self, lane_number: int) -> None:
         """Close the open chunk of a lane: pack it on another thread, and write the chunks that are ready."""
-        lane = self._lanes[number]
-        self._lanes[number] = _Lane(lane.is_own)
-        self._packing.append((lane.size, self._threads.submit(_pack, lane, self._declaring(lane))))
+        lane = self._lanes[lane_number]
+        self._lanes[lane_number] = _Lane(lane.is_own)
+        self._packing.append((lane.size, self._threads.submit(_pack, lane, self._due_declarations(lane))))
         self._packing_bytes += lane.size
         self._write_ready_chunks(WAITING_BYTES)
 
-    def _declaring(self, lane: _Lane) -> bytes:
+    def _due_declarations(self, lane: _Lane) -> bytes:
         """Return the declarations at the beginning of a chunk, each schema once."""
         start_ns = lane.first_ns
         counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
         declarations = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
-        due = [declaration for declaration in declarations if start_ns >= declaration.due_ns]
+        due_declarations = [declaration for declaration in declarations if start_ns >= declaration.due_ns]
         # declared more than once, so that a broken chunk costs no other chunk its declarations
-        for declaration in due:
+        for declaration in due_declarations:
             declaration.count += 1
             declaration.due_ns = -FOREVER if declaration.count < 2 else start_ns + REPEAT_NS
         return b"".join(
             chain(
-                dict.fromkeys(declaration.schema for declaration in due),
-                (declaration.channel for declaration in due),
+                dict.fromkeys(declaration.schema for declaration in due_declarations),
+                (declaration.channel for declaration in due_declarations),
             )
         )
 
     def _write_ready_chunks(self, waiting_bytes: int) -> None:
         """Write packed chunks in order; wait for packing while more than `waiting_bytes` are pending."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
-            size, packing = self._packing.popleft()
-            chunk = packing.result()
-            self._packing_bytes -= size
+            chunk_bytes, future = self._packing.popleft()
+            chunk = future.result()
+            self._packing_bytes -= chunk_bytes
             self._summary.add(chunk, self._offset)
             self._write(chunk.data)
             self._flush_stream()
