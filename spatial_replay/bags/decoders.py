@@ -136,8 +136,8 @@ def _protobuf_decoder(type_name: str, message_class: type[Message]) -> Decoder:
 @lru_cache(64)
 def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
     if schema is None or schema.encoding != "protobuf":
-        place = "missing" if schema is None else f"in {schema.encoding!r:.100}"
-        raise LogError(f"the definition of {type_name!r:.100} is {place}; protobuf needs a descriptor set")
+        state = "missing" if schema is None else f"in {schema.encoding!r:.100}"
+        raise LogError(f"the definition of {type_name!r:.100} is {state}; protobuf needs a descriptor set")
     # a pool for each type, because logs may define a name in different ways
     pool = DescriptorPool()
     try:
@@ -151,23 +151,24 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
         ) from None
 
 
-def _add_well_known_types(described: FileDescriptorSet) -> FileDescriptorSet:
+def _add_well_known_types(descriptors: FileDescriptorSet) -> FileDescriptorSet:
     """Add the files of well-known types, such as timestamps, that a set imports but does not contain."""
-    file_names = {file.name for file in described.file}
-    imported = {name for file in described.file for name in file.dependency} - file_names
+    file_names = {file.name for file in descriptors.file}
+    missing_names = {name for file in descriptors.file for name in file.dependency} - file_names
     for module in _WELL_KNOWN:
-        if module.DESCRIPTOR.name in imported:
-            module.DESCRIPTOR.CopyToProto(described.file.add())
-    return described
+        if module.DESCRIPTOR.name in missing_names:
+            module.DESCRIPTOR.CopyToProto(descriptors.file.add())
+    return descriptors
 
 
-def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
+def _in_order(descriptors: FileDescriptorSet) -> list[FileDescriptorProto]:
     """Return the files in an order in which each follows its imports, as the descriptor pool requires."""
-    if len(described.file) > _MOST_FILES:
-        raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
-    files = {file.name: file for file in described.file}
+    if len(descriptors.file) > _MOST_FILES:
+        raise ValueError(f"it has {len(descriptors.file)} files; at most {_MOST_FILES} are read")
+    files = {file.name: file for file in descriptors.file}
     imports = {
-        name: [imported for imported in file.dependency if imported in files] for name, file in files.items()
+        name: [imported_name for imported_name in file.dependency if imported_name in files]
+        for name, file in files.items()
     }
     try:
         return [files[name] for name in TopologicalSorter(imports).static_order()]
@@ -188,13 +189,13 @@ def topics_by_name(described: Iterable[Topic], distribution: str | None = None) 
     Args:
         distribution: ROS release that the log names.
     """
-    named: dict[str, Topic] = {}
+    topic_by_name: dict[str, Topic] = {}
     for topic in described:
-        before = named.get(topic.name)
-        named[topic.name] = topic if before is None else _join(before, topic)
+        earlier_topic = topic_by_name.get(topic.name)
+        topic_by_name[topic.name] = topic if earlier_topic is None else _join(earlier_topic, topic)
     return tuple(
         topic if topic.unreadable else replace(topic, unreadable=why_unreadable(topic, distribution))
-        for _, topic in sorted(named.items())
+        for _, topic in sorted(topic_by_name.items())
     )
 
 
@@ -233,20 +234,21 @@ def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
 
 def _join(first: Topic, second: Topic) -> Topic:
     has_counts = None not in (first.count, second.count)
-    joined = replace(
+    joined_topic = replace(
         first,
         count=(first.count or 0) + (second.count or 0) if has_counts else None,
         latched=first.latched or second.latched,
         schema=first.schema or second.schema,
     )
-    for what in ("type", "encoding"):
-        if getattr(first, what) != getattr(second, what):
-            both = f"{getattr(first, what)!r} and {getattr(second, what)!r}"
+    for attribute in ("type", "encoding"):
+        if getattr(first, attribute) != getattr(second, attribute):
+            values_text = f"{getattr(first, attribute)!r} and {getattr(second, attribute)!r}"
             return replace(
-                joined, unreadable=f"topic {first.name!r} has messages of more than one {what}: {both}"
+                joined_topic,
+                unreadable=f"topic {first.name!r} has messages of more than one {attribute}: {values_text}",
             )
     if None not in (first.schema, second.schema) and not same_definition(first, second):
         return replace(
-            joined, unreadable=f"topic {first.name!r} has messages of {first.type!r} in two definitions"
+            joined_topic, unreadable=f"topic {first.name!r} has messages of {first.type!r} in two definitions"
         )
-    return joined
+    return joined_topic

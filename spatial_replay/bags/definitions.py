@@ -74,8 +74,8 @@ Definitions: TypeAlias = Mapping[str, tuple[Field, ...]]
 
 def full_type_name(name: str) -> str:
     """Return a ROS type's name with its middle part: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
-    parts = name.split("/")
-    return "/".join([parts[0], "msg", parts[1]]) if len(parts) == 2 else name
+    name_parts = name.split("/")
+    return "/".join([name_parts[0], "msg", name_parts[1]]) if len(name_parts) == 2 else name
 
 
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
@@ -122,15 +122,15 @@ def checked_type_name(name: str) -> str:
 
 
 def _iter_fields(body: str, owner: str, type_names: set[str]) -> Iterator[Field]:
-    for number, line in enumerate(body.splitlines(), 1):
+    for line_number, line in enumerate(body.splitlines(), 1):
         # an annotation may be on the line of its field; no encoding of ROS depends on annotations
-        bare = _ANNOTATIONS.sub("", line.partition("#")[0])
-        if not bare.strip():
+        bare_line = _ANNOTATIONS.sub("", line.partition("#")[0])
+        if not bare_line.strip():
             continue
-        field_match = _FIELD.fullmatch(bare)
+        field_match = _FIELD.fullmatch(bare_line)
         if field_match is None:
             raise LogError(
-                f"the definition of {owner!r}, line {number}: {line.strip()!r:.100} is not a field"
+                f"the definition of {owner!r}, line {line_number}: {line.strip()!r:.100} is not a field"
             )
         # a constant is not in the bytes of a message
         if field_match["rest"].startswith("="):
@@ -173,14 +173,14 @@ class _Walk:
     def __init__(self, definitions: Definitions, empty_bytes: int) -> None:
         self._definitions = definitions
         self._empty_bytes = empty_bytes
-        self._measured: dict[str, tuple[int, int]] = {}
-        self._in_all = 0
+        self._measures: dict[str, tuple[int, int]] = {}
+        self._total_values = 0
         self.used: dict[str, tuple[Field, ...]] = {}
 
     def measure(self, name: str, above: tuple[str, ...]) -> tuple[int, int]:
         """Return the number of values of a type, and its least size in bytes."""
-        if name in self._measured:
-            return self._measured[name]
+        if name in self._measures:
+            return self._measures[name]
         if name not in self._definitions:
             raise LogError(f"the definition of {name!r:.100} is missing" + _used_by(above))
         # the depth is limited, because this function calls itself
@@ -193,49 +193,51 @@ class _Walk:
             raise LogError(f"{name!r:.100} has {len(fields)} fields; at most {MOST_FIELDS} are read")
         self.used[checked_type_name(name)] = fields
         _check_field_names(name, fields)
-        values = least = 0
+        value_count = least_bytes = 0
         for member in fields:
-            field_values, field_least = self._field(member, name, (*above, name))
-            values += field_values
-            least += field_least
-        if values > MOST_VALUES:
-            raise LogError(f"{name!r} requires {values} values in a message; at most {MOST_VALUES} are read")
-        self._in_all += values
-        if self._in_all > MOST_VALUES_IN_ALL:
+            field_values, field_bytes = self._field(member, name, (*above, name))
+            value_count += field_values
+            least_bytes += field_bytes
+        if value_count > MOST_VALUES:
             raise LogError(
-                f"{name!r} and the other used types require {self._in_all} values; at most"
+                f"{name!r} requires {value_count} values in a message; at most {MOST_VALUES} are read"
+            )
+        self._total_values += value_count
+        if self._total_values > MOST_VALUES_IN_ALL:
+            raise LogError(
+                f"{name!r} and the other used types require {self._total_values} values; at most"
                 f" {MOST_VALUES_IN_ALL} are read"
             )
-        self._measured[name] = values, least if fields else self._empty_bytes
-        return self._measured[name]
+        self._measures[name] = value_count, least_bytes if fields else self._empty_bytes
+        return self._measures[name]
 
     def _field(self, field: Field, owner: str, above: tuple[str, ...]) -> tuple[int, int]:
         if field.type in _NOT_READ:
             raise LogError(f"{field.name!r} of {owner!r} is a {field.type}, which is not read")
         if field.type in BASE_BYTES:
             # generated code reads an array of numbers as one block, but strings one by one
-            values, least = 1, BASE_BYTES[field.type]
-            by_block = field.type != "string"
+            value_count, least_bytes = 1, BASE_BYTES[field.type]
+            is_block = field.type != "string"
         else:
-            values, least = self.measure(field.type, above)
-            by_block = False
+            value_count, least_bytes = self.measure(field.type, above)
+            is_block = False
         if field.kind == "array":
-            return (1 if by_block else max(1, values) * field.size), least * field.size
+            return (1 if is_block else max(1, value_count) * field.size), least_bytes * field.size
         if field.kind == "sequence":
-            if not least:
+            if not least_bytes:
                 raise LogError(f"{field.name!r} of {owner!r} is a sequence of items that take no bytes")
-            return values, 4
-        return values, least
+            return value_count, 4
+        return value_count, least_bytes
 
 
 def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
-    seen: set[str] = set()
+    field_names: set[str] = set()
     for member in fields:
         if len(member.name) > 256 or not _NAME.fullmatch(member.name):
             raise LogError(f"{member.name!r:.100} is not a name of a field; it is in {name!r}")
-        if member.name in seen:
+        if member.name in field_names:
             raise LogError(f"the type {name!r} has two fields {member.name!r}")
-        seen.add(member.name)
+        field_names.add(member.name)
 
 
 def _used_by(above: tuple[str, ...]) -> str:
@@ -253,11 +255,11 @@ def msg_from_definitions(definitions: Definitions, type_name: str) -> str:
 
 
 def _field_text(field: Field) -> str:
-    name = field.type.replace("/msg/", "/") + (f"<={field.longest}" if field.longest else "")
+    type_text = field.type.replace("/msg/", "/") + (f"<={field.longest}" if field.longest else "")
     match field.kind:
         case "scalar":
-            return name
+            return type_text
         case "array":
-            return f"{name}[{field.size}]"
+            return f"{type_text}[{field.size}]"
         case "sequence":
-            return f"{name}[<={field.size}]" if field.size else f"{name}[]"
+            return f"{type_text}[<={field.size}]" if field.size else f"{type_text}[]"

@@ -66,7 +66,7 @@ class McapLog(MessageReader):
     def __init__(self, path: LogFile) -> None:
         super().__init__(path)
         self._file = path
-        self._walked, self._walked_all = 0, False
+        self._read_count, self._is_all_read = 0, False
         self._is_remarked = False
 
     @cached_property
@@ -120,18 +120,18 @@ class McapLog(MessageReader):
         """Log time of the first message."""
         return min((place.start_ns for place in self._directory.chunks), default=None)
 
-    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+    def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
         directory, channel_numbers = self._directory, self._channel_numbers(topics)
         places = [
             (rank, place)
             for rank, place in enumerate(directory.chunks)
-            if place.start_ns < last
-            and place.end_ns >= first
+            if place.start_ns < end_ns
+            and place.end_ns >= first_ns
             and (place.channels is None or not place.channels.isdisjoint(channel_numbers))
         ]
         if not as_recorded:
             places.sort(key=lambda ranked: ranked[1].start_ns)
-        self._walked, self._walked_all = 0, len(places) == len(directory.chunks)
+        self._read_count, self._is_all_read = 0, len(places) == len(directory.chunks)
         with open_file(self._file) as stream:
             walk = copy(self._walk)
             walk.stream = stream
@@ -142,24 +142,25 @@ class McapLog(MessageReader):
                 [place for _, place in places], lambda topic: is_total or topic in topics
             )
             contents = (
-                self._columns(rank, place, messages, channel_numbers, first, last)
+                self._columns(rank, place, messages, channel_numbers, first_ns, end_ns)
                 for (rank, _), (place, messages) in zip(places, messages_of_places, strict=True)
             )
             if as_recorded:
                 yield from contents
                 return
-            most = most_waiting(place.length for _, place in places)
-            yield from in_order([place.start_ns for _, place in places], contents, self.name, most)
+            most_bytes = most_waiting(place.length for _, place in places)
+            yield from in_order([place.start_ns for _, place in places], contents, self.name, most_bytes)
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         yield from super()._count(columns, topics, name)
         statistics = self._directory.statistics
         # without counts of channels, only the total can be compared
-        if statistics and not statistics.channel_message_counts and self._walked_all:
-            total = statistics.message_count
-            if total != self._walked:
+        if statistics and not statistics.channel_message_counts and self._is_all_read:
+            declared_total = statistics.message_count
+            if declared_total != self._read_count:
                 self._faults.add(
-                    f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
+                    f"{self.name}: it declares {declared_total} messages in all;"
+                    f" {self._read_count} could be read"
                 )
 
     def attachments(self) -> tuple[Attachment, ...]:
@@ -171,19 +172,36 @@ class McapLog(MessageReader):
             return tuple(iter_metadata(stream, self._directory, FaultList(), self.name))
 
     def _columns(
-        self, rank: int, place: ChunkPlace, messages: Messages, wanted: list[int], first: int, last: int
+        self,
+        rank: int,
+        place: ChunkPlace,
+        messages: Messages,
+        wanted_channels: list[int],
+        first_ns: int,
+        end_ns: int,
     ) -> MessageColumns:
         """Return the wanted messages in a place; report messages of channels that the index lacks."""
-        self._walked += len(messages)
-        unknown = np.setdiff1d(messages.channel, self._numbers)
-        if len(unknown):
-            what = f"at byte {place.offset}: some messages are of a channel {unknown[0]} that is not declared"
-            self._faults.add(f"{self.name}: {what} in the index")
-        times = messages.log_time_ns
-        rows = np.flatnonzero(np.isin(messages.channel, wanted) & (times >= first) & (times < last))
-        read = select(messages, rows)
-        both_ns = read.log_time_ns, read.publish_time_ns
-        return self._make_columns(read.channel, both_ns, read.sequence, read.payloads, places_in(rank, rows))
+        self._read_count += len(messages)
+        unknown_channels = np.setdiff1d(messages.channel, self._numbers)
+        if len(unknown_channels):
+            fault = (
+                f"at byte {place.offset}: some messages are of a channel {unknown_channels[0]} that is not"
+                " declared"
+            )
+            self._faults.add(f"{self.name}: {fault} in the index")
+        times_ns = messages.log_time_ns
+        rows = np.flatnonzero(
+            np.isin(messages.channel, wanted_channels) & (times_ns >= first_ns) & (times_ns < end_ns)
+        )
+        wanted_messages = select(messages, rows)
+        times_of_messages = wanted_messages.log_time_ns, wanted_messages.publish_time_ns
+        return self._make_columns(
+            wanted_messages.channel,
+            times_of_messages,
+            wanted_messages.sequence,
+            wanted_messages.payloads,
+            places_in(rank, rows),
+        )
 
 
 _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -219,33 +237,33 @@ class BagFolder(MessageReader):
             with path.open("rb") as stream:
                 return bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1))
         except FileNotFoundError:
-            what = "is missing: its recorder was interrupted"
+            fault = "is missing: its recorder was interrupted"
         except OSError as error:
             raise MissingFileError.of(path, error) from None
         except LogError as error:
-            what = f"cannot be used: {error}"
-        self._faults.add(f"{self.name}: {BAG_METADATA} {what}; the files in the folder were read without it")
+            fault = f"cannot be used: {error}"
+        self._faults.add(f"{self.name}: {BAG_METADATA} {fault}; the files in the folder were read without it")
         return None
 
     @cached_property
     def _files(self) -> tuple[_File, ...]:
-        present = sorted(
+        present_names = sorted(
             (entry.name for entry in self._path.iterdir() if entry.name.endswith(_ENDINGS)), key=_rank
         )
-        names = self._metadata.files if self._metadata else tuple(present)
-        for name in names:
+        listed_names = self._metadata.files if self._metadata else tuple(present_names)
+        for name in listed_names:
             if not (self._path / name).is_file():
                 self._faults.add(f"{self.name}: its file {name!r} is missing; what it holds is lost")
-        for name in sorted(set(present) - set(names)):
+        for name in sorted(set(present_names) - set(listed_names)):
             self._remarks.add(
                 f"{self.name}: the file {name!r} is not listed in {BAG_METADATA}; it was not read"
             )
-        opened = [self._open(self._path / name) for name in names if (self._path / name).is_file()]
-        files = tuple(file for file in opened if file is not None)
+        readers = [self._open(self._path / name) for name in listed_names if (self._path / name).is_file()]
+        files = tuple(file for file in readers if file is not None)
         if not files:
             reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap file")
             raise LogError(f"{self.name} is not a ROS 2 bag that can be read: {reason}")
-        self._parts = files
+        self._part_readers = files
         return files
 
     @cached_property
@@ -255,29 +273,29 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        present: list[Topic] = []
+        file_topics: list[Topic] = []
         for file in self._files:
             try:
-                present += file.topics()
+                file_topics += file.topics()
             except LogError as error:
                 self._faults.add(f"{self.name}: {error}")
-        declared = self._metadata
-        named = topics_by_name(present, self._distribution)
-        if declared is None:
-            return named
-        missing = declared.counts.keys() - {topic.name for topic in present}
-        absent = [
+        metadata = self._metadata
+        topics = topics_by_name(file_topics, self._distribution)
+        if metadata is None:
+            return topics
+        missing_names = metadata.counts.keys() - {topic.name for topic in file_topics}
+        missing_topics = [
             Topic(
                 name,
-                declared.types[name],
+                metadata.types[name],
                 "cdr",
-                declared.counts[name],
+                metadata.counts[name],
                 unreadable=f"topic {name!r} is in none of the bag's files",
             )
-            for name in missing
+            for name in missing_names
         ]
-        counted_topics = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
-        return tuple(sorted([*counted_topics, *absent], key=lambda topic: topic.name))
+        counted_topics = [replace(topic, count=metadata.counts.get(topic.name, 0)) for topic in topics]
+        return tuple(sorted([*counted_topics, *missing_topics], key=lambda topic: topic.name))
 
     @property
     def start_ns(self) -> int | None:
@@ -291,40 +309,40 @@ class BagFolder(MessageReader):
     def topics(self) -> tuple[Topic, ...]:
         return self._topics
 
-    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        def read(number: int, file: _File) -> Columns:
+    def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
+        def read(file_number: int, file: _File) -> Columns:
             # bits of a place: file from 48 on, chunk from 28 on, then the row
-            for columns_of_file in file.iter_columns(topics, first, last, as_recorded=as_recorded):
-                place, first_channel = np.int64(number) << 48, self._first_channels[number]
-                channel = first_channel + columns_of_file.channel
+            for columns_of_file in file.iter_columns(topics, first_ns, end_ns, as_recorded=as_recorded):
+                file_place, first_channel = np.int64(file_number) << 48, self._first_channels[file_number]
+                channel_numbers = first_channel + columns_of_file.channel
                 yield replace(
                     columns_of_file,
                     channels=self._channels,
-                    channel=channel,
-                    place=place + columns_of_file.place,
+                    channel=channel_numbers,
+                    place=file_place + columns_of_file.place,
                 )
 
-        reads = [partial(read, number, file) for number, file in enumerate(self._files)]
+        reads = [partial(read, file_number, file) for file_number, file in enumerate(self._files)]
         if as_recorded or len(reads) == 1:
-            columns: Columns = (columns_of_file for open_file in reads for columns_of_file in open_file())
+            merged: Columns = (columns_of_file for open_file in reads for columns_of_file in open_file())
         else:
-            pairs = zip(self._files, reads, strict=True)
-            columns = merge_files((file.start_ns or 0, open_file) for file, open_file in pairs)
+            file_reads = zip(self._files, reads, strict=True)
+            merged = merge_files((file.start_ns or 0, open_file) for file, open_file in file_reads)
         if self._metadata and self._metadata.compression == "message":
-            return self._unpack_all(columns)
-        return columns
+            return self._unpack_all(merged)
+        return merged
 
     def _unpack_all(self, columns: Columns) -> Columns:
         """Decompress messages; remark once on each topic with plain messages."""
-        plain = set[str]()
-        for packed in columns:
+        plain_topics = set[str]()
+        for packed_messages in columns:
             # in batches of bounded size after decompression
-            begin = size = 0
-            for number, payload in enumerate(packed.payloads, 1):
-                size += unpacked_size(payload)
-                if size >= _MOST_UNPACKED or number == len(packed):
-                    yield self._unpack(select(packed, slice(begin, number)), plain)
-                    begin, size = number, 0
+            begin = unpacked_bytes = 0
+            for end, payload in enumerate(packed_messages.payloads, 1):
+                unpacked_bytes += unpacked_size(payload)
+                if unpacked_bytes >= _MOST_UNPACKED or end == len(packed_messages):
+                    yield self._unpack(select(packed_messages, slice(begin, end)), plain_topics)
+                    begin, unpacked_bytes = end, 0
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
@@ -360,8 +378,8 @@ class BagFolder(MessageReader):
         """Open a file by its content; return None and report a fault if it is unreadable."""
         try:
             with path.open("rb") as stream:
-                head = stream.read(len(SQLITE_MAGIC))
-            if head.startswith(ZSTD_MAGIC):
+                first_bytes = stream.read(len(SQLITE_MAGIC))
+            if first_bytes.startswith(ZSTD_MAGIC):
                 unpacked_file, damage = unpack_file(path, self._unpacked_files)
                 if damage:
                     self._faults.add(f"{self.name}: {damage}")
@@ -371,41 +389,41 @@ class BagFolder(MessageReader):
         except LogError as error:
             self._faults.add(f"{self.name}: {error}; what it holds is lost")
             return None
-        if head == SQLITE_MAGIC:
+        if first_bytes == SQLITE_MAGIC:
             return SqliteBag(path)
-        if head.startswith(MAGIC):
+        if first_bytes.startswith(MAGIC):
             return McapLog(path)
         self._faults.add(f"{self.name}: {path.name!r} is neither SQLite nor MCAP; what it holds is lost")
         return None
 
-    def _unpack(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
+    def _unpack(self, packed: MessageColumns, plain_topics: set[str]) -> MessageColumns:
         payloads: list[bytes] = []
-        places: list[int] = []
-        lost: dict[str, list[Sentence]] = {}
-        for place, (topic, payload) in enumerate(zip(packed.topics, packed.payloads, strict=True)):
-            when = Instant(int(packed.log_time_ns[place]), 0)
+        indices: list[int] = []
+        faults: dict[str, list[Sentence]] = {}
+        for index, (topic, payload) in enumerate(zip(packed.topics, packed.payloads, strict=True)):
+            instant = Instant(int(packed.log_time_ns[index]), 0)
             try:
                 if not payload.startswith(_CDR_BEGIN):
                     payloads.append(decompress_message(payload))
                 else:
                     payloads.append(payload)
-                    if topic not in plain:
-                        plain.add(topic)
+                    if topic not in plain_topics:
+                        plain_topics.add(topic)
                         self._remarks.add(
                             Sentence(
                                 f"{self.name}: messages on {topic!r} are plain, the first at ",
-                                Sentence(when, f", although {BAG_METADATA} declares them as compressed"),
+                                Sentence(instant, f", although {BAG_METADATA} declares them as compressed"),
                                 "; they are read as they are",
                             )
                         )
-                places.append(place)
+                indices.append(index)
             except LogError as error:
-                lost.setdefault(topic, []).append(Sentence(f"on {topic!r} at ", when, f": {error}"))
-        for first, *others in lost.values():
+                faults.setdefault(topic, []).append(Sentence(f"on {topic!r} at ", instant, f": {error}"))
+        for first_fault, *other_faults in faults.values():
             latest = Instant(int(packed.log_time_ns[-1]), 0)
-            more = Sentence(f"; so are {len(others)} more up to ", latest) if others else ""
-            self._faults.add(Sentence(f"{self.name}: ", first, ", and is lost", more))
-        return replace(select(packed, np.array(places, np.int64)), payloads=payloads)
+            more = Sentence(f"; so are {len(other_faults)} more up to ", latest) if other_faults else ""
+            self._faults.add(Sentence(f"{self.name}: ", first_fault, ", and is lost", more))
+        return replace(select(packed, np.array(indices, np.int64)), payloads=payloads)
 
 
 def _rank(name: str) -> tuple[str | int, ...]:
@@ -423,8 +441,8 @@ def is_log(path: LogFile) -> bool:
     Raises:
         MissingFileError: there is no such file, or it cannot be opened.
     """
-    head = _head(path)
-    return head is None or any(head.startswith(magic) for magic in READERS)
+    first_bytes = _head(path)
+    return first_bytes is None or any(first_bytes.startswith(magic) for magic in READERS)
 
 
 def open_messages(path: LogFile) -> MessageReader:
@@ -434,11 +452,11 @@ def open_messages(path: LogFile) -> MessageReader:
         MissingFileError: there is no such file, or it cannot be opened.
         LogError: the file or folder is not a log of messages.
     """
-    head = _head(path)
-    if head is None and isinstance(path, Path):
+    first_bytes = _head(path)
+    if first_bytes is None and isinstance(path, Path):
         return BagFolder(path)
     for magic, reader in READERS.items():
-        if head is not None and head.startswith(magic):
+        if first_bytes is not None and first_bytes.startswith(magic):
             return reader(path)
     raise LogError(f"{path.name} is neither a ROS bag nor an MCAP log")
 

@@ -66,10 +66,10 @@ class MessageColumns(Messages):
 
     def sort_by_time(self) -> MessageColumns:
         """Sort the messages by log time, topic and sequence; equal ones stay in their order."""
-        times = self.log_time_ns
-        if (times[1:] > times[:-1]).all():
+        times_ns = self.log_time_ns
+        if (times_ns[1:] > times_ns[:-1]).all():
             return self
-        return select(self, np.lexsort((self.sequence, self.topic_ranks, times)))
+        return select(self, np.lexsort((self.sequence, self.topic_ranks, times_ns)))
 
     def count_before(self, time_ns: int) -> int:
         """Count the messages before a time; the messages must be sorted by time."""
@@ -119,19 +119,19 @@ def in_order(
         LogError: the messages in memory exceed `most_bytes`.
     """
     waiting = MessageColumns()
-    held = 0
-    for number, chunk in enumerate(chunks, 1):
-        held += sum(map(len, chunk.payloads))
-        if held > most_bytes:
+    held_bytes = 0
+    for chunk_count, chunk in enumerate(chunks, 1):
+        held_bytes += sum(map(len, chunk.payloads))
+        if held_bytes > most_bytes:
             raise too_many_waiting(name, most_bytes)
         waiting = concatenate_tables([waiting, chunk] if len(waiting) else [chunk]).sort_by_time()
-        if number == len(starts_ns):
+        if chunk_count == len(starts_ns):
             break
-        ready = waiting.count_before(starts_ns[number])
-        if ready:
-            yield select(waiting, slice(ready))
-            waiting = select(waiting, slice(ready, None))
-            held = sum(map(len, waiting.payloads))
+        ready_count = waiting.count_before(starts_ns[chunk_count])
+        if ready_count:
+            yield select(waiting, slice(ready_count))
+            waiting = select(waiting, slice(ready_count, None))
+            held_bytes = sum(map(len, waiting.payloads))
     if len(waiting):
         yield waiting
 
@@ -146,31 +146,31 @@ def merge_files(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
     Args:
         files: for each file, the time of its first message, and a function that opens it.
     """
-    waiting = sorted(files, key=itemgetter(0), reverse=True)
+    unopened_files = sorted(files, key=itemgetter(0), reverse=True)
     active: _Active = []
-    opened = 0
-    while waiting or active:
-        while waiting and (not active or waiting[-1][0] <= active[0][0]):
-            _push_next(active, opened, waiting.pop()[1]())
-            opened += 1
+    opened_count = 0
+    while unopened_files or active:
+        while unopened_files and (not active or unopened_files[-1][0] <= active[0][0]):
+            _push_next(active, opened_count, unopened_files.pop()[1]())
+            opened_count += 1
         if not active:
             continue
-        _, number, columns, following = heapq.heappop(active)
-        limits = [start_ns for start_ns, _ in waiting[-1:]] + [entry[0] for entry in active[:1]]
+        _, file_number, columns, later_columns = heapq.heappop(active)
+        limits_ns = [start_ns for start_ns, _ in unopened_files[-1:]] + [entry[0] for entry in active[:1]]
         # messages of equal times are yielded in the order of the files
-        ready = columns.count_before(min(limits) + 1) if limits else len(columns)
-        yield select(columns, slice(ready))
-        if ready < len(columns):
-            rest = select(columns, slice(ready, None))
-            heapq.heappush(active, (int(rest.log_time_ns[0]), number, rest, following))
+        ready_count = columns.count_before(min(limits_ns) + 1) if limits_ns else len(columns)
+        yield select(columns, slice(ready_count))
+        if ready_count < len(columns):
+            remaining = select(columns, slice(ready_count, None))
+            heapq.heappush(active, (int(remaining.log_time_ns[0]), file_number, remaining, later_columns))
         else:
-            _push_next(active, number, following)
+            _push_next(active, file_number, later_columns)
 
 
-def _push_next(active: _Active, number: int, following: Columns) -> None:
-    for columns in following:
+def _push_next(active: _Active, file_number: int, later_columns: Columns) -> None:
+    for columns in later_columns:
         if len(columns):
-            heapq.heappush(active, (int(columns.log_time_ns[0]), number, columns, following))
+            heapq.heappush(active, (int(columns.log_time_ns[0]), file_number, columns, later_columns))
             return
 
 
@@ -197,31 +197,32 @@ def without_jumps(
     """
     first_ns: int | None = None
     # logs that were merged topic by topic are in order too, so each topic is checked separately
-    topics = dict[str, _Recorded]()
+    history_by_topic = dict[str, _PlaceHistory]()
     for message_columns in columns:
         if first_ns is None and len(message_columns):
             first_ns = int(message_columns.log_time_ns[0])
         for topic, rows in message_columns.by_topic():
             if topic not in checked:
                 continue
-            recorded = topics.setdefault(topic, _Recorded(disorder_ns))
-            jump = recorded.first_jump(message_columns.log_time_ns[rows], message_columns.place[rows])
-            if jump is not None:
-                at = Instant(int(message_columns.log_time_ns[rows][jump]), first_ns or 0)
+            history = history_by_topic.setdefault(topic, _PlaceHistory(disorder_ns))
+            jump_index = history.first_jump(message_columns.log_time_ns[rows], message_columns.place[rows])
+            if jump_index is not None:
+                jump_instant = Instant(int(message_columns.log_time_ns[rows][jump_index]), first_ns or 0)
                 raise LogError(
-                    f"{name}: time jumps back: the message on {topic!r} logged at {at} was recorded before"
-                    f" others that were logged more than {disorder_ns / 1e9:g} s earlier; {JUMP_REMEDY}"
+                    f"{name}: time jumps back: the message on {topic!r} logged at {jump_instant} was recorded"
+                    f" before others that were logged more than {disorder_ns / 1e9:g} s earlier;"
+                    f" {JUMP_REMEDY}"
                 )
         yield message_columns
 
 
-class _Recorded:
+class _PlaceHistory:
     """Stores the greatest place of recording up to each message of the last `disorder_ns`."""
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
         self._latest: deque[tuple[Integers, Integers]] = deque()
-        self._before = self._furthest = -1
+        self._place_before = self._furthest_place = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
         """Return the first message recorded before a message that is earlier by more than the disorder.
@@ -233,16 +234,18 @@ class _Recorded:
         Returns:
             the index of the message; None if there is none.
         """
-        furthest = np.maximum.accumulate(np.append(self._furthest, places))[1:]
-        self._latest.append((times_ns, furthest))
-        self._furthest, jumps = int(furthest[-1]), np.zeros(0, np.int64)
-        if (places < furthest).any():
-            times, reached = map(np.concatenate, zip(*self._latest, strict=True))
-            earlier = np.searchsorted(times, times_ns - self._disorder_ns)
-            jumps = np.flatnonzero(places < np.append(self._before, reached)[earlier])
+        furthest_places = np.maximum.accumulate(np.append(self._furthest_place, places))[1:]
+        self._latest.append((times_ns, furthest_places))
+        self._furthest_place, jump_indices = int(furthest_places[-1]), np.zeros(0, np.int64)
+        if (places < furthest_places).any():
+            recent_ns, recent_places = map(np.concatenate, zip(*self._latest, strict=True))
+            earlier_indices = np.searchsorted(recent_ns, times_ns - self._disorder_ns)
+            jump_indices = np.flatnonzero(
+                places < np.append(self._place_before, recent_places)[earlier_indices]
+            )
         while self._latest[0][0][-1] < times_ns[-1] - self._disorder_ns:
-            self._before = int(self._latest.popleft()[1][-1])
-        return int(jumps[0]) if len(jumps) else None
+            self._place_before = int(self._latest.popleft()[1][-1])
+        return int(jump_indices[0]) if len(jump_indices) else None
 
 
 class MessageReader(ABC):
@@ -258,7 +261,7 @@ class MessageReader(ABC):
         # readers that open `_path` get local files only; for a remote file, it is a name
         self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults, self._remarks = FaultList(), FaultList()
-        self._parts: Sequence[MessageReader] = ()
+        self._part_readers: Sequence[MessageReader] = ()
 
     @property
     @abstractmethod
@@ -387,9 +390,9 @@ class MessageReader(ABC):
         Args:
             as_recorded: whether to yield them in the order of recording, which may jump back in time.
         """
-        first, last = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
-        columns = self._read(topics, first, last, as_recorded=as_recorded)
-        yield from self._count(columns, topics) if (first, last) == (0, LATEST_NS + 1) else columns
+        first_ns, last_ns = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
+        columns = self._read(topics, first_ns, last_ns, as_recorded=as_recorded)
+        yield from self._count(columns, topics) if (first_ns, last_ns) == (0, LATEST_NS + 1) else columns
 
     def take_faults(self) -> tuple[str, ...]:
         """Return the losses on the read topics since the last call, each with its place."""
@@ -403,22 +406,22 @@ class MessageReader(ABC):
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return the remarks since the last call: irregularities without a loss on the read topics."""
-        of_parts = (remark for part in self._parts for remark in part.take_remarks())
-        return (*self._remarks.take(), *of_parts)
+        part_remarks = (remark for part in self._part_readers for remark in part.take_remarks())
+        return (*self._remarks.take(), *part_remarks)
 
     def _gather_parts(self) -> None:
         """Collect the faults of the opened files of the log."""
-        for part in self._parts:
+        for part in self._part_readers:
             part.move_faults(self._faults)
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         """Yield all messages of some topics, then compare their numbers with the declared ones."""
-        read = Counter[str]()
+        read_counts = Counter[str]()
         for message_columns in columns:
-            read.update(message_columns.topics)
+            read_counts.update(message_columns.topics)
             yield message_columns
         for topic in self._topics:
-            count = read[topic.name]
-            if topic.name in topics and topic.count not in (None, count):
-                declared = f"it declares {topic.count} messages on {topic.name!r}"
-                self._faults.add(f"{name or self.name}: {declared}; {count} could be read")
+            read_count = read_counts[topic.name]
+            if topic.name in topics and topic.count not in (None, read_count):
+                declaration = f"it declares {topic.count} messages on {topic.name!r}"
+                self._faults.add(f"{name or self.name}: {declaration}; {read_count} could be read")

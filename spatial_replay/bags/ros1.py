@@ -102,8 +102,8 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
     Raises:
         DamageError: the records do not decompress to `size` bytes.
     """
-    most = max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data))
-    if size > LARGEST_CHUNK or (compression != b"none" and size > most):
+    most_bytes = max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data))
+    if size > LARGEST_CHUNK or (compression != b"none" and size > most_bytes):
         raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
         match compression:
@@ -127,18 +127,18 @@ def record_table(content: bytes) -> tuple[RecordTable, bool]:
     """Return the records in a chunk's content, and whether the last record breaks off."""
     view = np.frombuffer(content, np.uint8)
     # a table without room, to count the records first
-    count, _ = _walk(view, np.empty((6, 0), np.int64))
-    table = np.empty((6, count), np.int64)
-    _, end = _walk(view, table)
-    return RecordTable(*table), end < len(content)
+    record_count, _ = _walk(view, np.empty((6, 0), np.int64))
+    table = np.empty((6, record_count), np.int64)
+    _, end_offset = _walk(view, table)
+    return RecordTable(*table), end_offset < len(content)
 
 
 @piece
 def _u32(content: NDArray[np.uint8], at: int) -> int:
     """Return a little-endian word."""
     word = 0
-    for k in range(4):
-        word += int(content[at + k]) << (8 * k)
+    for byte_index in range(4):
+        word += int(content[at + byte_index]) << (8 * byte_index)
     return word
 
 
@@ -146,21 +146,21 @@ def _u32(content: NDArray[np.uint8], at: int) -> int:
 def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, int]:
     """Return opcode, connection and time in the fields of a head; a missing field is -1."""
     opcode = connection = time_ns = -1
-    at = head
-    while at + 4 <= data:
-        length = _u32(content, at)
-        at += 4
-        if at + length > data:
+    position = head
+    while position + 4 <= data:
+        length = _u32(content, position)
+        position += 4
+        if position + length > data:
             break
-        first, second = content[at], content[at + 1]
-        if length == 4 and first == _O and second == _P:
-            opcode = int(content[at + 3])
-        elif length == 9 and first == _C and second == _O:
-            connection = _u32(content, at + 5)
-        elif length == 13 and first == _T and second == _I:
-            time_ns = _u32(content, at + 5) * _SECOND_NS + _u32(content, at + 9)
-        at += length
-    return (opcode if at == data else -1), connection, time_ns
+        first_letter, second_letter = content[position], content[position + 1]
+        if length == 4 and first_letter == _O and second_letter == _P:
+            opcode = int(content[position + 3])
+        elif length == 9 and first_letter == _C and second_letter == _O:
+            connection = _u32(content, position + 5)
+        elif length == 13 and first_letter == _T and second_letter == _I:
+            time_ns = _u32(content, position + 5) * _SECOND_NS + _u32(content, position + 9)
+        position += length
+    return (opcode if position == data else -1), connection, time_ns
 
 
 @kernel
@@ -257,21 +257,21 @@ class _Record:
     """A record in the file: the fields of its head, and the place of its data.
 
     Attributes:
-        missing: number of bytes that are missing in an uncompressed chunk at the end of a truncated file.
+        missing_bytes: number of missing bytes in an uncompressed chunk at the end of a truncated file.
     """
 
     fields: dict[str, bytes]
-    data: int
+    data_offset: int
     length: int
-    missing: int = 0
+    missing_bytes: int = 0
 
     @property
     def opcode(self) -> int:
         return number(self.fields, "op", 1)
 
     @property
-    def following(self) -> int:
-        return self.data + self.length
+    def next_offset(self) -> int:
+        return self.data_offset + self.length
 
 
 def read_chunk(stream: BinaryIO, offset: int) -> bytes:
@@ -298,11 +298,11 @@ def connections_in(content: bytes, table: RecordTable) -> Iterator[Connection]:
 
 
 def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
-    head = _record(stream, len(BAG_MAGIC), size)
-    if head.opcode != BAG_HEADER:
+    header = _record(stream, len(BAG_MAGIC), size)
+    if header.opcode != BAG_HEADER:
         raise DamageError("the bag's header is damaged")
-    position = number(head.fields, "index_pos", 8)
-    if not head.following <= position <= size:
+    position = number(header.fields, "index_pos", 8)
+    if not header.next_offset <= position <= size:
         raise DamageError("the bag has no index; its writer was interrupted or the file is cut")
     directory = BagDirectory(is_indexed=True)
     while position < size:
@@ -314,9 +314,9 @@ def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
             directory.chunks.append(_chunk_info(record.fields, _data(stream, record)))
         else:
             raise DamageError(f"the index has an unexpected record (op {record.opcode})")
-        position = record.following
-    declared = number(head.fields, "conn_count"), number(head.fields, "chunk_count")
-    if declared != (len(directory.connections), len(directory.chunks)):
+        position = record.next_offset
+    declared_counts = number(header.fields, "conn_count"), number(header.fields, "chunk_count")
+    if declared_counts != (len(directory.connections), len(directory.chunks)):
         raise DamageError("the index does not hold as many connections and chunks as the bag's header says")
     unknown = {connection for chunk in directory.chunks for connection in chunk.counts or {}} - set(
         directory.connections
@@ -330,7 +330,7 @@ def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
 def _chunk_info(fields: dict[str, bytes], data: bytes) -> BagChunk:
     if number(fields, "ver") != 1 or number(fields, "count") * 8 != len(data):
         raise DamageError("the index describes a chunk in an unknown version")
-    words = [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)]
+    words = [int.from_bytes(data[offset : offset + 4], "little") for offset in range(0, len(data), 4)]
     return BagChunk(
         number(fields, "chunk_pos", 8),
         time_from(number(fields, "start_time", 8)),
@@ -353,10 +353,10 @@ def _record(stream: BinaryIO, position: int, size: int) -> _Record:
         raise DamageError("a record's head is inconsistent")
     fields = fields_of(stream.read(head_length))
     length = _word(stream)
-    data = stream.tell()
-    missing = max(0, data + length - size)
-    record = _Record(fields, data, length - missing, missing)
-    if missing and not (
+    data_offset = stream.tell()
+    missing_bytes = max(0, data_offset + length - size)
+    record = _Record(fields, data_offset, length - missing_bytes, missing_bytes)
+    if missing_bytes and not (
         record.opcode == CHUNK and fields.get("compression") == b"none" and number(fields, "size") == length
     ):
         raise DamageError("the file breaks off in a record")
@@ -373,15 +373,15 @@ def _word(stream: BinaryIO) -> int:
 def _data(stream: BinaryIO, record: _Record) -> bytes:
     if record.length > LARGEST_CHUNK:
         raise DamageError(f"a record claims to hold {record.length} bytes")
-    stream.seek(record.data)
+    stream.seek(record.data_offset)
     return stream.read(record.length)
 
 
 def _content(stream: BinaryIO, record: _Record) -> bytes:
     compression = record.fields.get("compression", b"")
-    size = number(record.fields, "size") - record.missing
+    size = number(record.fields, "size") - record.missing_bytes
     content = decompress_chunk(compression, _data(stream, record), size)
-    if record.missing:
+    if record.missing_bytes:
         # the scan of the file reports the loss
         table, _ = record_table(content)
         content = content[: int(table.end.max(initial=0))]
@@ -397,27 +397,27 @@ class _Scan:
         self._faults = faults
         self._name = name
         self._directory = BagDirectory()
-        self._marks = 0
+        self._mark_count = 0
 
     def directory(self) -> BagDirectory:
         position = len(BAG_MAGIC)
-        gaps = 0
+        gap_count = 0
         while position < self._size:
             try:
-                position = self._take_in(position)
+                position = self._read_record(position)
             except DamageError as damage:
-                gaps += 1
-                following = self._next_chunk(position + 1) if gaps < _MOST_GAPS else None
-                self._lose(position, damage, (following or self._size) - position)
-                if following is None:
+                gap_count += 1
+                next_offset = self._next_chunk(position + 1) if gap_count < _MOST_GAPS else None
+                self._lose(position, damage, (next_offset or self._size) - position)
+                if next_offset is None:
                     break
-                position = following
+                position = next_offset
         return self._directory
 
-    def _lose(self, position: int, damage: DamageError | str, lost: int) -> None:
-        self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
+    def _lose(self, position: int, damage: DamageError | str, lost_bytes: int) -> None:
+        self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost_bytes} bytes cannot be read")
 
-    def _take_in(self, position: int) -> int:
+    def _read_record(self, position: int) -> int:
         """Read the record at a position; return the position of the next record."""
         record = _record(self._stream, position, self._size)
         if record.opcode == CHUNK:
@@ -427,39 +427,43 @@ class _Scan:
             self._directory.connections.setdefault(connection.number, connection)
         elif record.opcode not in (BAG_HEADER, INDEX, CHUNK_INFO):
             raise DamageError(f"there is no known record (op {record.opcode})")
-        return record.following
+        return record.next_offset
 
     def _chunk(self, position: int, record: _Record) -> None:
         content = _content(self._stream, record)
         table, _ = record_table(content)
         for connection in connections_in(content, table):
             self._directory.connections.setdefault(connection.number, connection)
-        if record.missing:
+        if record.missing_bytes:
             self._lose(
-                position, "the file breaks off in a chunk", record.missing + record.length - len(content)
+                position,
+                "the file breaks off in a chunk",
+                record.missing_bytes + record.length - len(content),
             )
         is_message = table.opcode == MESSAGE
         if is_message.any():
-            times = table.time_ns[is_message]
+            times_ns = table.time_ns[is_message]
             counts = Counter(table.connection[is_message].tolist())
-            self._directory.chunks.append(BagChunk(position, int(times.min()), int(times.max()), counts))
+            self._directory.chunks.append(
+                BagChunk(position, int(times_ns.min()), int(times_ns.max()), counts)
+            )
 
     def _next_chunk(self, position: int) -> int | None:
         """Return the offset of the next chunk with a consistent head, from a position on."""
-        overlap = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
+        overlap_bytes = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
         while position < self._size:
             self._stream.seek(position)
-            window = self._stream.read(_STRIDE + overlap)
-            mark = window.find(_CHUNK_MARK)
-            while mark >= 0:
-                self._marks += 1
-                if self._marks > _MOST_MARKS:
+            window = self._stream.read(_STRIDE + overlap_bytes)
+            mark_offset = window.find(_CHUNK_MARK)
+            while mark_offset >= 0:
+                self._mark_count += 1
+                if self._mark_count > _MOST_MARKS:
                     return None
-                for begin in (mark - before for before in reversed(_BEFORE_MARK)):
+                for begin in (mark_offset - before for before in reversed(_BEFORE_MARK)):
                     length = int.from_bytes(window[max(0, begin) : max(0, begin) + 4], "little")
                     if begin >= 0 and length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
                         return position + begin
-                mark = window.find(_CHUNK_MARK, mark + 1)
+                mark_offset = window.find(_CHUNK_MARK, mark_offset + 1)
             position += _STRIDE
         return None
 
@@ -501,15 +505,15 @@ class Ros1Bag(MessageReader):
         """Log time of the first message."""
         return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
 
-    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+    def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
         connections = {
             number: self._directory.connections[number] for number in self._channel_numbers(topics)
         }
         chunks = [
             (rank, chunk)
             for rank, chunk in enumerate(self._directory.chunks)
-            if chunk.start_ns < last
-            and chunk.end_ns >= first
+            if chunk.start_ns < end_ns
+            and chunk.end_ns >= first_ns
             and (chunk.counts is None or not connections.keys().isdisjoint(chunk.counts))
         ]
         if not as_recorded:
@@ -517,12 +521,12 @@ class Ros1Bag(MessageReader):
             if self._is_in_parts:
                 chunks = [(rank, chunk) for rank, (_, chunk) in enumerate(chunks)]
         with self._path.open("rb") as stream:
-            contents = (self._messages(stream, *ranked, connections, first, last) for ranked in chunks)
+            contents = (self._messages(stream, *ranked, connections, first_ns, end_ns) for ranked in chunks)
             if as_recorded:
                 yield from contents
                 return
-            most = most_waiting([self._path.stat().st_size])
-            yield from in_order([chunk.start_ns for _, chunk in chunks], contents, self.name, most)
+            most_bytes = most_waiting([self._path.stat().st_size])
+            yield from in_order([chunk.start_ns for _, chunk in chunks], contents, self.name, most_bytes)
 
     @cached_property
     def _is_in_parts(self) -> bool:
@@ -530,8 +534,8 @@ class Ros1Bag(MessageReader):
 
         Bags are played by their index. Tools that merge or repair bags write chunks in any order.
         """
-        ordered = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
-        return all(before.end_ns <= after.start_ns for before, after in pairwise(ordered))
+        sorted_chunks = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
+        return all(before.end_ns <= after.start_ns for before, after in pairwise(sorted_chunks))
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
@@ -543,9 +547,9 @@ class Ros1Bag(MessageReader):
         stream: BinaryIO,
         rank: int,
         chunk: BagChunk,
-        wanted: dict[int, Connection],
-        first: int,
-        last: int,
+        connections: dict[int, Connection],
+        first_ns: int,
+        end_ns: int,
     ) -> MessageColumns:
         """Read the messages of a chunk; report losses."""
         span = Sentence("messages between ", Instant(chunk.start_ns, 0), " and ", Instant(chunk.end_ns, 0))
@@ -559,36 +563,36 @@ class Ros1Bag(MessageReader):
             self._fault(chunk, Sentence("a record breaks off; some of the ", span, " are lost"))
         try:
             for connection in connections_in(content, table):
-                if wanted.get(connection.number, connection) != connection:
+                if connections.get(connection.number, connection) != connection:
                     self._fault(chunk, f"connection {connection.number} is described in two ways")
         except DamageError as damage:
             self._fault(chunk, f"{damage}; a connection is described there")
         is_message = table.opcode == MESSAGE
         if (chunk.start_ns, chunk.end_ns) != _span(table.time_ns[is_message]):
             self._fault(chunk, Sentence("the ", span, " have other times than the index says"))
-        rows = is_message & np.isin(table.connection, list(wanted))
-        rows &= (table.time_ns >= first) & (table.time_ns < last)
-        bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
-        payloads = [content[begin:end] for begin, end in bounds]
-        numbers = table.connection[rows].tolist()
+        is_wanted = is_message & np.isin(table.connection, list(connections))
+        is_wanted &= (table.time_ns >= first_ns) & (table.time_ns < end_ns)
+        payload_bounds = zip(table.begin[is_wanted].tolist(), table.end[is_wanted].tolist(), strict=True)
+        payloads = [content[begin:end] for begin, end in payload_bounds]
+        connection_numbers = table.connection[is_wanted].tolist()
         # a header begins with the sequence number of its publisher; several publishers have no common order
-        publishers = Counter(connection.topic for connection in wanted.values())
-        headed = {
+        publisher_counts = Counter(connection.topic for connection in connections.values())
+        headed_numbers = {
             number
-            for number, connection in wanted.items()
-            if publishers[connection.topic] == 1 and connection.begins_with_header
+            for number, connection in connections.items()
+            if publisher_counts[connection.topic] == 1 and connection.begins_with_header
         }
-        sequence = [
-            int.from_bytes(payload[:4], "little") if number in headed else 0
-            for number, payload in zip(numbers, payloads, strict=True)
+        sequence_numbers = [
+            int.from_bytes(payload[:4], "little") if number in headed_numbers else 0
+            for number, payload in zip(connection_numbers, payloads, strict=True)
         ]
-        times_ns = table.time_ns[rows]
+        times_ns = table.time_ns[is_wanted]
         return self._make_columns(
-            table.connection[rows],
+            table.connection[is_wanted],
             (times_ns, times_ns),
-            np.array(sequence, np.int64),
+            np.array(sequence_numbers, np.int64),
             payloads,
-            places_in(rank, np.flatnonzero(rows)),
+            places_in(rank, np.flatnonzero(is_wanted)),
         )
 
     def _topic(self, connection: Connection, count: int) -> Topic:

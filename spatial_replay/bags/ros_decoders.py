@@ -84,9 +84,9 @@ def ros_definitions(
             for index, definition in enumerate(definitions)
             if definition not in definitions[:index]
         )
-    from_schema = _parse(type_name, schema)
+    log_definitions = _parse(type_name, schema)
     standard = next(iter(_standards(encoding, distribution)))
-    return (check_definitions({**standard, **from_schema}, type_name, empty_bytes=empty_bytes),)
+    return (check_definitions({**standard, **log_definitions}, type_name, empty_bytes=empty_bytes),)
 
 
 @lru_cache(64)
@@ -193,16 +193,16 @@ def _from_idl(text: str, type_name: str) -> Definitions:
         raise
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be read: {failure_text(error)}") from None
-    enums = {*_IDL_ENUM.findall(_IDL_ASIDE.sub(" ", text))}
+    enum_names = {*_IDL_ENUM.findall(_IDL_ASIDE.sub(" ", text))}
     return {
-        name: tuple(_without_enum(field, fields_by_type, enums) for field in fields)
+        name: tuple(_without_enum(field, fields_by_type, enum_names) for field in fields)
         for name, fields in fields_by_type.items()
     }
 
 
-def _without_enum(field: Field, definitions: Definitions, enums: Collection[str]) -> Field:
+def _without_enum(field: Field, definitions: Definitions, enum_names: Collection[str]) -> Field:
     """Return a field with its enum replaced by uint32, the integer that CDR writes for an enum."""
-    is_enum = field.type not in definitions and field.type.rpartition("/")[2] in enums
+    is_enum = field.type not in definitions and field.type.rpartition("/")[2] in enum_names
     return replace(field, type="uint32") if is_enum else field
 
 
@@ -211,20 +211,20 @@ def _check_idl(text: str, type_name: str) -> None:
 
     The time of its parser grows fast with the depth of parentheses, and by milliseconds per annotation.
     """
-    bare = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
-    what = None
+    bare_text = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
+    fault = None
     if len(text) > _LONGEST_IDL:
-        what = f"has {len(text)} characters; at most {_LONGEST_IDL} are read"
-    elif "<<" in bare:
-        what = "shifts numbers; shifts are not read"
-    elif bare.count("(") > len(_IDL_ANNOTATION.findall(bare)):
-        what = "has parentheses outside annotations, or nested ones; they are not read"
-    elif _IDL_NESTED_TYPE.search(bare):
-        what = "nests types deeply; such types are not read"
-    elif bare.count("@") > _MOST_ANNOTATIONS:
-        what = f"has {bare.count('@')} annotations; at most {_MOST_ANNOTATIONS} are read"
-    if what is not None:
-        raise LogError(f"the definition of {type_name!r} {what}")
+        fault = f"has {len(text)} characters; at most {_LONGEST_IDL} are read"
+    elif "<<" in bare_text:
+        fault = "shifts numbers; shifts are not read"
+    elif bare_text.count("(") > len(_IDL_ANNOTATION.findall(bare_text)):
+        fault = "has parentheses outside annotations, or nested ones; they are not read"
+    elif _IDL_NESTED_TYPE.search(bare_text):
+        fault = "nests types deeply; such types are not read"
+    elif bare_text.count("@") > _MOST_ANNOTATIONS:
+        fault = f"has {bare_text.count('@')} annotations; at most {_MOST_ANNOTATIONS} are read"
+    if fault is not None:
+        raise LogError(f"the definition of {type_name!r} {fault}")
 
 
 def _standards(encoding: RosEncoding, distribution: str | None) -> Iterator[Definitions]:
@@ -254,13 +254,13 @@ def _fields(types: Typesdict) -> dict[str, tuple[Field, ...]]:
 def _field(name: str, description: FieldDesc) -> Field:
     kind = _KINDS.get(int(description[0]))
     # the type hints of rosbags do not describe its nested tuples
-    base: Any = description
+    base_description: Any = description
     size = 0
     if kind:
-        base, size = base[1]
-    type_text = base[1]
-    type_name, longest = (type_text, 0) if isinstance(type_text, str) else type_text
-    return Field(name, type_name, kind or "scalar", size, longest)
+        base_description, size = base_description[1]
+    type_text = base_description[1]
+    type_name, longest_text = (type_text, 0) if isinstance(type_text, str) else type_text
+    return Field(name, type_name, kind or "scalar", size, longest_text)
 
 
 def _describe(definitions: Definitions, store: Typestore) -> Typesdict:
@@ -275,14 +275,14 @@ def _describe(definitions: Definitions, store: Typestore) -> Typesdict:
 def _description(field: Field) -> FieldDesc:
     from rosbags.interfaces import Nodetype
 
-    base: BaseDesc | NameDesc
+    base_description: BaseDesc | NameDesc
     if field.type in BASE_BYTES:
-        base = (Nodetype.BASE, (field.type, field.longest))  # type: ignore[assignment]
+        base_description = (Nodetype.BASE, (field.type, field.longest))  # type: ignore[assignment]
     else:
-        base = (Nodetype.NAME, field.type)
+        base_description = (Nodetype.NAME, field.type)
     if field.kind == "scalar":
-        return base
-    return (Nodetype.ARRAY if field.kind == "array" else Nodetype.SEQUENCE, (base, field.size))
+        return base_description
+    return (Nodetype.ARRAY if field.kind == "array" else Nodetype.SEQUENCE, (base_description, field.size))
 
 
 def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | None = None) -> Schema:

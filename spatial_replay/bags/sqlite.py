@@ -71,17 +71,19 @@ def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
         document = _plain(data.decode())
     except UnicodeDecodeError:
         raise LogError("it is not UTF-8") from None
-    about = document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
-    if not isinstance(about, dict):
+    information = (
+        document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
+    )
+    if not isinstance(information, dict):
         raise LogError("it does not describe a bag; it has no 'rosbag2_bagfile_information'")
-    topics = [_metadata_topic(entry) for entry in _list(about, "topics_with_message_count")]
-    files = [_text(entry, "relative_file_paths") for entry in _list(about, "relative_file_paths")]
-    distribution = about.get("ros_distro")
+    topics = [_metadata_topic(entry) for entry in _list(information, "topics_with_message_count")]
+    files = [_text(entry, "relative_file_paths") for entry in _list(information, "relative_file_paths")]
+    distribution = information.get("ros_distro")
     return BagMetadata(
         files=tuple(dict.fromkeys(_base_name(file) for file in files)),
         types={name: type_name for name, type_name, _ in topics},
         counts={name: count for name, _, count in topics},
-        compression=_compression(about),
+        compression=_compression(information),
         distribution=distribution if isinstance(distribution, str) else None,
     )
 
@@ -119,18 +121,19 @@ def _metadata_topic(entry: object) -> tuple[str, str, int]:
 
 def _compression(topic_metadata: dict[str, object]) -> Compression:
     mode = str(topic_metadata.get("compression_mode") or "none").lower()
-    form = str(topic_metadata.get("compression_format") or "")
+    compression_format = str(topic_metadata.get("compression_format") or "")
     if mode == "none":
         return ""
-    if mode not in ("file", "message") or form != "zstd":
+    if mode not in ("file", "message") or compression_format != "zstd":
         raise LogError(
-            f"the bag is compressed by {mode!r:.40} with {form!r:.40}; zstd by file or message is read"
+            f"the bag is compressed by {mode!r:.40} with {compression_format!r:.40}; zstd by file or"
+            " message is read"
         )
     return "file" if mode == "file" else "message"
 
 
-def _list(about: dict[str, object], name: str) -> list[object]:
-    value = about.get(name)
+def _list(mapping: dict[str, object], name: str) -> list[object]:
+    value = mapping.get(name)
     if not isinstance(value, list):
         raise LogError(f"{name!r} in it is not a list")
     return value
@@ -175,9 +178,9 @@ def temporary_folder(owner: object) -> Path:
 def copy_beginning(path: Path, size: int, folder: Path) -> Path:
     """Copy the first `size` bytes of a file into a folder."""
     target = folder / path.name
-    with path.open("rb") as source, open_output(target) as sink:
-        while size > 0 and (piece := source.read(min(size, _PIECE))):
-            sink.write(piece)
+    with path.open("rb") as source_file, open_output(target) as target_file:
+        while size > 0 and (piece := source_file.read(min(size, _PIECE))):
+            target_file.write(piece)
             size -= len(piece)
     return target
 
@@ -193,41 +196,41 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
         OutputError: the folder has no room for it.
     """
     target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
-    most = packed.stat().st_size * MOST_TIMES_LARGER + ALWAYS_ALLOWED
-    free = shutil.disk_usage(folder).free
-    room = free - min(_LEFT_FREE, free // 10)
-    size = 0
+    most_bytes = packed.stat().st_size * MOST_TIMES_LARGER + ALWAYS_ALLOWED
+    free_bytes = shutil.disk_usage(folder).free
+    room_bytes = free_bytes - min(_LEFT_FREE, free_bytes // 10)
+    unpacked_bytes = 0
     damage = "breaks off"
     try:
-        with packed.open("rb") as source, open_output(target) as sink:
-            for piece, is_between in _decompress(source):
-                size += len(piece)
-                if size > most:
+        with packed.open("rb") as packed_file, open_output(target) as target_file:
+            for piece, is_between in _decompress(packed_file):
+                unpacked_bytes += len(piece)
+                if unpacked_bytes > most_bytes:
                     raise LogError(
-                        f"{packed.name} decompresses to more than {most} bytes; no recorder writes that"
+                        f"{packed.name} decompresses to more than {most_bytes} bytes; no recorder writes that"
                     )
-                if size > room:
+                if unpacked_bytes > room_bytes:
                     raise OutputError(
                         f"{packed.name} decompresses to more than fits in {folder.parent};"
                         " set TMPDIR to a folder with more room"
                     )
-                sink.write(piece)
+                target_file.write(piece)
                 damage = "" if is_between else "breaks off"
     except zstandard.ZstdError as error:
         damage = f"does not decompress to its end ({error})"
-    if not size:
+    if not unpacked_bytes:
         raise LogError(f"{packed.name} {damage or 'is empty'}; nothing in it can be decompressed")
-    return target, f"{packed.name} {damage}; {size} bytes could be decompressed" if damage else ""
+    return target, f"{packed.name} {damage}; {unpacked_bytes} bytes could be decompressed" if damage else ""
 
 
 def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
     """Yield the decompressed pieces of a file, each with whether it completes a frame."""
-    frame, rest = None, b""
-    while piece := rest or source.read(_PACKED_PIECE):
+    frame, unused_bytes = None, b""
+    while piece := unused_bytes or source.read(_PACKED_PIECE):
         frame = frame or zstandard.ZstdDecompressor().decompressobj()
-        content, rest = frame.decompress(piece), b""
+        content, unused_bytes = frame.decompress(piece), b""
         if frame.eof:
-            rest = frame.unused_data
+            unused_bytes = frame.unused_data
             frame = None
         yield content, frame is None
 
@@ -249,10 +252,10 @@ def decompress_message(payload: bytes) -> bytes:
     """
     try:
         size = zstandard.frame_content_size(payload)
-        most = min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(payload)))
-        if size > most:
+        most_bytes = min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(payload)))
+        if size > most_bytes:
             raise LogError(f"a message claims to hold {size} bytes in {len(payload)}")
-        return zstandard.ZstdDecompressor().decompress(payload, max_output_size=most)
+        return zstandard.ZstdDecompressor().decompress(payload, max_output_size=most_bytes)
     except zstandard.ZstdError as error:
         raise LogError(f"a message does not decompress ({error})") from None
 
@@ -284,66 +287,69 @@ class SqliteBag(MessageReader):
     kind = "ROS 2 bag"
 
     @cached_property
-    def _whole(self) -> Path:
+    def _readable_file(self) -> Path:
         """The file, or a copy of the complete pages of a truncated file; a partial page would read as 0."""
-        path = self._with_log
-        missing, whole = _bytes_missing(path)
-        if not missing:
+        path = self._merged_file
+        missing_bytes, whole_bytes = _bytes_missing(path)
+        if not missing_bytes:
             return path
-        self._faults.add(f"{self.name}: at least {missing} bytes are missing from its end")
-        return copy_beginning(path, whole, temporary_folder(self))
+        self._faults.add(f"{self.name}: at least {missing_bytes} bytes are missing from its end")
+        return copy_beginning(path, whole_bytes, temporary_folder(self))
 
     @cached_property
-    def _with_log(self) -> Path:
+    def _merged_file(self) -> Path:
         """The file, or a copy merged with the write-ahead log next to it."""
         # https://www.sqlite.org/wal.html
-        log = self._path.with_name(f"{self.name}-wal")
-        if not log.is_file() or not log.stat().st_size:
+        log_file = self._path.with_name(f"{self.name}-wal")
+        if not log_file.is_file() or not log_file.stat().st_size:
             return self._path
         folder = temporary_folder(self)
-        copy, _ = (copy_beginning(file, file.stat().st_size, folder) for file in (self._path, log))
-        most = copy.stat().st_size + log.stat().st_size
+        bag_copy, _ = (copy_beginning(file, file.stat().st_size, folder) for file in (self._path, log_file))
+        most_bytes = bag_copy.stat().st_size + log_file.stat().st_size
         try:
             # in a separate folder, so that only the copies are read and written
-            with closing(sqlite3.connect(copy, isolation_level=None)) as database:
+            with closing(sqlite3.connect(bag_copy, isolation_level=None)) as database:
                 database.execute("PRAGMA trusted_schema=OFF")
                 # the checkpoint copies the pages of the write-ahead log into the copy of the file
-                (_, frames, _) = database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
-            if frames < 1:
+                (_, frame_count, _) = database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+            if frame_count < 1:
                 raise sqlite3.DatabaseError("no whole change is in it")
-            if copy.stat().st_size > most:
+            if bag_copy.stat().st_size > most_bytes:
                 raise sqlite3.DatabaseError("it places pages beyond its own size")
         except (sqlite3.Error, UnicodeDecodeError) as error:
             self._faults.add(
-                f"{self.name}: its recorder was interrupted, and what {log.name} holds was not read ({error})"
+                f"{self.name}: its recorder was interrupted, and what {log_file.name} holds was not read"
+                f" ({error})"
             )
             return self._path
-        self._remarks.add(f"{self.name}: its recorder was interrupted; {log.name} was read, too")
-        return copy
+        self._remarks.add(f"{self.name}: its recorder was interrupted; {log_file.name} was read, too")
+        return bag_copy
 
     @cached_property
     def _tables(self) -> tuple[dict[int, Topic], str | None]:
         """The topics by their numbers, and the ROS release that wrote the file."""
-        journal = self._path.with_name(f"{self.name}-journal")
-        if journal.is_file() and journal.stat().st_size:
+        journal_file = self._path.with_name(f"{self.name}-journal")
+        if journal_file.is_file() and journal_file.stat().st_size:
             self._faults.add(
-                f"{self.name}: its recorder was interrupted, and {journal.name} was not read; open a copy of"
-                " both with sqlite3 to bring them together"
+                f"{self.name}: its recorder was interrupted, and {journal_file.name} was not read; open a"
+                " copy of both with sqlite3 to bring them together"
             )
-        with _opened(self._whole) as database:
-            described, distribution = _read_tables(database, self.name)
-        if self._with_log != self._path:
+        with _open_database(self._readable_file) as database:
+            topic_by_number, distribution = _read_tables(database, self.name)
+        if self._merged_file != self._path:
             # counts in the file do not include the write-ahead log
-            described = {number: replace(topic, count=None) for number, topic in described.items()}
-        return described, distribution
+            topic_by_number = {
+                number: replace(topic, count=None) for number, topic in topic_by_number.items()
+            }
+        return topic_by_number, distribution
 
     @property
-    def _described(self) -> dict[int, Topic]:
+    def _topic_by_number(self) -> dict[int, Topic]:
         return self._tables[0]
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        return topics_by_name(self._described.values(), self._distribution)
+        return topics_by_name(self._topic_by_number.values(), self._distribution)
 
     @property
     def _distribution(self) -> str | None:
@@ -353,7 +359,7 @@ class SqliteBag(MessageReader):
     def start_ns(self) -> int | None:
         """Log time of the first message."""
         try:
-            with _opened(self._whole) as database:
+            with _open_database(self._readable_file) as database:
                 ((start_ns,),) = database.execute("SELECT min(timestamp) FROM messages")
         except LogError:
             # reading the messages reports the damage
@@ -362,9 +368,11 @@ class SqliteBag(MessageReader):
 
     @cached_property
     def _declared(self) -> Mapping[int, Channel]:
-        return {number: channel_of(topic, self._distribution) for number, topic in self._described.items()}
+        return {
+            number: channel_of(topic, self._distribution) for number, topic in self._topic_by_number.items()
+        }
 
-    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+    def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
         topic_numbers = self._channel_numbers(topics)
         query = (
             "SELECT rowid, topic_id, timestamp, data FROM messages"
@@ -376,81 +384,83 @@ class SqliteBag(MessageReader):
             return (row[0], 0) if as_recorded else (row[2], row[0])
 
         # the last row before the damage, after which the search for intact rows continues
-        after = (-1, -1)
-        with _opened(self._whole) as database:
+        last_key = (-1, -1)
+        with _open_database(self._readable_file) as database:
             try:
-                cursor = database.execute(query, (*sorted(topic_numbers), first, last - 1))
-                for rows in self._sound(_batches(cursor)):
+                cursor = database.execute(query, (*sorted(topic_numbers), first_ns, end_ns - 1))
+                for rows in self._valid_batches(_batches(cursor)):
                     yield self._columns(rows)
-                    after = key(rows[-1])
+                    last_key = key(rows[-1])
                 return
             except sqlite3.Error as error:
                 damage = str(error)
-        with _opened(self._whole) as database:
-            intact, lost = _intact_rows(database)
-            following = sorted(
+        with _open_database(self._readable_file) as database:
+            intact_rows, lost_spans = _intact_rows(database)
+            remaining_rows = sorted(
                 (
                     row
-                    for row in intact
-                    if row[1] in topic_numbers and first <= row[2] < last and key(row) > after
+                    for row in intact_rows
+                    if row[1] in topic_numbers and first_ns <= row[2] < end_ns and key(row) > last_key
                 ),
                 key=key,
             )
-            for rows in self._sound(_batches(_contents(database, following, lost))):
+            for rows in self._valid_batches(_batches(_contents(database, remaining_rows, lost_spans))):
                 yield self._columns(rows)
-        self._report_losses(damage, intact, lost)
+        self._report_losses(damage, intact_rows, lost_spans)
 
-    def _report_losses(self, damage: str, intact: Sequence[RowHead], lost: Collection[_Span]) -> None:
+    def _report_losses(
+        self, damage: str, intact_rows: Sequence[RowHead], lost_spans: Collection[_Span]
+    ) -> None:
         """Report the lost rows of a damaged database, with the times of the messages around them."""
-        damaged = f"{self.name}: the database is damaged ({damage})"
-        spans = _joined_spans(lost)
+        damage_text = f"{self.name}: the database is damaged ({damage})"
+        spans = _joined_spans(lost_spans)
         if not spans:
-            self._faults.add(f"{damaged}; every message could be read")
-        places = [row[0] for row in intact]
-        for begin, end in spans:
-            at, to = bisect_left(places, begin), bisect_right(places, end)
-            before = [Instant(row[2], 0) for row in intact[max(0, at - 1) : at]]
-            behind = [Instant(row[2], 0) for row in intact[to : to + 1]]
-            when: tuple[str | Instant, ...] = (" between ", *before, " and ", *behind)
-            if not (before and behind):
-                when = (" after ", *before) if before else (" before ", *behind) if behind else ()
-            rows = f"row {begin}" if begin == end else f"rows {begin} to {end}"
+            self._faults.add(f"{damage_text}; every message could be read")
+        row_ids = [row[0] for row in intact_rows]
+        for first_id, last_id in spans:
+            first_index, end_index = bisect_left(row_ids, first_id), bisect_right(row_ids, last_id)
+            earlier = [Instant(row[2], 0) for row in intact_rows[max(0, first_index - 1) : first_index]]
+            later = [Instant(row[2], 0) for row in intact_rows[end_index : end_index + 1]]
+            time_words: tuple[str | Instant, ...] = (" between ", *earlier, " and ", *later)
+            if not (earlier and later):
+                time_words = (" after ", *earlier) if earlier else (" before ", *later) if later else ()
+            rows_text = f"row {first_id}" if first_id == last_id else f"rows {first_id} to {last_id}"
             # if no message follows, the number of lost rows is not known
-            rows = rows if behind or not before else f"rows from {begin} on"
-            self._faults.add(Sentence(f"{damaged}; messages", *when, f" are lost: {rows}"))
+            rows_text = rows_text if later or not earlier else f"rows from {first_id} on"
+            self._faults.add(Sentence(f"{damage_text}; messages", *time_words, f" are lost: {rows_text}"))
 
-    def _sound(self, batches: Iterable[list[Row]]) -> Iterator[list[Row]]:
+    def _valid_batches(self, batches: Iterable[list[Row]]) -> Iterator[list[Row]]:
         """Yield the rows with valid types, and report the other rows."""
         for rows in batches:
-            sound = [row for row in rows if tuple(map(type, row)) == _TYPES]
-            if len(sound) < len(rows):
-                lost = len(rows) - len(sound)
-                self._faults.add(f"{self.name}: {lost} messages have no number, time or content")
-            if sound:
-                yield sound
+            sound_rows = [row for row in rows if tuple(map(type, row)) == _TYPES]
+            if len(sound_rows) < len(rows):
+                lost_count = len(rows) - len(sound_rows)
+                self._faults.add(f"{self.name}: {lost_count} messages have no number, time or content")
+            if sound_rows:
+                yield sound_rows
 
     def _columns(self, rows: Sequence[Row]) -> MessageColumns:
         *columns, payloads = zip(*rows, strict=True)
-        place, numbers, times_ns = (np.array(column, np.int64) for column in columns)
-        return self._make_columns(numbers, (times_ns, times_ns), np.zeros_like(place), payloads, place)
+        row_ids, topics, times_ns = (np.array(column, np.int64) for column in columns)
+        return self._make_columns(topics, (times_ns, times_ns), np.zeros_like(row_ids), payloads, row_ids)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
     """Open the database in a file, read-only; no other file is read, and no function in it is trusted.
 
     Raises:
         LogError: the database cannot be opened.
     """
-    size = path.stat().st_size
+    file_bytes = path.stat().st_size
     try:
         # immutable: no locks, and no file next to it: https://www.sqlite.org/uri.html#uriimmutable
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
         # one thread reads, but garbage collection in another may close it
-        connected = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-        with closing(connected) as database:
+        connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+        with closing(connection) as database:
             # no value is longer than its file
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, size))
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, file_bytes))
             # texts of a damaged file may hold any bytes
             database.text_factory = lambda text: text.decode("utf-8", "replace")
             # without this, SQLite refuses a truncated file; nothing is ever written
@@ -458,10 +468,10 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             # as advised for untrusted files: https://www.sqlite.org/security.html
             database.execute("PRAGMA trusted_schema=OFF")
             database.execute("PRAGMA cell_size_check=ON")
-            steps = count(1)
-            most = 1_000 + size * _STEPS_A_BYTE // _STEPS
+            step_numbers = count(1)
+            most_checks = 1_000 + file_bytes * _STEPS_A_BYTE // _STEPS
             # pages of a damaged file can form a cycle, so the number of steps is limited
-            database.set_progress_handler(lambda: next(steps) > most, _STEPS)
+            database.set_progress_handler(lambda: next(step_numbers) > most_checks, _STEPS)
             yield database
     # sqlite3 decodes names of columns as UTF-8, whatever their bytes are
     except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -471,19 +481,19 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 def _bytes_missing(path: Path) -> tuple[int, int]:
     """Return how many bytes are missing at a file's end, and the length of its complete pages, in bytes."""
     # https://www.sqlite.org/fileformat.html#the_database_header
-    size = path.stat().st_size
+    file_bytes = path.stat().st_size
     with path.open("rb") as stream:
-        head = stream.read(100)
-    if len(head) < 100:
-        return 100 - len(head), size
-    page = int.from_bytes(head[16:18], "big")
-    page = 65536 if page == 1 else page
-    pages = int.from_bytes(head[28:32], "big")
-    if page < 512 or head[24:28] != head[92:96]:
+        header = stream.read(100)
+    if len(header) < 100:
+        return 100 - len(header), file_bytes
+    page_bytes = int.from_bytes(header[16:18], "big")
+    page_bytes = 65536 if page_bytes == 1 else page_bytes
+    page_count = int.from_bytes(header[28:32], "big")
+    if page_bytes < 512 or header[24:28] != header[92:96]:
         # damaged, or written by an old version, whose number of pages is not valid:
         # https://www.sqlite.org/fileformat.html#in_header_database_size
-        return 0, size
-    return max(0, pages * page - size), size - size % page
+        return 0, file_bytes
+    return max(0, page_count * page_bytes - file_bytes), file_bytes - file_bytes % page_bytes
 
 
 def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Topic], str | None]:
@@ -492,23 +502,23 @@ def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Top
     Raises:
         LogError: the file is not a bag.
     """
-    kinds = dict(
+    table_sql = dict(
         database.execute(
             "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND rootpage > 0 LIMIT ?",
             (_MOST_TOPICS,),
         ).fetchall()
     )
-    if not {"topics", "messages"} <= kinds.keys():
+    if not {"topics", "messages"} <= table_sql.keys():
         raise LogError(f"{name} is not a ROS 2 bag: it has no tables 'topics' and 'messages'")
-    metadata = _metadata(database) if "metadata" in kinds else None
-    schemas = _schemas(database) if "message_definitions" in kinds else {}
-    rows = _records(database, "topics")
+    metadata = _metadata(database) if "metadata" in table_sql else None
+    schemas = _schemas(database) if "message_definitions" in table_sql else {}
+    topic_rows = _records(database, "topics")
     distribution = metadata.distribution if metadata else None
-    for row in _records(database, "schema") if "schema" in kinds else ():
+    for row in _records(database, "schema") if "schema" in table_sql else ():
         distribution = str(row.get("ros_distro") or "") or distribution
     counts = metadata.counts if metadata else {}
     topics = {}
-    for row in rows:
+    for row in topic_rows:
         number, topic, type_name = row.get("id"), row.get("name"), row.get("type")
         if not (isinstance(number, int) and isinstance(topic, str) and isinstance(type_name, str)):
             raise LogError(f"{name} is damaged: its table 'topics' has a row without an id, a name or a type")
@@ -519,14 +529,14 @@ def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Top
 def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:
     """Yield the rows of a query in lists of bounded size; the rows before an error are yielded first."""
     rows: list[Row] = []
-    held = 0
+    held_bytes = 0
     try:
         for row in cursor:
             rows.append(row)
-            held += len(row[3]) if isinstance(row[3], bytes) else 0
-            if len(rows) == _MOST_ROWS or held >= _BATCH_BYTES:
+            held_bytes += len(row[3]) if isinstance(row[3], bytes) else 0
+            if len(rows) == _MOST_ROWS or held_bytes >= _BATCH_BYTES:
                 yield rows
-                rows, held = [], 0
+                rows, held_bytes = [], 0
     except sqlite3.Error:
         if rows:
             yield rows
@@ -547,78 +557,78 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
         " WHERE rowid BETWEEN ? AND ? ORDER BY rowid"
     )
     spans = deque([_all_ids(database)])
-    heads: dict[int, RowHead] = {}
-    lost: set[_Span] = set()
+    row_by_id: dict[int, RowHead] = {}
+    lost_spans: set[_Span] = set()
     for _ in range(_MOST_PROBES):
         if not spans:
             break
-        first, last = spans.popleft()
+        first_id, last_id = spans.popleft()
         try:
-            for row in database.execute(query, (first, last)):
+            for row in database.execute(query, (first_id, last_id)):
                 if all(type(cell) is int for cell in row):
-                    heads[row[0]] = row
-                    first = max(first, row[0] + 1)
+                    row_by_id[row[0]] = row
+                    first_id = max(first_id, row[0] + 1)
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
                 # the limit of steps is reached, so the other ranges count as lost
-                spans.append((first, last))
+                spans.append((first_id, last_id))
                 break
-            middle = (first + last) // 2
-            halves = [(first, middle), (middle + 1, last)] if first < last else []
+            middle_id = (first_id + last_id) // 2
+            halves = [(first_id, middle_id), (middle_id + 1, last_id)] if first_id < last_id else []
             spans.extend(halves)
-            lost.update([] if halves else [(first, last)])
-    lost.update(spans)
-    return sorted(heads.values()), lost
+            lost_spans.update([] if halves else [(first_id, last_id)])
+    lost_spans.update(spans)
+    return sorted(row_by_id.values()), lost_spans
 
 
 def _all_ids(database: sqlite3.Connection) -> _Span:
     """Return the range of ids that messages can have."""
     try:
-        ((first, last),) = database.execute(
+        ((first_id, last_id),) = database.execute(
             "SELECT (SELECT min(rowid) FROM messages NOT INDEXED),"
             " (SELECT max(rowid) FROM messages NOT INDEXED)"
         )
-        if type(first) is type(last) is int:
-            return first, last
+        if type(first_id) is type(last_id) is int:
+            return first_id, last_id
     except sqlite3.Error:
         pass
     # recorders number messages from 1 on, and a message takes at least 8 bytes
-    (pages,), (page,) = (
+    (page_count,), (page_bytes,) = (
         database.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size")
     )
-    return 0, int(pages * page) // 8
+    return 0, int(page_count * page_bytes) // 8
 
 
-def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[_Span]) -> Iterator[Row]:
+def _contents(database: sqlite3.Connection, row_heads: Sequence[RowHead], lost: set[_Span]) -> Iterator[Row]:
     """Yield rows with their contents; ids of unreadable rows go to `lost`."""
-    for place, (row_id, *_) in enumerate(heads):
+    for index, (row_id, *_) in enumerate(row_heads):
         try:
             yield from database.execute(
                 "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED WHERE rowid = ?", (row_id,)
             )
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
-                lost.update((row_number, row_number) for row_number, *_ in heads[place:])
+                lost.update((row_number, row_number) for row_number, *_ in row_heads[index:])
                 return
             lost.add((row_id, row_id))
 
 
 def _joined_spans(spans: Collection[_Span]) -> list[_Span]:
     """Return sorted ranges of ids; adjacent ranges are merged."""
-    joined: list[_Span] = []
-    for first, last in sorted(spans):
-        if joined and first <= joined[-1][1] + 1:
-            joined[-1] = joined[-1][0], max(last, joined[-1][1])
+    joined_spans: list[_Span] = []
+    for first_id, last_id in sorted(spans):
+        if joined_spans and first_id <= joined_spans[-1][1] + 1:
+            joined_spans[-1] = joined_spans[-1][0], max(last_id, joined_spans[-1][1])
         else:
-            joined.append((first, last))
-    return joined
+            joined_spans.append((first_id, last_id))
+    return joined_spans
 
 
 def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]]:
     """Return the rows of a small table; columns vary with the release that wrote it."""
     cursor = database.execute(f"SELECT * FROM {table} LIMIT {_MOST_TOPICS}")
-    names = [column[0] for column in cursor.description]
-    return [dict(zip(names, row, strict=True)) for row in cursor]
+    column_names = [column[0] for column in cursor.description]
+    return [dict(zip(column_names, row, strict=True)) for row in cursor]
 
 
 def _schemas(database: sqlite3.Connection) -> dict[str, Schema]:
