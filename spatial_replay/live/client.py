@@ -86,50 +86,52 @@ class Inbox:
 
     def __init__(self) -> None:
         self._items: deque[Arrival] = deque()
-        self._messages = self._bytes = 0
-        self._others: list[Arrival] = []
-        self._offered: Offered | None = None
-        self._warnings = 0
+        self._message_count = self._message_bytes = 0
+        self._earlier_items: list[Arrival] = []
+        self._latest_offer: Offered | None = None
+        self._warning_count = 0
         self.dropped = 0
         self.filled = asyncio.Event()
 
     def put(self, arrival: Arrival) -> None:
         """Add an item; if there is no room, drop the oldest messages."""
         if isinstance(arrival, Received):
-            self._messages += 1
-            self._bytes += len(arrival.payload)
-            while self._messages > 1 and (self._messages > MOST_WAITING or self._bytes > MOST_WAITING_BYTES):
+            self._message_count += 1
+            self._message_bytes += len(arrival.payload)
+            while self._message_count > 1 and (
+                self._message_count > MOST_WAITING or self._message_bytes > MOST_WAITING_BYTES
+            ):
                 self._drop()
         if isinstance(arrival, Offered):
             # channels are a live view, so an unread item already has all channels that are offered now
-            if self._offered is not None and self._offered.channels is arrival.channels:
+            if self._latest_offer is not None and self._latest_offer.channels is arrival.channels:
                 return
-            self._offered = arrival
+            self._latest_offer = arrival
         if isinstance(arrival, Warned):
-            self._warnings += 1
-            if self._warnings == MOST_WARNINGS:
+            self._warning_count += 1
+            if self._warning_count == MOST_WARNINGS:
                 arrival = Warned("the server sends too many warnings; further ones are left out")
-            elif self._warnings > MOST_WARNINGS:
+            elif self._warning_count > MOST_WARNINGS:
                 return
         self._items.append(arrival)
         self.filled.set()
 
     def take(self) -> list[Arrival]:
         """Remove and return all unread items."""
-        arrivals = [*self._others, *self._items]
+        arrivals = [*self._earlier_items, *self._items]
         self._items.clear()
-        self._others.clear()
-        self._offered = None
-        self._messages = self._bytes = 0
+        self._earlier_items.clear()
+        self._latest_offer = None
+        self._message_count = self._message_bytes = 0
         self.filled.clear()
         return arrivals
 
     def _drop(self) -> None:
         # only messages may be lost: other items before the oldest one are kept
         while not isinstance(oldest := self._items.popleft(), Received):
-            self._others.append(oldest)
-        self._messages -= 1
-        self._bytes -= len(oldest.payload)
+            self._earlier_items.append(oldest)
+        self._message_count -= 1
+        self._message_bytes -= len(oldest.payload)
         self.dropped += 1
 
 
@@ -185,19 +187,19 @@ class Client:
 
     async def _listen(self, connection: ClientConnection) -> str:
         """Put all items into the inbox until the connection ends; return the reason of its end."""
-        offered: dict[int, Channel] = {}
-        channels_now = offered.values()
-        subscribed: dict[int, Channel] = {}
+        offered_channels: dict[int, Channel] = {}
+        channels_now = offered_channels.values()
+        subscribed_channels: dict[int, Channel] = {}
         has_warned = False
         definition_bytes = 0
-        turn_s = time.monotonic()
+        turn_start_s = time.monotonic()
         try:
             async for raw in connection:
                 arrived_s = time.monotonic()
-                if arrived_s - turn_s > _LONGEST_TURN_S:
+                if arrived_s - turn_start_s > _LONGEST_TURN_S:
                     # a flood of messages must not block Ctrl-C and the evaluation
                     await asyncio.sleep(0)
-                    turn_s = arrived_s
+                    turn_start_s = arrived_s
                 try:
                     frame = decode_frame(raw)
                 except LogError as error:
@@ -207,7 +209,7 @@ class Client:
                     continue
                 match frame:
                     case MessageData(number, time_ns, payload):
-                        channel = subscribed.get(number)
+                        channel = subscribed_channels.get(number)
                         if channel is not None:
                             received = Received(channel, time_ns, payload, arrived_s)
                             self.record(received)
@@ -215,23 +217,25 @@ class Client:
                     case Connected():
                         self.inbox.put(frame)
                     case Advertised(channels):
-                        offered |= channels
-                        if len(offered) > _MOST_CHANNELS:
+                        offered_channels |= channels
+                        if len(offered_channels) > _MOST_CHANNELS:
                             return f"it offers more than {_MOST_CHANNELS} channels"
                         definition_bytes += sum(map(_definition_bytes, channels.values()))
                         if definition_bytes > _MOST_DEFINITION_BYTES:
                             return (
                                 f"its channels have more than {_MOST_DEFINITION_BYTES} bytes of definitions"
                             )
-                        new = {n: channel for n, channel in channels.items() if self.wants(channel.topic)}
-                        if new:
-                            subscribed |= new
-                            await connection.send(subscribe(new))
+                        new_channels = {
+                            n: channel for n, channel in channels.items() if self.wants(channel.topic)
+                        }
+                        if new_channels:
+                            subscribed_channels |= new_channels
+                            await connection.send(subscribe(new_channels))
                         self.inbox.put(Offered(channels_now))
                     case Unadvertised(numbers):
                         for number in numbers:
-                            offered.pop(number, None)
-                            subscribed.pop(number, None)
+                            offered_channels.pop(number, None)
+                            subscribed_channels.pop(number, None)
                         self.inbox.put(Offered(channels_now))
                     case Warned(text):
                         self.inbox.put(Warned(f"{self.address} says: {text}"))

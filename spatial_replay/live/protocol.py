@@ -124,20 +124,20 @@ def _number(value: object) -> int:
     return value
 
 
-def _channel(described: Any) -> Channel:
-    topic, encoding = described["topic"], described["encoding"]
-    name, text = described.get("schemaName") or "", described.get("schema") or ""
-    for part in (topic, encoding, name, text):
-        if not isinstance(part, str):
-            raise ValueError(f"{part!r:.40} in a channel is not a text")
-    schema_encoding = described.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
-    if not name and not text:
+def _channel(offer: Any) -> Channel:
+    topic, encoding = offer["topic"], offer["encoding"]
+    schema_name, schema_text = offer.get("schemaName") or "", offer.get("schema") or ""
+    for value in (topic, encoding, schema_name, schema_text):
+        if not isinstance(value, str):
+            raise ValueError(f"{value!r:.40} in a channel is not a text")
+    schema_encoding = offer.get("schemaEncoding") or _SCHEMA_ENCODINGS.get(encoding, "")
+    if not schema_name and not schema_text:
         return Channel(topic, encoding, None)
     # JSON can spell lone surrogates, which are not UTF-8
-    data = text.encode("utf-8", "replace")
+    schema_data = schema_text.encode("utf-8", "replace")
     if schema_encoding in _BINARY_SCHEMAS:
         try:
-            data = base64.b64decode(text, validate=True)
+            schema_data = base64.b64decode(schema_text, validate=True)
         except binascii.Error as error:
             raise ValueError(f"the schema of {topic!r:.100} is not Base64: {error}") from None
-    return Channel(topic, encoding, Schema(name, str(schema_encoding), data))
+    return Channel(topic, encoding, Schema(schema_name, str(schema_encoding), schema_data))

@@ -91,8 +91,10 @@ class ObjectsAssembler:
             self._faults.add(f"{self._name}: {fault}")
         if len(trace):
             rows = zip(trace.names, trace.rows[-1].tolist(), strict=True)
-            present = {name: row if row >= 0 else -2 - row for name, row in rows if row != ABSENT}
-            self._classes = {name: trace.classes[int(trace.class_code[row])] for name, row in present.items()}
+            present_rows = {name: row if row >= 0 else -2 - row for name, row in rows if row != ABSENT}
+            self._classes = {
+                name: trace.classes[int(trace.class_code[row])] for name, row in present_rows.items()
+            }
         return trace
 
     def arrived_s(self, time_ns: int) -> float:
@@ -111,8 +113,8 @@ class ObjectsAssembler:
         if self._newest_ns < 0 or not self._classes:
             return Trace.empty()
         self._newest_ns += 1
-        unknown, self._classes = self._classes, {}
-        return Trace.from_samples([Sample(self._newest_ns, unknown=unknown)])
+        unknown_classes, self._classes = self._classes, {}
+        return Trace.from_samples([Sample(self._newest_ns, unknown=unknown_classes)])
 
     def finish(self) -> Trace:
         """Return no samples, because no sample remains."""
@@ -214,8 +216,8 @@ class LiveUpdate:
         for update in self.updates:
             if name in update.places:
                 return update.node(name)
-        names = sorted(node_name for update in self.updates for node_name in update.places)
-        raise UsageError(no_such_node(name, names))
+        node_names = sorted(node_name for update in self.updates for node_name in update.places)
+        raise UsageError(no_such_node(name, node_names))
 
 
 MAX_DELAY_S: Final = 0.2
@@ -297,34 +299,34 @@ class LiveSession:
         rehearse()
         self._assembler: LiveAssembler | ObjectsAssembler | None = None
         self._channels: tuple[Channel, ...] = ()
-        self._planned: dict[str, Channel] = {}
-        self._offered_s = self._settled_s = math.inf
-        self._last_s: dict[str, float] = {}
+        self._planned_channels: dict[str, Channel] = {}
+        self._offer_deadline_s = self._settle_deadline_s = math.inf
+        self._last_message_s: dict[str, float] = {}
         # silent topics, with the times of their last messages
-        self._silent: dict[str, float] = {}
-        self._heard: set[str] = set()
-        self._rare: set[str] = set()
+        self._silent_since_s: dict[str, float] = {}
+        self._heard_topics: set[str] = set()
+        self._rare_topics: set[str] = set()
         self._intervals_s: dict[str, deque[float]] = {}
-        self._overdue = 0
-        self._is_overdue_said = False
+        self._overdue_count = 0
+        self._has_noted_overdue = False
         self._notes: list[str] = []
-        self._missing: tuple[str, ...] = ()
+        self._missing_topics: tuple[str, ...] = ()
         self._server: str | None = None
         self._is_connected = False
         self.connected = asyncio.Event()
         """Set when the first connection is open."""
-        self._samples = self._messages = self._dropped = 0
+        self._sample_count = self._message_count = self._dropped_count = 0
         self._delay_s = math.nan
         self._time_ns: int | None = None
-        self._stopped = False
+        self._is_stopped = False
         self._inbox: Inbox | None = None
-        self._early = Inbox()
-        self._refused: set[str] = set()
-        self._remarked: set[Diagnostic] = set()
+        self._early_inbox = Inbox()
+        self._refused_topics: set[str] = set()
+        self._noted_diagnostics: set[Diagnostic] = set()
         self._members = ClassMembers(self._ends.needs.classes)
         self._is_closed = False
         self._next_doubts = _SAMPLES_BEFORE_DOUBTS
-        self._doubted: set[tuple[str, str]] = set()
+        self._noted_doubts: set[tuple[str, str]] = set()
         self.remarks: tuple[str, ...] = ()
         self.doubts: tuple[Doubt, ...] = ()
         """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
@@ -337,11 +339,11 @@ class LiveSession:
         return SessionStatus(
             self._server,
             self._is_connected,
-            self._missing,
-            self._samples,
-            self._messages,
-            self._dropped,
-            self._early.dropped + (0 if self._inbox is None else self._inbox.dropped),
+            self._missing_topics,
+            self._sample_count,
+            self._message_count,
+            self._dropped_count,
+            self._early_inbox.dropped + (0 if self._inbox is None else self._inbox.dropped),
             0 if self._assembler is None else self._assembler.late,
             0 if self._assembler is None else self._assembler.overdue,
             self._delay_s,
@@ -367,13 +369,13 @@ class LiveSession:
     def _note_overdue(self) -> None:
         """Note once in a run that a transform is overdue; before the run begins, that is usual."""
         assembler = self._assembler
-        if not isinstance(assembler, LiveAssembler) or assembler.overdue == self._overdue:
+        if not isinstance(assembler, LiveAssembler) or assembler.overdue == self._overdue_count:
             return
-        is_first = self._samples > 0 and not self._is_overdue_said and self._is_connected
-        self._overdue = assembler.overdue
+        is_first = self._sample_count > 0 and not self._has_noted_overdue and self._is_connected
+        self._overdue_count = assembler.overdue
         if is_first and assembler.overdue_frame is not None:
             topic, frame = assembler.overdue_frame
-            self._is_overdue_said = True
+            self._has_noted_overdue = True
             self._notes.append(
                 f"{topic} is unknown where no transform of {frame!r} came within {self._max_delay_s:g} s; if"
                 " transforms come later or seldom, give --max-delay (max_delay_s) more"
@@ -397,7 +399,7 @@ class LiveSession:
 
     def stop(self) -> None:
         """End `updates` after the arrived messages are evaluated."""
-        self._stopped = True
+        self._is_stopped = True
         if self._inbox is not None:
             self._inbox.filled.set()
 
@@ -411,16 +413,16 @@ class LiveSession:
         """
         inbox = self._inbox = Inbox()
         client = Client(self._address, self._wants, inbox, self._record)
-        listening = asyncio.create_task(client.run())
-        listening.add_done_callback(lambda _: inbox.filled.set())
+        client_task = asyncio.create_task(client.run())
+        client_task.add_done_callback(lambda _: inbox.filled.set())
         # objects that are loaded by now stay, and scans of them for garbage would delay samples:
         # https://docs.python.org/3/library/gc.html#gc.freeze
         gc.freeze()
         try:
-            while not (self._stopped or self.failure):
+            while not (self._is_stopped or self.failure):
                 await self._wait(inbox)
-                if listening.done():
-                    listening.result()
+                if client_task.done():
+                    client_task.result()
                 async for update in self._turn(inbox):
                     yield update
             if self._assembler is None and self._is_connected and not self.failure:
@@ -437,9 +439,9 @@ class LiveSession:
                     yield update
                 self._conclude(self._assembler)
         finally:
-            listening.cancel()
+            client_task.cancel()
             with suppress(asyncio.CancelledError, Exception):
-                await listening
+                await client_task
 
     # ------------------------------------------------------------------------------ what comes
 
@@ -449,7 +451,7 @@ class LiveSession:
     def _is_evaluated(self, topic: str) -> bool:
         if self._mapping is None:
             return topic == OBJECTS
-        return topic in self._planned or self._is_named(topic, self._mapping)
+        return topic in self._planned_channels or self._is_named(topic, self._mapping)
 
     def _is_named(self, topic: str, mapping: LogMapping) -> bool:
         # a client subscribes by names, so topics of transforms are recognised by their usual names
@@ -462,25 +464,29 @@ class LiveSession:
     def _record(self, received: Received) -> None:
         """Copy a message to the recorders before it can be dropped."""
         channel = received.channel
-        if not self._recorders or channel.topic in self._refused or not self._is_copied(channel.topic):
+        if not self._recorders or channel.topic in self._refused_topics or not self._is_copied(channel.topic):
             return
         for recorder in self._recorders:
             try:
                 recorder.copy(channel, received.time_ns, received.payload)
             except UsageError as error:
-                self._refused.add(channel.topic)
+                self._refused_topics.add(channel.topic)
                 self._notes.append(f"{channel.topic} is not recorded: {error}")
 
     async def _wait(self, inbox: Inbox) -> None:
         """Wait until there is something to do."""
         now_s = time.monotonic()
-        times = [self._settled_s, self._offered_s]
+        due_times_s = [self._settle_deadline_s, self._offer_deadline_s]
         if self._assembler is not None:
-            times.append(self._assembler.due_s() or math.inf)
+            due_times_s.append(self._assembler.due_s() or math.inf)
             if self._topic_timeout_s is not None:
-                waiting = (at for topic, at in self._last_s.items() if topic not in self._silent)
-                times.append(min(waiting, default=math.inf) + self._topic_timeout_s)
-        due_s = min(times)
+                last_times_s = (
+                    last_s
+                    for topic, last_s in self._last_message_s.items()
+                    if topic not in self._silent_since_s
+                )
+                due_times_s.append(min(last_times_s, default=math.inf) + self._topic_timeout_s)
+        due_s = min(due_times_s)
         if inbox.filled.is_set() or due_s <= now_s:
             # the client gets a turn, however many samples wait for evaluation
             await asyncio.sleep(0)
@@ -503,11 +509,11 @@ class LiveSession:
                 topic = arrival.channel.topic
                 if self._assembler is None:
                     # messages that arrive before all topics are offered are evaluated after that
-                    self._early.put(arrival)
+                    self._early_inbox.put(arrival)
                     continue
-                if topic not in self._planned:
+                if topic not in self._planned_channels:
                     continue
-                self._messages += 1
+                self._message_count += 1
                 arrived_s = min(arrived_s, arrival.arrived_s)
                 self._note_return(topic, arrival.arrived_s)
                 messages.append(Message(topic, arrival.time_ns, arrival.time_ns, 0, arrival.payload))
@@ -521,10 +527,10 @@ class LiveSession:
                     if self._server is not None:
                         self._notes.append(f"connected again to {self._address}")
                         # silence counts from the new connection on
-                        self._last_s = dict.fromkeys(self._last_s, time.monotonic())
+                        self._last_message_s = dict.fromkeys(self._last_message_s, time.monotonic())
                     self._server, self._is_connected = server, True
                     self.connected.set()
-                    self._offered_s = time.monotonic() + _OFFER_S
+                    self._offer_deadline_s = time.monotonic() + _OFFER_S
                 case Offered(channels):
                     self._channels = tuple(channels)
                     self._plan()
@@ -532,10 +538,10 @@ class LiveSession:
                     self._notes.append(text)
                 case Disconnected(reason, at_s):
                     self._is_connected = False
-                    self._offered_s = self._settled_s = math.inf
+                    self._offer_deadline_s = self._settle_deadline_s = math.inf
                     if self._assembler is None:
                         # the run begins after the pause, so that no value is held during the pause
-                        self._early = Inbox()
+                        self._early_inbox = Inbox()
                     else:
                         # after a lost connection, no sample waits for a topic
                         trace = self._assembler.flush()
@@ -545,40 +551,44 @@ class LiveSession:
                         f"the connection to {self._address} is lost: {reason}; everything is unknown until"
                         " it is back"
                     )
-                    lost = self._lose(list(self._planned), "connection lost")
-                    async for update in self._evaluate(lost, at_s, self._ends.release):
+                    unknown_trace = self._lose(list(self._planned_channels), "connection lost")
+                    async for update in self._evaluate(unknown_trace, at_s, self._ends.release):
                         yield update
         async for update in self._evaluate(self._add(messages), arrived_s):
             yield update
         now_s = time.monotonic()
-        if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
+        if (
+            self._assembler is None
+            and self._is_connected
+            and now_s >= min(self._offer_deadline_s, self._settle_deadline_s)
+        ):
             self._begin(inbox, now_s)
         if silent := self._silent_topics(now_s):
-            self._silent |= {topic: self._last_s[topic] for topic in silent}
+            self._silent_since_s |= {topic: self._last_message_s[topic] for topic in silent}
             topic_names = ", ".join(silent)
             self._notes.append(
                 f"no message on {topic_names} for {self._topic_timeout_s:g} s: what it reports is unknown"
             )
-            lost = self._lose(silent, f"silence on {topic_names}")
-            async for update in self._evaluate(lost, now_s, self._ends.release):
+            unknown_trace = self._lose(silent, f"silence on {topic_names}")
+            async for update in self._evaluate(unknown_trace, now_s, self._ends.release):
                 yield update
 
     def _note_return(self, topic: str, arrived_s: float) -> None:
         """Store the time of a message on a topic; note a return after silence."""
-        intervals = self._intervals_s.setdefault(topic, deque(maxlen=_USUAL))
-        since_s = arrived_s - self._last_s.get(topic, arrived_s)
-        if topic in self._heard:
-            intervals.append(since_s)
-        self._heard.add(topic)
-        self._last_s[topic] = arrived_s
-        if topic not in self._silent:
+        intervals_s = self._intervals_s.setdefault(topic, deque(maxlen=_USUAL))
+        interval_s = arrived_s - self._last_message_s.get(topic, arrived_s)
+        if topic in self._heard_topics:
+            intervals_s.append(interval_s)
+        self._heard_topics.add(topic)
+        self._last_message_s[topic] = arrived_s
+        if topic not in self._silent_since_s:
             return
-        silent_s = arrived_s - self._silent.pop(topic)
+        silent_s = arrived_s - self._silent_since_s.pop(topic)
         self._notes.append(f"a message on {topic} again, after {silent_s:.3g} s")
-        usual_s = median(intervals) if len(intervals) > 1 else 0.0
+        usual_s = median(intervals_s) if len(intervals_s) > 1 else 0.0
         timeout_s = self._topic_timeout_s or math.inf
-        if usual_s >= timeout_s and topic not in self._rare:
-            self._rare.add(topic)
+        if usual_s >= timeout_s and topic not in self._rare_topics:
+            self._rare_topics.add(topic)
             self._notes.append(
                 f"{topic} usually comes every {usual_s:.3g} s: with a timeout of {timeout_s:g} s, what it"
                 " reports is unknown between its messages; give --topic-timeout (topic_timeout_s) more"
@@ -597,7 +607,7 @@ class LiveSession:
             )
         return trace
 
-    def _lose(self, topics: Sequence[str], what: str) -> Trace | None:
+    def _lose(self, topics: Sequence[str], event_name: str) -> Trace | None:
         """Make the objects of some topics unknown; report an event with the newest note."""
         if self._assembler is None:
             return None
@@ -605,33 +615,37 @@ class LiveSession:
         time_ns = int(trace.times_ns[-1]) if len(trace) else self._time_ns
         if time_ns is not None:
             for recorder in self._recorders:
-                recorder.report(RunEvent(time_ns, what, self._notes[-1]))
+                recorder.report(RunEvent(time_ns, event_name, self._notes[-1]))
         return trace
 
     def _silent_topics(self, now_s: float) -> list[str]:
         """Return the topics that exceeded the timeout since the last call."""
         if self._topic_timeout_s is None or self._assembler is None or not self._is_connected:
             return []
-        watched = [topic for topic in self._assembler.topics if topic not in self._silent]
-        return [topic for topic in watched if now_s - self._last_s.get(topic, now_s) >= self._topic_timeout_s]
+        watched_topics = [topic for topic in self._assembler.topics if topic not in self._silent_since_s]
+        return [
+            topic
+            for topic in watched_topics
+            if now_s - self._last_message_s.get(topic, now_s) >= self._topic_timeout_s
+        ]
 
     # -------------------------------------------------------------------------------- planning
 
     def _plan(self) -> None:
         """Find the topics of the mapping among the offered topics."""
-        offered = {channel.topic: channel for channel in self._channels}
+        channels = {channel.topic: channel for channel in self._channels}
         if self._assembler is not None:
-            changed = [
+            changed_topics = [
                 topic
-                for topic, channel in self._planned.items()
-                if topic in offered and offered[topic] != channel
+                for topic, channel in self._planned_channels.items()
+                if topic in channels and channels[topic] != channel
             ]
-            if changed:
+            if changed_topics:
                 raise LogError(
-                    f"{self._address}: {', '.join(changed)} has another type or definition than before; start"
-                    " the monitor again"
+                    f"{self._address}: {', '.join(changed_topics)} has another type or definition than"
+                    " before; start the monitor again"
                 )
-            self._missing = tuple(topic for topic in self._planned if topic not in offered)
+            self._missing_topics = tuple(topic for topic in self._planned_channels if topic not in channels)
             return
         if self._mapping is None:
             needed_topics = [OBJECTS]
@@ -640,57 +654,62 @@ class LiveSession:
             needed_topics += [
                 sampled_topic for sampled_topic in [self._mapping.sampling.topic] if sampled_topic is not None
             ]
-        self._missing = tuple(topic for topic in dict.fromkeys(needed_topics) if topic not in offered)
+        self._missing_topics = tuple(topic for topic in dict.fromkeys(needed_topics) if topic not in channels)
         # transforms and optional topics are often offered a little later
-        self._settled_s = math.inf if self._missing else time.monotonic() + _SETTLE_S
+        self._settle_deadline_s = math.inf if self._missing_topics else time.monotonic() + _SETTLE_S
 
     def _begin(self, inbox: Inbox, now_s: float) -> None:
         """Begin to assemble samples from the offered topics, from the earliest message on."""
-        self._offered_s = self._settled_s = math.inf
-        offered = {channel.topic: channel for channel in self._channels}
+        self._offer_deadline_s = self._settle_deadline_s = math.inf
+        channels = {channel.topic: channel for channel in self._channels}
         if self._mapping is None:
-            if OBJECTS not in offered:
+            if OBJECTS not in channels:
                 raise UsageError(
                     f"{self._address} has no topic {OBJECTS}; give --mapping FILE (`mapping=`) to say which"
-                    f" topics carry which objects: {', '.join(sorted(offered)[:20]) or 'it has none'}"
+                    f" topics carry which objects: {', '.join(sorted(channels)[:20]) or 'it has none'}"
                 )
-            self._assembler, self._planned = ObjectsAssembler(self._address), {OBJECTS: offered[OBJECTS]}
+            self._assembler, self._planned_channels = (
+                ObjectsAssembler(self._address),
+                {OBJECTS: channels[OBJECTS]},
+            )
         else:
             topics = topics_by_name(map(topic_of, self._channels))
             try:
                 plan = ReadingPlan.of(self._mapping, topics)
             except UsageError as error:
                 raise UsageError(str(error).replace("the log has", "the server offers")) from None
-            by_name = {topic.name: topic for topic in topics}
+            topic_by_name = {topic.name: topic for topic in topics}
             self._assembler = LiveAssembler(
                 plan,
-                lambda topic: decoder_of(by_name[topic]),
+                lambda topic: decoder_of(topic_by_name[topic]),
                 name=self._address,
                 max_delay_s=self._max_delay_s,
                 in_order=self._server in _STAMPING_SERVERS,
             )
-            self._planned = {topic: offered[topic] for topic in plan.topics}
-            unheard = [
+            self._planned_channels = {topic: channels[topic] for topic in plan.topics}
+            unheard_topics = [
                 topic.name
                 for topic in topics
-                if topic.name in self._planned
+                if topic.name in self._planned_channels
                 and short_type(topic.type) in TRANSFORM_TYPES
                 and not self._is_named(topic.name, self._mapping)
             ]
-            if unheard:
-                self._notes.append(f"transforms on {', '.join(unheard)} are not listened to: map the topic")
-        self._last_s = dict.fromkeys(self._assembler.topics, now_s)
+            if unheard_topics:
+                self._notes.append(
+                    f"transforms on {', '.join(unheard_topics)} are not listened to: map the topic"
+                )
+        self._last_message_s = dict.fromkeys(self._assembler.topics, now_s)
         self._notes.append(
             f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
-            f" {plural(len(self._planned), 'topic')}"
+            f" {plural(len(self._planned_channels), 'topic')}"
         )
-        if (sampled := self._sampled_by_default()) is not None:
+        if (sampled_topic := self._sampled_by_default()) is not None:
             self._notes.append(
-                f"samples are taken at {sampled}, the first topic with objects; a bag is sampled at the most"
-                f" frequent one: `sample: {{topic: {sampled}}}` in the mapping takes the same"
+                f"samples are taken at {sampled_topic}, the first topic with objects; a bag is sampled at the"
+                f" most frequent one: `sample: {{topic: {sampled_topic}}}` in the mapping takes the same"
             )
-        self._early, early = Inbox(), self._early
-        for arrival in early.take():
+        self._early_inbox, early_inbox = Inbox(), self._early_inbox
+        for arrival in early_inbox.take():
             # the wait for the beginning does not count as late evaluation
             inbox.put(arrival._replace(arrived_s=now_s) if isinstance(arrival, Received) else arrival)
 
@@ -698,10 +717,12 @@ class LiveSession:
         """Return the topic that is sampled, if a recording of the same topics may be sampled at another."""
         if self._mapping is None or self._mapping.sampling != Sampling():
             return None
-        mapped = [entry for entry in self._mapping.topics if entry.topic in self._planned]
-        topics = {entry.topic for entry in mapped if entry.reads_objects} or {entry.topic for entry in mapped}
-        first = next((entry.topic for entry in mapped if entry.topic in topics), None)
-        return first if len(topics) > 1 else None
+        entries = [entry for entry in self._mapping.topics if entry.topic in self._planned_channels]
+        topics = {entry.topic for entry in entries if entry.reads_objects} or {
+            entry.topic for entry in entries
+        }
+        first_topic = next((entry.topic for entry in entries if entry.topic in topics), None)
+        return first_topic if len(topics) > 1 else None
 
     # ------------------------------------------------------------------------------ evaluating
 
@@ -714,10 +735,10 @@ class LiveSession:
             remaining: function that returns the pending samples of `RunEnds`, to evaluate them too.
         """
         if trace is not None:
-            trace = self._counting(trace, remaining)
+            trace = self._relevant_samples(trace, remaining)
         if trace is None or not len(trace):
             return
-        turn_s = time.monotonic()
+        turn_start_s = time.monotonic()
         last_ns = int(trace.times_ns[-1])
         for sample in trace.samples():
             # the log must hold each evaluated sample; while it is full, the inbox drops messages
@@ -726,16 +747,16 @@ class LiveSession:
             now_s = time.monotonic()
             # the newest sample is never dropped
             if now_s - arrived_s > LATE_S and sample.time_ns != last_ns:
-                self._dropped += 1
+                self._dropped_count += 1
                 for recorder in self._recorders:
                     recorder.miss(sample)
                 continue
-            if now_s - turn_s > _TURN_S:
+            if now_s - turn_start_s > _TURN_S:
                 await asyncio.sleep(0)
-                turn_s = now_s
+                turn_start_s = now_s
             yield self._update(sample, arrived_s)
 
-    def _counting(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
+    def _relevant_samples(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
         """Return the samples that count.
 
         They begin when all needed topics can be judged, and stop where the run may have ended.
@@ -744,10 +765,12 @@ class LiveSession:
         ends = self._ends
         had_begun, remarks = ends.begin_ns is not None, ends.remarks
         # samples are added one by one, so that none waits for the next one, which may not count
-        parts = [trace.slice(place, place + 1) for place in range(len(trace))]
-        counting = [part for added in (parts if had_begun else [trace]) for part in ends.add(added)]
+        samples = [trace.slice(index, index + 1) for index in range(len(trace))]
+        counting_traces = [
+            piece for new_trace in (samples if had_begun else [trace]) for piece in ends.add(new_trace)
+        ]
         if remaining is not None:
-            counting += remaining()
+            counting_traces += remaining()
         if ends.begin_ns is not None:
             self._notes += counted_from(ends.remarks[len(remarks) :], ends.begin_ns)
             if ends.late and not had_begun:
@@ -757,7 +780,7 @@ class LiveSession:
                     " reports is unknown, and groups lack its objects; --start-within (start_within_s)"
                     " waits longer"
                 )
-        return counting[0] if len(counting) == 1 else Trace.concatenate(counting)
+        return counting_traces[0] if len(counting_traces) == 1 else Trace.concatenate(counting_traces)
 
     def _note_doubts(self) -> None:
         """Note new contradictions of the run to its mapping; compare again after twice as many samples."""
@@ -765,8 +788,8 @@ class LiveSession:
         if self._assembler is None:
             return
         for doubt in distinct_doubts(self._assembler.find_doubts(), self._ends.begin_ns or 0):
-            if (doubt.assumption, doubt.topic) not in self._doubted:
-                self._doubted.add((doubt.assumption, doubt.topic))
+            if (doubt.assumption, doubt.topic) not in self._noted_doubts:
+                self._noted_doubts.add((doubt.assumption, doubt.topic))
                 self._notes.append(doubt.remark(self._address))
 
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
@@ -774,13 +797,13 @@ class LiveSession:
         for monitor in self._monitors:
             monitor.note_unknown()
         for remark in itertools.chain.from_iterable(update.remarks for update in updates):
-            if remark not in self._remarked:
-                self._remarked.add(remark)
+            if remark not in self._noted_diagnostics:
+                self._noted_diagnostics.add(remark)
                 self._notes.append(
                     f"{remark.filename}:{remark.line}:{remark.column}: {remark.message}; {remark.hint}"
                 )
-        self._samples += 1
-        if self._samples >= self._next_doubts:
+        self._sample_count += 1
+        if self._sample_count >= self._next_doubts:
             self._note_doubts()
         self._time_ns = sample.time_ns
         now_s = time.monotonic()
@@ -791,7 +814,7 @@ class LiveSession:
         for recorder in self._recorders:
             recorder.write(sample)
         changes = tuple(self._changes.after(updates))
-        return LiveUpdate(sample, changes, self.take_notes(), self._delay_s, self._dropped, updates)
+        return LiveUpdate(sample, changes, self.take_notes(), self._delay_s, self._dropped_count, updates)
 
 
 _WAITING = 65_536
@@ -823,14 +846,14 @@ def open_recorders(
     """
     if (trigger is None) != (clips is None):
         raise UsageError("clips take a trigger and a folder; give both")
-    about = _about(mapping)
-    with ExitStack() as opened:
+    metadata = _about(mapping)
+    with ExitStack() as stack:
         recorders: list[Recorder] = [
-            opened.enter_context(
+            stack.enter_context(
                 _RunRecorder(
                     path,
                     specifications=files,
-                    about=about,
+                    about=metadata,
                     waiting=_WAITING,
                     block=False,
                     trigger=trigger_of_path,
@@ -847,8 +870,8 @@ def _about(mapping: LogMapping | None) -> Mapping[str, str]:
     """Return the metadata of a run in its log; nothing in it depends on the machine."""
     if mapping is None:
         return {"source": "live"}
-    named = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
-    return {"source": "live", **named, **mapping.axes.metadata()}
+    mapping_metadata = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
+    return {"source": "live", **mapping_metadata, **mapping.axes.metadata()}
 
 
 async def monitor(
