@@ -54,8 +54,8 @@ class Pace:
     def __init__(self, clock: Callable[[], float]) -> None:
         """Begin the first turn."""
         self._clock = clock
-        self._behind_s = 0.0
-        self._turn = clock()
+        self._lag_s = 0.0
+        self._turn_start_s = clock()
 
     def now(self) -> float:
         """Return the playing time in seconds: the clock's time without the skipped parts of long turns."""
@@ -63,14 +63,14 @@ class Pace:
 
     def next_turn(self) -> float:
         """Begin the next turn, and return the playing time of the last turn in seconds."""
-        read = self._clock()
-        now = self._at(read)
-        elapsed_s = now - self._turn
-        self._behind_s, self._turn = read - now, now
+        clock_s = self._clock()
+        now_s = self._at(clock_s)
+        elapsed_s = now_s - self._turn_start_s
+        self._lag_s, self._turn_start_s = clock_s - now_s, now_s
         return elapsed_s
 
-    def _at(self, read: float) -> float:
-        return min(read - self._behind_s, self._turn + MOST_LATE_S)
+    def _at(self, clock_s: float) -> float:
+        return min(clock_s - self._lag_s, self._turn_start_s + MOST_LATE_S)
 
 
 SLOWEST: Final = 0.01
@@ -111,13 +111,13 @@ class Transport:
         self.start_ns, self.end_ns = start_ns, end_ns
         self._is_playing = False
         self._speed = 1.0
-        self._from_ns, self._since = start_ns, 0.0
+        self._from_ns, self._since_s = start_ns, 0.0
 
     def time_ns(self, now: float) -> int:
         """Return the present time of the log."""
         if not self._is_playing:
             return self._from_ns
-        played_ns = round((now - self._since) * self._speed * 1e9)
+        played_ns = round((now - self._since_s) * self._speed * 1e9)
         return min(self._from_ns + max(played_ns, 0), self.end_ns)
 
     def state(self, now: float) -> PlaybackState:
@@ -140,7 +140,7 @@ class Transport:
 
     def move_to(self, time_ns: int, now: float) -> None:
         """Go to a time, clipped to the log."""
-        self._from_ns, self._since = min(max(time_ns, self.start_ns), self.end_ns), now
+        self._from_ns, self._since_s = min(max(time_ns, self.start_ns), self.end_ns), now
 
     def set_speed(self, speed: float, now: float) -> None:
         """Set the speed, clipped to `SLOWEST` and `FASTEST`; ignore one that is not positive and finite."""
@@ -192,9 +192,9 @@ class Questions:
             wait_for_evaluation: returns the evaluation that viewers see; see `Session.wait_for_evaluation`.
         """
         self._wait_for_evaluation = wait_for_evaluation
-        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
-        self._open: list[Future[Any]] = []
-        self._changing = Lock()
+        self._queue: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        self._open_answers: list[Future[Any]] = []
+        self._lock = Lock()
         self._is_over = False
 
     def ask(self, work: Callable[[Evaluated], _Answer]) -> _Answer:
@@ -205,18 +205,18 @@ class Questions:
             Exception: any error of `work`.
         """
         evaluated, answer = self._wait_for_evaluation(), Future[_Answer]()
-        with self._changing:
+        with self._lock:
             if self._is_over:
                 raise session_over()
-            if len(self._open) >= MOST_OPEN:
+            if len(self._open_answers) >= MOST_OPEN:
                 raise UsageError(f"{MOST_OPEN} questions are open already; ask again when they are answered")
-            self._open.append(answer)
-            self._waiting.put((answer, partial(work, evaluated)))
+            self._open_answers.append(answer)
+            self._queue.put((answer, partial(work, evaluated)))
         return answer.result()
 
     def run(self) -> None:
         """Answer questions until `stop`."""
-        while (question := self._waiting.get()) is not None:
+        while (question := self._queue.get()) is not None:
             answer, work = question
             # `stop` may refuse the question before or during its computation
             with suppress(InvalidStateError):
@@ -225,17 +225,17 @@ class Questions:
                         answer.set_result(work())
                     except Exception as error:
                         answer.set_exception(error)
-            with self._changing:
-                self._open.remove(answer)
+            with self._lock:
+                self._open_answers.remove(answer)
 
     def stop(self) -> None:
         """Refuse all open and all later questions."""
-        with self._changing:
+        with self._lock:
             self._is_over = True
-            for answer in self._open:
+            for answer in self._open_answers:
                 with suppress(InvalidStateError):
                     answer.set_exception(session_over())
-            self._waiting.put(None)
+            self._queue.put(None)
 
 
 def session_over() -> UsageError:
@@ -289,12 +289,12 @@ class Session:
         self._transport, self._zero_ns = Transport(start_ns, end_ns), loaded.first_ns
         self.edited = loaded.edit({})
         self._pending = PendingRequests()
-        # `_awaited` gets the evaluation after the next requests, `_due` the one after the present requests
-        self._awaited: Future[Evaluated] | None = None
-        self._due: Future[Evaluated] | None = None
+        # the evaluation after the next requests, and the evaluation after the present requests
+        self._next_evaluation: Future[Evaluated] | None = None
+        self._due_evaluation: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
-        self._loops = False
+        self._is_looping = False
         self._is_behind = False
         self.arrow = ""
         self.failure: SpatialReplayError | None = None
@@ -324,9 +324,9 @@ class Session:
     def playback(self) -> Mapping[str, float | bool]:
         """The values of the parameters in `PLAYBACK`, by name."""
         state = self.state
-        seconds = round((state.time_ns - self._zero_ns) / 1e9, 3)
+        time_s = round((state.time_ns - self._zero_ns) / 1e9, 3)
         is_playing = state.status is Status.PLAYING
-        return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
+        return dict(zip(PLAYBACK, (time_s, is_playing, state.speed, self._is_looping), strict=True))
 
     # ------------------------------------------------------------------------ called for viewers
 
@@ -336,22 +336,22 @@ class Session:
         At the end of the log, playback starts again at the first time.
         """
         with self._requested:
-            now = self._pace.now()
-            status = self._transport.state(now).status
+            now_s = self._pace.now()
+            status = self._transport.state(now_s).status
             if seek_ns is None and is_playing and status is Status.ENDED:
                 seek_ns = self._transport.start_ns
             # the messages since the last turn are not sent yet
             is_behind = self._is_behind or status is Status.PLAYING
             self._is_behind = seek_ns is None and not is_playing and is_behind
-            self._transport.set_speed(speed, now)
+            self._transport.set_speed(speed, now_s)
             if seek_ns is not None:
-                self._transport.move_to(seek_ns, now)
-                self._pending.seek_ns = self._transport.time_ns(now)
-            (self._transport.play if is_playing else self._transport.pause)(now)
+                self._transport.move_to(seek_ns, now_s)
+                self._pending.seek_ns = self._transport.time_ns(now_s)
+            (self._transport.play if is_playing else self._transport.pause)(now_s)
             self._pending.is_controlled = True
             self._requested.notify()
             # without did_seek: the player reports the jump right before it sends the messages of that time
-            return self._transport.state(now)
+            return self._transport.state(now_s)
 
     def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
         """Set some parameters of `PLAYBACK`, and return the state.
@@ -359,24 +359,24 @@ class Session:
         Raises:
             UsageError: a value has another type, or a number is outside its limits.
         """
-        now = self.playback
+        current_values = self.playback
         time, play, speed, loop = PLAYBACK
         for name, value in values.items():
-            is_flag = isinstance(now[name], bool)
+            is_flag = isinstance(current_values[name], bool)
             if isinstance(value, str) or isinstance(value, bool) != is_flag:
-                kind = "true or false" if is_flag else "a number"
-                raise UsageError(f"{name} cannot be {value!r}: give {kind}")
+                kind_text = "true or false" if is_flag else "a number"
+                raise UsageError(f"{name} cannot be {value!r}: give {kind_text}")
             if name == speed and not (SLOWEST <= value <= FASTEST):
                 raise UsageError(f"{name} cannot be {value!r}: give a number from {SLOWEST:g} to {FASTEST:g}")
             if not is_flag and not (0.0 <= value < float("inf")):
                 raise UsageError(f"{name} cannot be {value!r}: give a number of seconds, at least 0")
-        self._loops = bool(values.get(loop, self._loops))
+        self._is_looping = bool(values.get(loop, self._is_looping))
         seek_ns = None
         if time in values:
             seek_ns = self._zero_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
         return self.control(
-            is_playing=bool(values.get(play, now[play])),
-            speed=float(values.get(speed, now[speed])),
+            is_playing=bool(values.get(play, current_values[play])),
+            speed=float(values.get(speed, current_values[speed])),
             seek_ns=seek_ns,
         )
 
@@ -410,11 +410,11 @@ class Session:
         A constant that a viewer changed keeps the viewer's value, unless its file changed, too.
         """
         with self._requested:
-            before = self.edited
-            constants_before = before.loaded.constants
+            edited_before = self.edited
+            constants_before = edited_before.loaded.constants
             values_from_viewers = {
                 name: value
-                for name, value in before.given.items()
+                for name, value in edited_before.given.items()
                 if name in loaded.constants
                 # `write_constants` wrote the viewer's earlier value; the present one may be newer
                 and (loaded.constants[name] == constants_before[name] or loaded.was_written(name))
@@ -441,9 +441,9 @@ class Session:
         with self._requested:
             if self._is_over:
                 raise session_over()
-            awaited = self._awaited = self._awaited or Future()
+            evaluation = self._next_evaluation = self._next_evaluation or Future()
             self._requested.notify()
-        return awaited.result()
+        return evaluation.result()
 
     def stop(self) -> None:
         """End the session, and wake the player's thread."""
@@ -464,11 +464,11 @@ class Session:
         with self._requested:
             is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
             self._requested.wait_for(
-                lambda: self._pending or self._awaited is not None,
+                lambda: self._pending or self._next_evaluation is not None,
                 patience_s if is_playing or is_due else None,
             )
             pending, self._pending = self._pending, PendingRequests()
-            self._due, self._awaited = self._awaited, None
+            self._due_evaluation, self._next_evaluation = self._next_evaluation, None
             return pending
 
     def play_up_to(self, reach_ns: int) -> PlaySpan | None:
@@ -481,14 +481,14 @@ class Session:
         """
         with self._requested:
             elapsed_s = self._pace.next_turn()
-            now = self._pace.now()
-            state = self._transport.state(now)
+            now_s = self._pace.now()
+            state = self._transport.state(now_s)
             is_due = self._is_behind or state.status is Status.PLAYING
             self._is_behind = False
             if not is_due or self._pending.seek_ns is not None:
                 return None
             if reach_ns < state.time_ns:
-                self._transport.move_to(reach_ns, now)
+                self._transport.move_to(reach_ns, now_s)
             return PlaySpan(min(state.time_ns, reach_ns), elapsed_s)
 
     def continue_from(self, time_ns: int) -> None:
@@ -515,30 +515,32 @@ class Session:
     def pause(self) -> PlaybackState:
         """Pause, unless a seek is pending, and return the state."""
         with self._requested:
-            now = self._pace.now()
+            now_s = self._pace.now()
             if self._pending.seek_ns is None:
-                self._transport.pause(now)
-            return self._transport.state(now)
+                self._transport.pause(now_s)
+            return self._transport.state(now_s)
 
     def finish(self) -> PlaybackState:
         """Pause at the end, or start again if `playback.loop` is set."""
-        if self._loops:
+        if self._is_looping:
             return self.control(is_playing=True, speed=self.state.speed, seek_ns=self._transport.start_ns)
         return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
         """Return an evaluation to all calls of `wait_for_evaluation` before the last `next_requests`."""
         with self._requested:
-            due, self._due = self._due, None
-        if due is not None:
-            due.set_result(evaluated)
+            due_evaluation, self._due_evaluation = self._due_evaluation, None
+        if due_evaluation is not None:
+            due_evaluation.set_result(evaluated)
 
     def end(self) -> None:
         """Make waiting and later calls of `wait_for_evaluation` raise."""
         with self._requested:
             self._is_over = True
-            open_futures = [future for future in (self._awaited, self._due) if future is not None]
-            self._awaited = self._due = None
+            open_futures = [
+                future for future in (self._next_evaluation, self._due_evaluation) if future is not None
+            ]
+            self._next_evaluation = self._due_evaluation = None
         for future in open_futures:
             future.set_exception(session_over())
 
@@ -579,36 +581,37 @@ class PlaybackThinning:
     """
 
     def __init__(self) -> None:
-        self._passed_s = 0.0
-        self._left: dict[str, tuple[float, float]] = {}
+        self._elapsed_s = 0.0
+        self._allowances: dict[str, tuple[float, float]] = {}
 
     def thin(self, messages: Messages, elapsed_s: float) -> Messages:
         """Return the messages to send from those of a turn that lasted `elapsed_s` seconds."""
-        self._passed_s += elapsed_s
-        most = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
+        self._elapsed_s += elapsed_s
+        most_samples = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
         is_sent = np.ones(len(messages), np.bool_)
         payloads: dict[int, bytes] = {}
-        for channel, rows in messages.by_channel():
+        for channel, message_indices in messages.by_channel():
             if channel.topic in _NEVER_THINNED:
                 continue
-            times_ns, which = np.unique(messages.log_time_ns[rows], return_inverse=True)
+            times_ns, time_indices = np.unique(messages.log_time_ns[message_indices], return_inverse=True)
             # a turn at the limit has one sample more by its phase
-            count = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most
-            if len(times_ns) <= count + (not _is_drawn(channel)):
+            limit = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most_samples
+            if len(times_ns) <= limit + (not _is_drawn(channel)):
                 continue
             is_chosen = np.zeros(len(times_ns), np.bool_)
-            is_chosen[np.linspace(len(times_ns) - 1, 0, count, endpoint=False).astype(np.int64)] = True
-            is_sent[rows] = is_chosen[which]
+            is_chosen[np.linspace(len(times_ns) - 1, 0, limit, endpoint=False).astype(np.int64)] = True
+            is_sent[message_indices] = is_chosen[time_indices]
             if channel.topic == SCENE:
-                payloads |= _with_deletions(messages.payloads, rows, is_sent)
+                payloads |= _with_deletions(messages.payloads, message_indices, is_sent)
         if is_sent.all():
             return messages
-        places = np.flatnonzero(is_sent)
-        sent = select(messages, places)
+        sent_indices = np.flatnonzero(is_sent)
+        sent_messages = select(messages, sent_indices)
         if not payloads:
-            return sent
+            return sent_messages
         return replace(
-            sent, payloads=[payloads.get(place, messages.payloads[place]) for place in places.tolist()]
+            sent_messages,
+            payloads=[payloads.get(index, messages.payloads[index]) for index in sent_indices.tolist()],
         )
 
     def _take(self, topic: str, count: int) -> int:
@@ -616,11 +619,11 @@ class PlaybackThinning:
 
         At most `count` messages are charged to the topic's allowance.
         """
-        left, at_s = self._left.get(topic, (float(_MOST_AT_ONCE), self._passed_s))
-        left = min(left + MOST_DRAWN_A_SECOND * (self._passed_s - at_s), _MOST_AT_ONCE)
-        most = max(1, math.floor(left))
-        self._left[topic] = left - min(count, most), self._passed_s
-        return most
+        allowance, at_s = self._allowances.get(topic, (float(_MOST_AT_ONCE), self._elapsed_s))
+        allowance = min(allowance + MOST_DRAWN_A_SECOND * (self._elapsed_s - at_s), _MOST_AT_ONCE)
+        limit = max(1, math.floor(allowance))
+        self._allowances[topic] = allowance - min(count, limit), self._elapsed_s
+        return limit
 
 
 def _is_drawn(channel: Channel) -> bool:
@@ -631,17 +634,17 @@ def _is_drawn(channel: Channel) -> bool:
 
 def _with_deletions(payloads: Sequence[bytes], places: Integers, is_kept: Booleans) -> dict[int, bytes]:
     """Return the kept scenes after dropped ones, by place, with the deletions of the dropped scenes added."""
-    with_more = {}
-    missed = SceneUpdate()
+    scene_by_index = {}
+    missed_deletions = SceneUpdate()
     for place in places.tolist():
         if not is_kept[place]:
-            missed.deletions.extend(SceneUpdate.FromString(payloads[place]).deletions)
-        elif missed.deletions:
+            missed_deletions.deletions.extend(SceneUpdate.FromString(payloads[place]).deletions)
+        elif missed_deletions.deletions:
             # parsers join the lists of concatenated messages; a viewer deletes before it draws:
             # https://protobuf.dev/programming-guides/encoding/#last-one-wins
-            with_more[place] = missed.SerializeToString(deterministic=True) + payloads[place]
-            missed = SceneUpdate()
-    return with_more
+            scene_by_index[place] = missed_deletions.SerializeToString(deterministic=True) + payloads[place]
+            missed_deletions = SceneUpdate()
+    return scene_by_index
 
 
 class Note(NamedTuple):
@@ -705,7 +708,7 @@ class Player:
         self._session = session
         self._viewers = viewers
         self._thinning = PlaybackThinning()
-        self._turns = 0
+        self._turn_count = 0
         self._shows_again = False
 
     def run(self) -> None:
@@ -744,14 +747,14 @@ class Player:
 
         After an error, viewers get the former values.
         """
-        before = self._playback.evaluated
+        evaluated_before = self._playback.evaluated
         try:
             self._playback.evaluated = edited.loaded.evaluate(edited)
         except SpatialReplayError as error:
             self._viewers.send_note(Note(CONSTANTS, str(error)))
-            self._viewers.send_values(self._session.restore(before.edited, error))
+            self._viewers.send_values(self._session.restore(evaluated_before.edited, error))
             return False
-        if edited.loaded is not before.loaded:
+        if edited.loaded is not evaluated_before.loaded:
             # viewers know the constants that they set, not those of a file that was saved
             self._viewers.send_values(constant_values(edited.constants))
         self._viewers.remove_note(CONSTANTS)
@@ -786,10 +789,10 @@ class Player:
         """
         self._viewers.send_time(self._playback.start_ns)
         self._viewers.send_time(time_ns)
-        present = self._playback.seek(time_ns)
+        present_messages = self._playback.seek(time_ns)
         self._viewers.publish(self._playback.past)
         self._send_curves(time_ns)
-        self._viewers.publish(present)
+        self._viewers.publish(present_messages)
         self._viewers.send_time(time_ns)
 
     def _resend(self, topics: Collection[str]) -> None:
@@ -813,14 +816,14 @@ class Player:
         if span is None:
             return
         time_ns = span.time_ns
-        coming = self._playback.advance_to(time_ns)
-        self._viewers.publish(self._thinning.thin(coming, span.elapsed_s))
+        new_messages = self._playback.advance_to(time_ns)
+        self._viewers.publish(self._thinning.thin(new_messages, span.elapsed_s))
         self._viewers.send_time(time_ns)
-        self._turns += 1
-        if self._turns % _CURVES_EVERY == 0:
+        self._turn_count += 1
+        if self._turn_count % _CURVES_EVERY == 0:
             self._send_curves(time_ns)
         if time_ns == self._playback.end_ns:
             self._viewers.send_state(self._session.finish())
             self._viewers.send_playback()
-        elif self._turns % _PLAYBACK_EVERY == 0:
+        elif self._turn_count % _PLAYBACK_EVERY == 0:
             self._viewers.send_playback()

@@ -52,8 +52,8 @@ class Gate:
         """
         allowed = set(VIEWERS)
         for origin in origins:
-            parts = urlsplit(origin)
-            if not parts.scheme or not parts.netloc or parts.path.strip("/") or parts.query:
+            url = urlsplit(origin)
+            if not url.scheme or not url.netloc or url.path.strip("/") or url.query:
                 raise UsageError(
                     f"{origin!r} is not the origin of a page; give it as in https://viewer.example.org:8080"
                 )
@@ -63,8 +63,8 @@ class Gate:
     def refusal(self, head: bytes) -> str | None:
         """Return the HTTP status for a refused request; None for an accepted one."""
         request, *lines = head.decode("latin-1").split("\r\n")
-        split = (line.partition(":") for line in lines)
-        fields = [(name.strip().lower(), value.strip()) for name, _, value in split]
+        split_lines = (line.partition(":") for line in lines)
+        fields = [(name.strip().lower(), value.strip()) for name, _, value in split_lines]
         words = request.split(" ")
         if len(words) != 3 or words[0] != "GET" or dict(fields).get("upgrade", "").lower() != "websocket":
             return "426 Upgrade Required"
@@ -82,8 +82,8 @@ class Gate:
         if origin.lower() in self.origins:
             return True
         try:
-            parts = urlsplit(origin)
-            return parts.scheme in ("http", "https") and is_loopback(parts.hostname or "")
+            url = urlsplit(origin)
+            return url.scheme in ("http", "https") and is_loopback(url.hostname or "")
         except ValueError:
             return False
 
@@ -135,9 +135,9 @@ class Relay:
         self._connections: set[asyncio.Task[None]] = set()
         self._thread = Thread(target=self._loop.run_forever, name="relay", daemon=True)
         self._thread.start()
-        listening = asyncio.start_server(self._accept, host, port, limit=_MOST_HEAD)
+        start = asyncio.start_server(self._accept, host, port, limit=_MOST_HEAD)
         try:
-            self._server = asyncio.run_coroutine_threadsafe(listening, self._loop).result()
+            self._server = asyncio.run_coroutine_threadsafe(start, self._loop).result()
         except BaseException:
             self._end()
             raise
@@ -183,26 +183,28 @@ class Relay:
             await writer.wait_closed()
             return
         request = b"GET / HTTP/1.1\r\n" + request.partition(b"\r\n")[2]
-        offered = {
+        offered_protocols = {
             protocol.strip() for header in _OFFER.findall(request) for protocol in header.decode().split(",")
         }
         # the SDK accepts only the name of the newer protocol; an old viewer expects the name that it offered
-        is_old = OLD_PROTOCOL in offered
-        if is_old and PROTOCOL not in offered:
+        is_old = OLD_PROTOCOL in offered_protocols
+        if is_old and PROTOCOL not in offered_protocols:
             request = _OFFER.sub(f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n".encode(), request)
-        inner, outer = await asyncio.open_connection(*self._behind, limit=_MOST_HEAD)
+        server_reader, server_writer = await asyncio.open_connection(*self._behind, limit=_MOST_HEAD)
         try:
-            outer.write(request)
-            response = await inner.readuntil(b"\r\n\r\n")
-            if is_old and PROTOCOL not in offered:
+            server_writer.write(request)
+            response = await server_reader.readuntil(b"\r\n\r\n")
+            if is_old and PROTOCOL not in offered_protocols:
                 response = response.replace(PROTOCOL.encode(), OLD_PROTOCOL.encode())
             writer.write(response)
             viewer = _Viewer(understands_state=not is_old)
-            await _until_one_ends(_from_viewer(reader, outer, viewer), _to_viewer(inner, writer, viewer))
+            await _until_one_ends(
+                _from_viewer(reader, server_writer, viewer), _to_viewer(server_reader, writer, viewer)
+            )
             # the server's last frames, such as the reason for closing
             await _drain(writer)
         finally:
-            outer.transport.abort()
+            server_writer.transport.abort()
 
 
 class _Viewer:
@@ -212,11 +214,11 @@ class _Viewer:
         self.understands_state = understands_state
 
 
-async def _until_one_ends(*both: Coroutine[Any, Any, None]) -> None:
-    tasks = [asyncio.create_task(direction) for direction in both]
+async def _until_one_ends(*directions: Coroutine[Any, Any, None]) -> None:
+    tasks = [asyncio.create_task(direction) for direction in directions]
     try:
-        finished, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in finished:
+        finished_tasks, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in finished_tasks:
             with suppress(OSError, EOFError, TimeoutError):
                 task.result()
     finally:
@@ -231,9 +233,9 @@ async def _from_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWrite
         frame = await _read_head(reader)
         viewer.understands_state |= frame.kind == (_BINARY, _CONTROL_REQUEST)
         if frame.is_whole_text and frame.rest < _MOST_TEXT:
-            mask, first = frame.begin[-5:-1], frame.begin[-1:]
-            text = _unmask(first + await reader.readexactly(frame.rest), mask)
-            writer.write(_text_frame(with_exact_numbers(text)))
+            frame_mask, first_byte = frame.begin[-5:-1], frame.begin[-1:]
+            request = _unmask(first_byte + await reader.readexactly(frame.rest), frame_mask)
+            writer.write(_text_frame(with_exact_numbers(request)))
             await _drain(writer)
         else:
             await _pass_on(frame, reader, writer)
@@ -263,19 +265,19 @@ def _exact_integer(number: str) -> int | str:
 
 
 def _unmask(content: bytes, mask: bytes) -> bytes:
-    return bytes(byte ^ mask[place % 4] for place, byte in enumerate(content))
+    return bytes(byte ^ mask[index % 4] for index, byte in enumerate(content))
 
 
 def _text_frame(content: bytes) -> bytes:
     """Return an unsplit text frame of a client, masked with zeros: RFC 6455, sections 5.2 and 5.3."""
     size = len(content)
     if size < 126:
-        length = bytes([0x80 | size])
+        length_bytes = bytes([0x80 | size])
     elif size < 1 << 16:
-        length = b"\xfe" + size.to_bytes(2, "big")
+        length_bytes = b"\xfe" + size.to_bytes(2, "big")
     else:
-        length = b"\xff" + size.to_bytes(8, "big")
-    return bytes([_FINAL | _TEXT]) + length + bytes(4) + content
+        length_bytes = b"\xff" + size.to_bytes(8, "big")
+    return bytes([_FINAL | _TEXT]) + length_bytes + bytes(4) + content
 
 
 async def _to_viewer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, viewer: _Viewer) -> None:
@@ -310,26 +312,26 @@ class _Frame(NamedTuple):
 
 
 async def _read_head(reader: asyncio.StreamReader) -> _Frame:
-    begin = await reader.readexactly(2)
-    is_masked, length = begin[1] & 0x80, begin[1] & 0x7F
+    head_bytes = await reader.readexactly(2)
+    is_masked, length = head_bytes[1] & 0x80, head_bytes[1] & 0x7F
     if length >= 126:
-        begin += await reader.readexactly(2 if length == 126 else 8)
-        length = int.from_bytes(begin[2:], "big")
+        head_bytes += await reader.readexactly(2 if length == 126 else 8)
+        length = int.from_bytes(head_bytes[2:], "big")
     mask = await reader.readexactly(4) if is_masked else b"\0"
-    first = await reader.readexactly(min(length, 1))
-    content = first[0] ^ mask[0] if first else -1
-    begin += (mask if is_masked else b"") + first
-    return _Frame(begin, length - len(first), (begin[0] & 0x0F, content))
+    first_byte = await reader.readexactly(min(length, 1))
+    first_content = first_byte[0] ^ mask[0] if first_byte else -1
+    head_bytes += (mask if is_masked else b"") + first_byte
+    return _Frame(head_bytes, length - len(first_byte), (head_bytes[0] & 0x0F, first_content))
 
 
 async def _pass_on(frame: _Frame, reader: asyncio.StreamReader, writer: asyncio.StreamWriter | None) -> None:
     """Pass on a frame; without a writer, skip it."""
     if writer is not None:
         writer.write(frame.begin)
-    left = frame.rest
-    while left:
-        piece = await reader.readexactly(min(left, _PIECE))
-        left -= len(piece)
+    left_bytes = frame.rest
+    while left_bytes:
+        piece = await reader.readexactly(min(left_bytes, _PIECE))
+        left_bytes -= len(piece)
         if writer is not None:
             writer.write(piece)
             await _drain(writer)

@@ -53,7 +53,7 @@ from spatial_replay.trace.trace import duration_ns_from_text
 _MOST_BYTES: Final = 1 << 16
 
 
-class _Served(NamedTuple):
+class _ServiceDefinition(NamedTuple):
     """A service of a session.
 
     Attributes:
@@ -77,15 +77,15 @@ def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[st
     if fault is not None:
         place = "/".join(map(str, fault.absolute_path))
         raise UsageError(f"the request{f' at {place}' if place else ''}: {fault.message}")
-    members: Mapping[str, Any] = request
-    return members
+    request_object: Mapping[str, Any] = request
+    return request_object
 
 
 def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Replay with other constants. Viewers keep the present evaluation."""
-    changed = _constants_in(request, evaluated)
-    if changed:
-        evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed})
+    changed_values = _constants_in(request, evaluated)
+    if changed_values:
+        evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed_values})
     results = tuple(replace(result, has_series=False) for result in evaluated.replayed.results)
     document = document_from_replay(replace(evaluated.replayed, results=results))
     return {**document, "constants": _constants_of(evaluated)}
@@ -143,14 +143,14 @@ _PLAYBACK_STATE: Final[Mapping[str, Any]] = _object(
     loop={"type": "boolean"},
 )
 
-_SERVICES: Final[Mapping[str, _Served]] = MappingProxyType(
+_SERVICES: Final[Mapping[str, _ServiceDefinition]] = MappingProxyType(
     {
-        "evaluate": _Served(
+        "evaluate": _ServiceDefinition(
             _object("spatial_replay.EvaluateRequest", constants=_CONSTANTS),
             {"title": "spatial_replay.EvaluateResponse", "type": "object", "properties": {}},
             lambda server, request: server.ask(_evaluate, request),
         ),
-        "explain": _Served(
+        "explain": _ServiceDefinition(
             _object(
                 "spatial_replay.ExplainRequest",
                 node={"description": "Name of a spec, a result or a part of one.", "type": "string"},
@@ -165,7 +165,7 @@ _SERVICES: Final[Mapping[str, _Served]] = MappingProxyType(
             },
             lambda server, request: server.ask(_explain, request),
         ),
-        "write_constants": _Served(
+        "write_constants": _ServiceDefinition(
             _object("spatial_replay.WriteConstantsRequest", constants=_CONSTANTS),
             {
                 "title": "spatial_replay.WriteConstantsResponse",
@@ -175,22 +175,22 @@ _SERVICES: Final[Mapping[str, _Served]] = MappingProxyType(
             lambda server, request: server.ask(_write_constants, request),
         ),
         # for viewers without controls of their own
-        "play": _Served(
+        "play": _ServiceDefinition(
             _object("spatial_replay.PlayRequest"),
             _PLAYBACK_STATE,
             lambda server, _: server.steer(_PLAY, True),
         ),
-        "pause": _Served(
+        "pause": _ServiceDefinition(
             _object("spatial_replay.PauseRequest"),
             _PLAYBACK_STATE,
             lambda server, _: server.steer(_PLAY, False),
         ),
-        "seek": _Served(
+        "seek": _ServiceDefinition(
             {**_object("spatial_replay.SeekRequest", time=_SECONDS), "required": ["time"]},
             _PLAYBACK_STATE,
             lambda server, request: server.steer(_TIME, request["time"]),
         ),
-        "speed": _Served(
+        "speed": _ServiceDefinition(
             {**_object("spatial_replay.SpeedRequest", speed=_TIMES), "required": ["speed"]},
             _PLAYBACK_STATE,
             lambda server, request: server.steer(_SPEED, request["speed"]),
@@ -275,24 +275,24 @@ class PublishingServer:
         """
         self._gate = Gate.of(host, origins)
         self._context = foxglove.Context()
-        self._sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
+        self._channel_by_key: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
         self._channels: dict[Channel, foxglove.Channel] = {}
         for channel in channels:
             self._advertise(channel)
         self._host = f"[{host}]" if _is_v6(host) else host
-        self._started: Future[protocol.WebSocketServer] = Future()
-        self._behind = _inner_host()
-        started = foxglove.start_server(
+        self._sdk_server: Future[protocol.WebSocketServer] = Future()
+        self._sdk_host = _inner_host()
+        sdk_server = foxglove.start_server(
             name=name,
-            host=self._behind,
+            host=self._sdk_host,
             port=0,
             supported_encodings=["json"],
             context=self._context,
             **self._options(),
         )
-        self._started.set_result(started)
+        self._sdk_server.set_result(sdk_server)
         try:
-            self._relay = Relay(host, port, (self._behind, self._server.port), self._gate)
+            self._relay = Relay(host, port, (self._sdk_host, self._server.port), self._gate)
         except (OSError, UnicodeError) as error:
             self._server.stop()
             reason = "no such name" if isinstance(error, UnicodeError) else system_reason(error)
@@ -320,19 +320,23 @@ class PublishingServer:
 
     def wants(self, topic: str) -> bool:
         """Return whether a viewer has subscribed to a topic."""
-        return any(sent.has_sinks() for channel, sent in self._channels.items() if channel.topic == topic)
+        return any(
+            sdk_channel.has_sinks()
+            for channel, sdk_channel in self._channels.items()
+            if channel.topic == topic
+        )
 
     def publish(self, messages: Messages) -> None:
         """Send messages to the viewers that have subscribed to their topics."""
-        subscribed = {
-            number: sent
+        sdk_channels = {
+            number: sdk_channel
             for number, channel in messages.channels.items()
-            if (sent := self._channels.get(channel)) is not None and sent.has_sinks()
+            if (sdk_channel := self._channels.get(channel)) is not None and sdk_channel.has_sinks()
         }
-        numbers, times_ns = messages.channel.tolist(), messages.log_time_ns.tolist()
-        for number, time_ns, payload in zip(numbers, times_ns, messages.payloads, strict=True):
-            if number in subscribed:
-                subscribed[number].log(payload, log_time=time_ns)
+        channel_numbers, times_ns = messages.channel.tolist(), messages.log_time_ns.tolist()
+        for number, time_ns, payload in zip(channel_numbers, times_ns, messages.payloads, strict=True):
+            if number in sdk_channels:
+                sdk_channels[number].log(payload, log_time=time_ns)
 
     def send_time(self, time_ns: int) -> None:
         """Send the present time of the log."""
@@ -349,7 +353,7 @@ class PublishingServer:
     @property
     def _server(self) -> protocol.WebSocketServer:
         """The SDK's server. A fast viewer may send a request before `start_server` returns it."""
-        return self._started.result()
+        return self._sdk_server.result()
 
     def _options(self) -> dict[str, Any]:
         """Return the keyword arguments of `foxglove.start_server` that differ between servers."""
@@ -360,18 +364,18 @@ class PublishingServer:
         if channel.schema is None and channel.encoding != "json":
             return
         # channels that differ only in their publisher are one to a viewer
-        alike = channel.topic, channel.encoding, channel.schema
-        if alike not in self._sent:
-            self._sent[alike] = self._channel(channel)
-        self._channels[channel] = self._sent[alike]
+        viewer_key = channel.topic, channel.encoding, channel.schema
+        if viewer_key not in self._channel_by_key:
+            self._channel_by_key[viewer_key] = self._channel(channel)
+        self._channels[channel] = self._channel_by_key[viewer_key]
 
     def _channel(self, channel: Channel) -> foxglove.Channel:
         schema = channel.schema
-        described = None
+        sdk_schema = None
         if schema is not None:
-            described = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+            sdk_schema = foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
         return foxglove.Channel(
-            channel.topic, schema=described, message_encoding=channel.encoding, context=self._context
+            channel.topic, schema=sdk_schema, message_encoding=channel.encoding, context=self._context
         )
 
 
@@ -398,23 +402,23 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             UsageError: the address cannot be used, or an origin is malformed.
         """
         self._session, self._questions = session, questions
-        self._rejected = ""
+        self._rejection = ""
         super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
 
     def send_note(self, note: Note) -> None:
         """Send a note. Some viewers keep notes, so a rejected value is sent as the parameter `rejected`."""
         if note.about not in (CONSTANTS, ARROW):
             super().send_note(note)
-        elif note.text != self._rejected:
-            self._rejected = note.text[:_LONGEST_NOTE]
+        elif note.text != self._rejection:
+            self._rejection = note.text[:_LONGEST_NOTE]
             self.send_playback()
 
     def remove_note(self, about: str) -> None:
         """Remove the note about a subject."""
         if about not in (CONSTANTS, ARROW):
             super().remove_note(about)
-        elif self._rejected:
-            self._rejected = ""
+        elif self._rejection:
+            self._rejection = ""
             self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
@@ -432,7 +436,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
     @property
     def steering(self) -> Mapping[str, float | str | bool]:
         """All parameters except constants."""
-        return {**self._session.playback, ARROW: self._session.arrow, _REJECTED: self._rejected}
+        return {**self._session.playback, ARROW: self._session.arrow, _REJECTED: self._rejection}
 
     def ask(
         self,
@@ -465,8 +469,8 @@ class LiveServer(PublishingServer, protocol.ServerListener):
         answer: Callable[[LiveServer, Mapping[str, Any]], Mapping[str, Any]],
     ) -> Service:
         def handle(call: ServiceRequest) -> bytes:
-            answered = answer(self, _request(name, call.payload, request))
-            return json.dumps(answered, ensure_ascii=False, allow_nan=False).encode()
+            response_object = answer(self, _request(name, call.payload, request))
+            return json.dumps(response_object, ensure_ascii=False, allow_nan=False).encode()
 
         return _json_service(name, request, response, handle)
 
@@ -545,12 +549,16 @@ class RunServer(PublishingServer, protocol.ServerListener):
             if channel not in self._channels:
                 self._advertise(channel)
         super().publish(messages)
-        for channel, rows in messages.by_channel():
+        for channel, message_indices in messages.by_channel():
             if channel in self._channels and _is_state(channel):
-                time_ns = int(messages.log_time_ns[rows[-1]])
-                newest = rows[messages.log_time_ns[rows] == time_ns].tolist()
-                sent = self._channels[channel]
-                self._latest[sent.id()] = sent, time_ns, [messages.payloads[place] for place in newest]
+                time_ns = int(messages.log_time_ns[message_indices[-1]])
+                newest_indices = message_indices[messages.log_time_ns[message_indices] == time_ns].tolist()
+                sdk_channel = self._channels[channel]
+                self._latest[sdk_channel.id()] = (
+                    sdk_channel,
+                    time_ns,
+                    [messages.payloads[index] for index in newest_indices],
+                )
 
     def send_time(self, time_ns: int) -> None:
         """Send the time of the newest sample."""
@@ -563,11 +571,11 @@ class RunServer(PublishingServer, protocol.ServerListener):
         # `publish` may store newer messages on another thread while these are sent
         while latest is not self._latest.get(channel.id):
             latest = self._latest[channel.id]
-            sent, time_ns, payloads = latest
-            present_ns = self._time_ns or time_ns
+            sdk_channel, time_ns, payloads = latest
+            newest_ns = self._time_ns or time_ns
             for payload in payloads:
-                sent.log(payload, log_time=present_ns)
-            super().send_time(present_ns)
+                sdk_channel.log(payload, log_time=newest_ns)
+            super().send_time(newest_ns)
 
     def _options(self) -> dict[str, Any]:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
@@ -708,8 +716,8 @@ def _is_v6(host: str) -> bool:
 def _is_own(host: str) -> bool:
     """Return whether an address belongs to this machine, by binding a socket to it."""
     try:
-        family, kind, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, number) as probe:
+        family, socket_type, number, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, socket_type, number) as probe:
             probe.bind(address)
     except (OSError, UnicodeError):
         return False
@@ -804,30 +812,30 @@ def open_server(
     session = Session(evaluated.loaded, playback.start_ns, playback.end_ns)
     questions = Questions(session.wait_for_evaluation)
     server = LiveServer(session, questions, (*playback.channels, CURVES_CHANNEL), host, port, origins)
-    loop = _in_background(Player(playback, session, server).run, "player")
-    answering = _in_background(questions.run, "questions")
+    player_future = _in_background(Player(playback, session, server).run, "player")
+    questions_future = _in_background(questions.run, "questions")
     try:
         if play:
             session.control(is_playing=True, speed=1.0)
-        yield Serving(server.address, loop, session, server)
+        yield Serving(server.address, player_future, session, server)
     finally:
         session.stop()
         questions.stop()
-        wait([loop, answering], _LAST_S)
+        wait([player_future, questions_future], _LAST_S)
         server.stop()
 
 
 def _in_background(work: Callable[[], None], name: str) -> Future[None]:
     """Do work on a daemon thread, so that the end of the process does not wait for it."""
-    ended: Future[None] = Future()
+    future: Future[None] = Future()
 
     def run() -> None:
         try:
             work()
         except BaseException as error:
-            ended.set_exception(error)
+            future.set_exception(error)
         else:
-            ended.set_result(None)
+            future.set_result(None)
 
     Thread(target=run, name=name, daemon=True).start()
-    return ended
+    return future
