@@ -19,8 +19,9 @@ class TreeNode(NamedTuple):
 
     Attributes:
         kind: type of the node, such as Sequence or Retry; Action for a leaf; empty for nodes of Nav2.
-        parent: index of its parent in `TreeTick.nodes`; None for the root, and for nodes of Nav2.
-        status: RUNNING, SUCCESS or FAILURE; INVALID without a tick since the start or reset of the tree.
+        parent: index of the parent node in `TreeTick.nodes`; None for the root, and for nodes of Nav2.
+        status: RUNNING, SUCCESS or FAILURE; INVALID for a node without a tick since the tree's start or
+            reset.
     """
 
     name: str
@@ -36,7 +37,7 @@ class TreeTick(NamedTuple):
     nodes: tuple[TreeNode, ...]
 
     def payload(self, time_ns: int) -> bytes:
-        """Encode the tick as a message; `time_ns` is on the clock of the samples."""
+        """Encode the tick as a message; `time_ns` is a time on the samples' clock."""
         message = BehaviourTree(time_ns=time_ns, tick=self.number)
         for node in self.nodes:
             status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
@@ -70,8 +71,8 @@ def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
 class Nav2Tree:
     """Nodes of a Nav2 behaviour tree, from its log of status changes.
 
-    The log names no parents. Nodes are sorted by `uid`, which is depth first. Older versions of Nav2 give no
-    `uid`; their nodes are in the order of their first status change.
+    The log names no parents. Nodes are sorted by `uid`, which Nav2 counts depth first. Older versions of Nav2
+    give no `uid`; their nodes are in the order of their first status change.
     """
 
     def __init__(self) -> None:
@@ -87,6 +88,6 @@ class Nav2Tree:
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"
             self._nodes[node_key] = TreeNode(change.node_name, "", None, status)
-        # a stable sort: names, in old versions, stay in the order of their first change
+        # a stable sort, so that node names of old versions stay in the order of first changes
         node_keys = sorted(self._nodes, key=lambda key: key if isinstance(key, int) else 0)
         return tuple(self._nodes[key] for key in node_keys)

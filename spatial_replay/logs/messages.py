@@ -185,7 +185,7 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
-    # by identity, because a rank holds the whole schema and is computed once for each object
+    # by identity: a rank holds the whole schema, so it is computed only once for each channel
     channel_by_id = {id(channel): channel for stream in streams for channel in stream.channels.values()}
     by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
     number_by_rank = {rank: number for number, rank in enumerate(sorted(by_rank))}

@@ -77,7 +77,7 @@ class SlotLayout:
 
 
 def parse_object_states(payload: bytes) -> ObjectStates:
-    """Parse a message or a piece of one.
+    """Parse a message, or a piece of a message with some of its fields.
 
     Raises:
         WrongMessageError: invalid bytes, an object without a name, or a vertex without y.
@@ -142,7 +142,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
 
 
 SAMPLES_PER_LAYOUT = 32
-"""Messages that a layout must serve on average: its setup costs as much as reading them piece by piece."""
+"""Least mean number of messages per layout; a layout costs as much as reading that many by pieces."""
 FIRST_LAYOUTS = 16
 """Number of layouts that are set up even if they serve few messages."""
 
@@ -246,9 +246,9 @@ def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tup
 def _first_group(
     first_piece: _Pieces, rows: Bytes, faults: dict[int, str]
 ) -> tuple[_Group | None, NDArray[np.bool_]]:
-    """Return the group of all rows (n, L) with the layout of the first, and (n,) whether a row is settled.
+    """Return the group of rows (n, L) with the first row's layout, and (n,) whether each row is done.
 
-    The group is None if the first row is not a valid message; then only that row is settled.
+    If the first row is not a valid message, the group is None, and only the first row is done.
     """
     is_first_row = np.zeros(len(rows), np.bool_)
     is_first_row[0] = True
@@ -388,7 +388,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
 
 
 def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | None:
-    """Return the report time of each observation, (R,); None if all equal the times of their samples."""
+    """Return the report time of each observation, (R,); None if every report has its sample's time."""
     if all((group.layout.reported == UNKNOWN).all() for group in groups):
         return None
     report_columns = [np.empty(0, np.int64)]
@@ -503,7 +503,7 @@ def _pieces(message: Message, numbers: Floats) -> Payloads:
 
 
 def _row_layout(trace: Trace) -> Integers:
-    """Return (R,) codes; observations of one code have messages that differ only in numbers and name."""
+    """Return layout codes (R,); messages of observations with equal codes differ only in numbers and name."""
     shapes = trace.footprints
     part_counts = np.diff(shapes.part_start)
     vertex_counts = np.diff(shapes.vertex_start)

@@ -55,7 +55,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
 
 
 Durability: TypeAlias = Literal["process", "disk"]
-"""Failure that a flushed file survives: a crash of the process, or also of the machine ("disk")."""
+"""Failure that a flushed file survives: a crash of the process, or also a crash of the machine ("disk")."""
 
 
 def open_output(output: Path, durability: Durability = "process", *, overwrite: bool = True) -> BinaryIO:
@@ -111,7 +111,7 @@ def _stream(file: int, output: Path, durability: Durability = "process") -> Bina
 
 
 class _DurableWriter(io.BufferedWriter):
-    """A stream that waits for the disk at every flush, also at the flush when it is closed."""
+    """A stream that waits for the disk at every flush, also when it is closed."""
 
     def flush(self) -> None:
         super().flush()

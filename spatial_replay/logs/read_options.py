@@ -119,7 +119,7 @@ def late_ns(text: object) -> int:
     """Parse a largest lateness, such as "2s", "500ms" or "all", to nanoseconds.
 
     Raises:
-        UsageError: another text.
+        UsageError: any other text.
     """
     lateness_ns = LATEST_NS if text == "all" else _nanoseconds(text)
     if lateness_ns is None:
@@ -131,7 +131,7 @@ def gap_ns(text: object) -> int | None:
     """Parse a longest pause, such as "2s" or "500ms", to nanoseconds; None for no limit.
 
     Raises:
-        UsageError: another text, or 0.
+        UsageError: any other text, or 0.
     """
     pause_ns = _nanoseconds(text)
     if text is not None and not pause_ns:
@@ -194,7 +194,7 @@ def count_of(faults: Sequence[str]) -> int:
 
 
 class FaultList:
-    """Faults in the order of discovery; `take` returns each once."""
+    """Faults in the order of discovery; `take` returns each fault once."""
 
     def __init__(self) -> None:
         self._fault_count = 0
@@ -211,7 +211,7 @@ class FaultList:
             self._pending.append(fault)
 
     def move_to(self, target: FaultList) -> None:
-        """Move pending faults to another list; add the number of faults beyond the limit to its count."""
+        """Move pending faults to `target`; add the number of faults beyond the limit to its count."""
         for fault in self.take():
             target.add(fault)
         excess = max(0, self._fault_count - MOST_FAULTS)
@@ -228,7 +228,7 @@ class FaultList:
 
 
 class FaultKinds(FaultList):
-    """Faults of a live run. The first fault of a kind is a line; its repetitions are counted until the end.
+    """Faults of a live run. The first fault of each kind is reported; repetitions are counted until the end.
 
     Two faults are of one kind if their topics are equal and their texts differ only in numbers.
     """

@@ -160,7 +160,7 @@ def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
 
 
 def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
-    """Return sorted ranges, joined over the smallest gaps, whose sum is at most `_WASTE` of the ranges."""
+    """Return sorted ranges, joined over the smallest gaps; joining adds at most `_WASTE` of their bytes."""
     ordered = sorted(span for span in ranges if span[1] > span[0])
     needed_bytes = sum(end - begin for begin, end in ordered)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
@@ -248,7 +248,7 @@ _REASONS: Final[Mapping[str, str]] = MappingProxyType(
 WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
-"""First read at the end of a file, bytes; mostly holds the whole index of a log of a gigabyte."""
+"""First read at the end of a file, bytes; it usually holds the whole index of a log of a gigabyte."""
 _HEAD_BYTES: Final = 2**16
 """First read at the beginning of a file, bytes: its format and first records."""
 _LEAST_BYTES: Final = 2**16
@@ -386,7 +386,7 @@ class RemoteFile(PathLike[str]):
         return self.version.size
 
     def current_version(self) -> FileVersion:
-        """Request the version without the content; return `version` if the server refuses that.
+        """Request the version without the content; return `version` if the server refuses the request.
 
         Raises:
             MissingFileError, RemoteError: the file cannot be read.
@@ -736,7 +736,7 @@ def _write(file: RemoteFile, copy: Path, advance: Callable[[int], None]) -> None
 
 
 def _make_room(downloads_folder: Path, room_bytes: int) -> None:
-    """Remove the least recently used copies until the others fit into `room` bytes."""
+    """Remove the least recently used copies until the other copies fit into `room_bytes`."""
     copies = []
     for folder in downloads_folder.iterdir():
         with suppress(OSError):
@@ -764,7 +764,7 @@ def user_cache_folder(name: str) -> Path:
 
 
 def gigabytes(variable: str, otherwise: float) -> int:
-    """Return the bytes of an environment variable in gigabytes.
+    """Return the size that an environment variable gives in gigabytes, in bytes.
 
     Raises:
         UsageError: the variable is not a number of at least 0.
@@ -829,7 +829,7 @@ class RemoteFolder:
         """Read files in parallel, and yield their contents in order.
 
         Raises:
-            MissingFileError: a file is missing; another batch may have joined it with others.
+            MissingFileError: a file is missing; another `batch` may have merged it into another file.
             UsageError: access is denied, or there is no such bucket.
             RemoteError: a file cannot be read.
         """

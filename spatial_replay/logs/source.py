@@ -27,7 +27,7 @@ BLOCK_SAMPLES = 12_288
 SAMPLES_A_GAP: Final = 10
 """Number of samples that are inserted for each `max_gap_ns` of a gap."""
 _MOST_IN_GAP = 10_000
-"""Approximate limit of the samples that are inserted in one gap."""
+"""Approximate maximum number of samples that are inserted in one gap."""
 
 IterBlocks = Callable[..., Iterator[Block]]
 
@@ -126,11 +126,11 @@ class Source:
 
     @property
     def begin_ns(self) -> int | None:
-        """A close lower bound of the first sample's time; None if that takes reading the samples."""
+        """A close lower bound of the first sample's time; None if only reading the samples shows the time."""
         return None
 
     def keeping(self, keep: tuple[str, ...] = ()) -> Source:
-        """Return a source that reads its samples, and other messages only on topics to keep.
+        """Return this source with its samples, and with other messages only on topics to keep.
 
         Args:
             keep: topic patterns, see `is_kept`.

@@ -137,7 +137,7 @@ AUTOMATA = "spatial_replay_automata"
 """The metadata record with the sizes of automata, or the reason why a specification has none."""
 
 AUTOMATA_PREFIX = "automata/"
-"""Prefix of attachments with automata; the prefix of their specification follows."""
+"""Prefix of attachments with automata; the specification's prefix follows it."""
 
 LAYOUT = "layout.json"
 """The attachment that arranges a viewer's panels; a replay replaces it."""

@@ -1,8 +1,9 @@
 """Many messages of one layout at once.
 
 Messages with equal fields, texts and list lengths have a common layout: in protobuf, their numbers of fixed
-width have equal offsets. One message, encoded by the protobuf library, is the template of its layout. Other
-messages of a layout differ only in these slots, which are filled or read for many messages together.
+width have equal offsets, the slots. One message, encoded by the protobuf library, is the template of its
+layout. Other messages of a layout differ only in the slots, which are filled or read for many messages
+together.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, combined_
 Bytes: TypeAlias = NDArray[np.uint8]
 Words: TypeAlias = NDArray[np.uint64]
 
-# field types of fixed width: other numbers do not change the length of a message
+# field types of fixed width: their values do not change the length of a message
 _WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
 _NARROW = FieldDescriptor.TYPE_ENUM
 
@@ -45,8 +46,8 @@ class WireTemplate:
 
     Attributes:
         payload: (L,) uint8, an encoded message with every slot 0.
-        word_offsets: (W,) int64, where the words begin.
-        mark_offsets: (M,) int64, where the marks are.
+        word_offsets: (W,) int64, offset of each word, bytes.
+        mark_offsets: (M,) int64, offset of each mark, bytes.
     """
 
     payload: Bytes
@@ -109,7 +110,7 @@ class WireTemplate:
         return Payloads.from_rows(self.fill(words, marks))
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
-        """Return (n,) which of n encoded messages (n, L) have this layout."""
+        """Return (n,) whether each of n encoded messages (n, L) has this layout."""
         # XOR is 0 where bytes are equal; `fixed` leaves out the slots
         return np.asarray(~((rows ^ self.payload) & self.fixed).any(axis=1))
 
@@ -209,7 +210,7 @@ class Payloads(Sequence[bytes]):
         return Payloads(self.buffers, self.buffer[places], self.start[places], self.size[places])
 
     def without(self, is_empty: Booleans) -> Payloads:
-        """Replace the messages that `is_empty` (M,) marks by empty ones."""
+        """Replace the messages that `is_empty` (M,) marks by empty messages."""
         return Payloads(self.buffers, self.buffer, self.start, np.where(is_empty, 0, self.size))
 
     def join(self, counts: Integers) -> Payloads:
@@ -263,7 +264,7 @@ def words_of(columns: Sequence[NDArray[Any]]) -> Words:
 
 
 def join_in_order(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
-    """Join groups of places and messages; the messages are sorted by their places."""
+    """Join groups of messages, and sort the messages by the places of the groups."""
     places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
     return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
 

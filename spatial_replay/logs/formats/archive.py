@@ -23,7 +23,7 @@ from spatial_replay.logs.formats.episodes import MOST_BYTES
 _BEST_RATIO: Final = 1100
 """Largest compression ratio; deflate reaches 1,032."""
 _SMALL: Final = 2**26
-"""Array size that is accepted in a file of any size, bytes."""
+"""Largest array that is accepted in a file of any size, bytes."""
 _LARGEST_ATTRIBUTE: Final = 2**24
 """Largest attribute, bytes."""
 _DEEPEST: Final = 12
@@ -47,7 +47,7 @@ def open_archive(path: Path) -> Iterator[Group]:
         with h5py.File(path, "r") as file:
             yield Group(file)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        # h5py raises any of these for damaged names, types and encodings
+        # h5py raises any of these errors for damaged names, types and encodings
         raise LogError(
             f"{path.name} cannot be read: {_first_line(error)}; close its writer or copy it again"
         ) from None
@@ -60,7 +60,7 @@ def _first_line(error: Exception) -> str:
 class Group:
     """A group of an HDF5 file. Links to other files, and soft links out of `top`, are refused.
 
-    Methods that take a path raise LogError for such a link.
+    Methods with a path raise LogError for a refused link.
     """
 
     def __init__(self, group: Any, top: Any = None) -> None:
@@ -72,20 +72,20 @@ class Group:
         return [name for name in self._group if isinstance(name, str)]
 
     def group(self, path: str) -> Group | None:
-        """Return the group at a path; None if there is none."""
+        """Return the group at a path; None if the path has no group."""
         node = self._node(path)
         return Group(node, self._top) if hasattr(node, "keys") else None
 
     def array(self, path: str) -> Any | None:
-        """Return the unread array at a path; None for a single value, or if there is none."""
+        """Return the array at a path, without its numbers; None for a single value or a missing array."""
         node = self._node(path)
         return node if getattr(node, "shape", None) else None
 
     def episode(self, path: str, place: str) -> Group:
-        """Return the group of an episode, whose soft links must not leave it.
+        """Return the group of an episode; soft links in an episode must not lead out of its group.
 
         Raises:
-            LogError: there is none.
+            LogError: the path has no group.
         """
         node = self._node(path)
         if not hasattr(node, "keys"):
@@ -140,7 +140,7 @@ class Group:
         return group
 
     def attribute(self, name: str) -> Any | None:
-        """Return an attribute with one value; None if there is none.
+        """Return the value of an attribute; None for a missing attribute.
 
         Raises:
             LogError: the attribute claims more than 16 MiB.
@@ -159,17 +159,17 @@ class Group:
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
     def text(self, name: str) -> str:
-        """Return a text attribute; "" for an attribute of another type."""
+        """Return a text attribute; "" for a missing attribute, or for another type."""
         value = self.attribute(name)
         return str(value) if isinstance(value, str) else ""
 
     def integer(self, name: str) -> int | None:
-        """Return an integer attribute; None for an attribute of another type."""
+        """Return an integer attribute; None for a missing attribute, or for another type."""
         value = self.attribute(name)
         return int(value) if isinstance(value, (int, np.integer)) and not isinstance(value, bool) else None
 
     def json(self, name: str) -> Mapping[str, Any]:
-        """Return the JSON object in a text attribute; an empty one for another attribute."""
+        """Return the JSON object in a text attribute; an empty object for any other attribute."""
         try:
             value = json.loads(self.text(name) or "{}")
         except (ValueError, RecursionError):

@@ -1,7 +1,7 @@
 """Read CommonRoad scenarios, XML files of obstacles, as samples.
 
 A file with a document type is refused, because its entities could fetch other files or expand without bound.
-Size, depth and number of elements are limited.
+The size of the file is limited, and so are the depth and the number of elements.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Element:
 
     Attributes:
         line: line of its start tag, from 1.
-        text: its own text; a text longer than `LONGEST_TEXT` is cut.
+        text: text of the element without its children; a text longer than `LONGEST_TEXT` is cut.
     """
 
     name: str
@@ -55,12 +55,12 @@ class Element:
 
 
 def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iterator[Element]:
-    """Yield the root without its content, then its children with wanted names.
+    """Yield the root without its content, then the root's children whose names are `wanted`.
 
-    A damaged file yields the children before the damage, which goes to `faults`.
+    A damaged file yields the children before the damage. The damage goes to `faults`.
 
     Raises:
-        LogError: the file has no root, declares a document type, or exceeds the limits above.
+        LogError: the file has no root, declares a document type, or exceeds a limit of this module.
     """
     collector = _Collector(path.name, wanted)
     with open_text(path) as stream:
@@ -211,12 +211,12 @@ class ObstacleState:
 
     Attributes:
         x, y: position, metres.
-        angle: rotation of its outline, radians.
-        hitch_angle: angle of its trailer, radians; 0 without a trailer.
-        oriented: whether `angle` is its orientation; False if the orientation is unknown.
+        angle: rotation of the outline, radians.
+        hitch_angle: angle of the trailer, radians; 0 without a trailer.
+        oriented: whether `angle` is the obstacle's orientation; False if the orientation is unknown.
         uncertainty: largest distance between the true and the stated outline, metres.
-        region: outline in the world frame that replaces the obstacle's own.
-        known: whether its place is known; False if only its presence is known.
+        region: outline in the world frame, which replaces the obstacle's outline.
+        known: whether the position is known; False if only the presence of the obstacle is known.
     """
 
     x: float = 0.0
@@ -229,7 +229,7 @@ class ObstacleState:
     known: bool = True
 
     def report(self, name: str, class_name: str | None, outline: Sequence[OutlinePart]) -> ObjectReport:
-        """Return the report of the obstacle in this state; `outline` is relative to its centre."""
+        """Return the report of the obstacle in this state; `outline` is relative to the obstacle's centre."""
         if not self.known:
             return ObjectReport(name, class_name, [nan, nan], [1], [0.0], invalid=True)
         parts = self.region if self.region is not None else outline
@@ -259,7 +259,7 @@ class _Obstacle:
     """One obstacle of a scenario.
 
     Attributes:
-        parts: its outline, relative to its centre.
+        parts: outline, relative to the obstacle's centre.
         moving_states: states by time step.
         fixed_state: state at every time step; None for a moving obstacle.
     """
@@ -398,7 +398,7 @@ def _moving_states(
 
 
 def _state_or_unknown(element: Element, outline: Sequence[OutlinePart], report: ReportFault) -> ObstacleState:
-    """Return a state, or `UNKNOWN` after reporting why."""
+    """Return a state; an invalid state is reported, and `UNKNOWN` is returned."""
     try:
         return _state(element, outline)
     except ScenarioError as error:
@@ -511,7 +511,7 @@ def _refuse_unknown(element: Element, *names: str) -> None:
 
 
 def _state(element: Element, outline: Sequence[OutlinePart]) -> ObstacleState:
-    """Return a state whose position is exact or in a region, and whose angles are exact or in intervals."""
+    """Return a state, whose position is a point or a region; each angle is exact or an interval."""
     position = _required_child(element, "position")
     point = position.child("point")
     place_uncertainty = 0.0
@@ -562,11 +562,11 @@ def _angle(state: Element, name: str, default: tuple[float, float]) -> tuple[flo
 
 
 def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[int, ObstacleState]]:
-    """Yield the time steps of an occupancy, each with the state of an obstacle somewhere in its region."""
+    """Yield each time step of an occupancy, with the state of an obstacle somewhere in the region."""
     try:
         time_steps = _steps(_required_child(occupancy, "time"))
         parts = _parts_of(_required_child(occupancy, "shape"))
-        # the true outline is inside the region, so every point of the region is within a diameter of it
+        # the true outline is inside the region, so a diameter of the region limits the error of its points
         region = _hull(parts)
         _, _, reach = _around([region])
         state = ObstacleState(uncertainty=2 * reach, region=(region,)) if isfinite(reach) else UNKNOWN
@@ -579,7 +579,7 @@ def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[
 
 def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
     """Return a convex outline around all parts."""
-    # the hull of several parts with a rounded one is no polygon
+    # the hull of several parts is no polygon if one of the parts is a disc
     if len(parts) > 1 and any(part.radius for part in parts):
         x, y, radius = _around(parts)
         return OutlinePart([(x, y)], radius)

@@ -31,7 +31,7 @@ FORMATS: Final[tuple[Callable[[Path], DataSet | None], ...]] = (
 
 
 def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
-    """Split an address such as `push_v3#17` into the path of a data set and a number; None for other texts.
+    """Split an address such as `push_v3#17` into a data set's path and an episode's number, or return None.
 
     The name of an existing file is no address.
 
@@ -77,7 +77,7 @@ _DESCRIBING: Final = (
     *("", "/meta", "/meta/info.json", "/meta/episodes", "/meta/episodes.jsonl"),
     *("/metadata.json", "/data/metadata.json", "/data/main_data.hdf5"),
 )
-"""Files that describe a data set: suffixes of its path."""
+"""Files that describe a data set, as suffixes of the data set's path."""
 
 
 def _file_states(path: Path) -> tuple[object, ...]:

@@ -24,8 +24,8 @@ class Feature(NamedTuple):
     """A column of a data set.
 
     Attributes:
-        places: names of its numbers; () if they have no names.
-        width: how many numbers it has per frame; 0 for images, videos and texts.
+        places: names of the feature's numbers; () for numbers without names.
+        width: number of numbers per frame; 0 for images, videos and texts.
     """
 
     name: str
@@ -37,8 +37,8 @@ class Label(NamedTuple):
     """The success label of a data set.
 
     Attributes:
-        field: its name in the data set.
-        is_about_next: whether it labels the state after the action of its frame.
+        field: name of the label in the data set.
+        is_about_next: whether a frame's label describes the state after the frame's action.
         is_stored: whether the data set stores the state after the last action.
     """
 
@@ -52,8 +52,8 @@ class Episode(NamedTuple):
 
     Attributes:
         number: number in the address, such as 17 in `push_v3#17`.
-        key: name in the data set, such as `demo_10`; the number if it has no name.
-        frames: number of frames; None if counting them takes reading the episode.
+        key: name in the data set, such as `demo_10`; the number for an episode without a name.
+        frames: number of frames; None if the frames can be counted only by reading the episode.
     """
 
     number: int
@@ -65,11 +65,11 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A body with a name in the data set, which needs no mapping.
+    """A body that the data set names, so that it needs no mapping.
 
     Attributes:
         positions: (T, 3) float64.
-        quaternions: (T, 4) float64, x y z w; None for a place.
+        quaternions: (T, 4) float64, x y z w; None for a body without orientation.
         shapes: T footprints with heights, in the world frame; None for a point.
     """
 
@@ -151,15 +151,15 @@ class DataSet:
 
     Attributes:
         path: path of the folder or file.
-        kind: its format with the version, such as `LeRobot v3.0`.
+        kind: name of the format with its version, such as `LeRobot v3.0`.
         fps: frames per second; None if the data set does not say.
-        has_times: whether its frames have times, so that `fps` is not needed.
+        has_times: whether frames have times, so that `fps` is not needed.
         robot: type of the robot; "" if the data set does not say.
         features: columns that a mapping can use, in the data set's order.
         episodes: episodes in the order of their numbers.
         label: success label; None without a label.
         remarks: messages about the whole data set.
-        names_bodies: whether it names its bodies, so that no mapping is needed.
+        names_bodies: whether the data set names bodies, so that no mapping is needed.
         always_read: arrays that `poses` needs.
     """
 
@@ -232,11 +232,11 @@ class DataSet:
         raise NotImplementedError
 
     def read(self, group: Any, names: AbstractSet[str]) -> dict[str, Floats]:
-        """Return the arrays with these names, (T,) or (T, W); arrays without numbers are left out."""
+        """Return the arrays in `names`, (T,) or (T, W); arrays without numbers are left out."""
         raise NotImplementedError
 
     def count_states(self, run: Run) -> int:
-        """Return the number of states; an array of steps may have one row less."""
+        """Return the number of states; an array with a row per step may have one row less."""
         raise NotImplementedError
 
     def poses(self, run: Run, count: int) -> EpisodeColumns:
@@ -281,9 +281,9 @@ class DataSet:
         """Return the episode with a number.
 
         Raises:
-            UsageError: there is none.
+            UsageError: no episode has the number.
         """
-        # numbers usually count from 0, so this index is tried first
+        # episodes are usually numbered from 0, so the index `number` is tried first
         likely_episodes = self.episodes[number : number + 1]
         for episode in (*likely_episodes, *self.episodes):
             if episode.number == number:
@@ -292,7 +292,7 @@ class DataSet:
 
     @property
     def range_text(self) -> str:
-        """The addresses of its episodes, in words."""
+        """A clause with the number of episodes, and the addresses of the first and the last episode."""
         if not self.episodes:
             return "it has no episodes"
         first_number, last_number = self.episodes[0].number, self.episodes[-1].number
@@ -302,14 +302,14 @@ class DataSet:
         )
 
     def feature(self, name: str) -> Feature | None:
-        """Return the feature with a name; None if there is none."""
+        """Return the feature with a name; None if no feature has the name."""
         return next((feature for feature in self.features if feature.name == name), None)
 
     def required_fps(self, reading: EpisodeReading) -> float:
-        """Return the frames per second of the mapping, or else of the data set.
+        """Return the frames per second: of the mapping if it names them, otherwise of the data set.
 
         Raises:
-            UsageError: neither says them.
+            UsageError: neither the mapping nor the data set names them.
         """
         fps = self.fps if reading.fps is None else reading.fps
         if fps is None:
@@ -332,7 +332,7 @@ def _with_last(values: Floats, count: int) -> Floats:
 
 
 def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
-    """Return the label (T,) of each state; a label of a step is about the state after it.
+    """Return the label (T,) of each state; a step's label describes the state after the step.
 
     Raises:
         LogError: the number of labels is neither the number of states nor one less.
@@ -354,7 +354,7 @@ def frame_times_ns(frames: Integers, fps: float) -> Integers:
     period_ns = Fraction(10**9) / Fraction(repr(float(fps)))
     if len(frames) and (frames.min() < 0 or int(frames.max()) * period_ns > LATEST_NS):
         raise LogError(f"frames {int(frames.min())} to {int(frames.max())} are no valid numbers of frames")
-    # fast in int64, where products fit as checked above; other periods take fractions
+    # products fit int64, as checked above; a period that is no integer takes fractions
     if period_ns.denominator == 1 and period_ns.numerator < 2**31:
         return frames.astype(np.int64) * period_ns.numerator
     return np.array([round(frame * period_ns) for frame in frames.tolist()], np.int64)
@@ -372,7 +372,7 @@ def natural_key(name: str) -> tuple[Any, ...]:
 
 
 def _as_label(values: Floats, place: str) -> Booleans:
-    """Return the label (T,) of each row of a column (T, …): whether it holds a number above 0.
+    """Return the label (T,) of each row of a column (T, …): whether the row has a number above 0.
 
     Raises:
         UsageError: the column has negative or different positive numbers, such as a shaped reward.
@@ -390,7 +390,7 @@ def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
     """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it is ambiguous.
 
     A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
-    upright in both orders: no turn as x y z w, half a turn as w x y z. So it is no evidence for x y z w.
+    upright in both orders: no turn as x y z w, half a turn as w x y z. So this quaternion is no evidence.
     """
     is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
     begins_with_zeros = is_zero[:, 0] & is_zero[:, 1]

@@ -100,7 +100,7 @@ class _Demonstrations(InGroups):
     """A data set whose episodes are numbered groups.
 
     Attributes:
-        left_out: first parts of the paths of arrays that are no features.
+        left_out: first path parts of arrays that are no features.
         task: task of episodes that name no task.
     """
 
@@ -217,7 +217,7 @@ class _ManiSkill(_Demonstrations):
         first_group = self.list_episodes(path, file)
         actors = first_group.group("env_states/actors")
         self.names_bodies = actors is not None and bool(actors.names)
-        # the label of a step is moved to the state after it; the first state has no label
+        # the label of a step is moved to the state after the step; the first state has no label
         if first_group.array("success") is not None or any("success" in row for row in self._rows.values()):
             self.label = Label("success")
         self.remarks = tuple(self._remarks(json_file))
@@ -280,7 +280,7 @@ class _ManiSkill(_Demonstrations):
 
 _BODIES: Final = "states/rigid_object"
 _MOST_EXAMINED: Final = 32
-"""Episodes whose quaternions are examined."""
+"""Maximum number of episodes whose quaternions are examined."""
 
 
 class _IsaacLab(_Demonstrations):
@@ -368,7 +368,7 @@ class _IsaacLab(_Demonstrations):
 
 
 def _has_success(home: Group, episodes: tuple[Episode, ...]) -> bool:
-    """Return whether an episode has the attribute `success`."""
+    """Return whether any episode has the attribute `success`."""
     demos = (home.group(episode.key) for episode in episodes)
     return any(demo is not None and demo.attribute("success") is not None for demo in demos)
 

@@ -42,7 +42,7 @@ class _Rows(NamedTuple):
     """Rows of an episode in a file.
 
     Attributes:
-        is_whole: whether no other episode is between them.
+        is_whole: whether the range has no rows of other episodes.
     """
 
     file: Path
@@ -62,8 +62,6 @@ def open_lerobot(path: Path) -> DataSet | None:
 
 
 class _LeRobot(DataSet):
-    """A data set of LeRobot."""
-
     always_read = ("episode_index", "frame_index", "timestamp", "next.done")
 
     def __init__(self, path: Path) -> None:
@@ -86,7 +84,7 @@ class _LeRobot(DataSet):
             end: file for file in self._files for end in (file.name, f"{file.parent.name}/{file.name}")
         }
         self._rows: dict[Path, Mapping[int, _Rows]] = {}
-        # some third-party copies have the metadata of versions 2 and 3, and file names of neither
+        # some third-party copies have the metadata of versions 2 and 3, and other file names
         is_third_party = version.startswith("v3") and (path / "meta" / "episodes.jsonl").exists()
         missing = [file for file in dict.fromkeys(self._file_of.values()) if file not in self._file_by_end]
         if missing and not is_third_party:
@@ -161,7 +159,7 @@ class _LeRobot(DataSet):
         """Return the rows of an episode, from its own file or from all files.
 
         Raises:
-            LogError: no file has its rows, or other episodes are between them.
+            LogError: no file has rows of the episode, or rows of other episodes are between its rows.
         """
         likely_ending = self._file_of[number]
         named_file = self._file_by_end.get(likely_ending)
@@ -230,7 +228,7 @@ def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
 
 
 def _places_of(names: object, width: int) -> tuple[str, ...]:
-    """Return the names of the numbers of a feature: a list, or the only list in an object."""
+    """Return the names of a feature's numbers, from a list or from an object with one list."""
     if isinstance(names, dict):
         lists = [part for part in names.values() if isinstance(part, list)]
         names = lists[0] if len(lists) == 1 else None

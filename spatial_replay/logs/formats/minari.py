@@ -56,8 +56,6 @@ def open_minari(path: Path) -> DataSet | None:
 
 
 class _Minari(DataSet):
-    """A data set of Minari."""
-
     always_read = _ENDS
 
     def __init__(self, path: Path, folder: Path, metadata: Mapping[str, Any]) -> None:

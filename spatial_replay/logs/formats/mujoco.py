@@ -113,7 +113,7 @@ class SceneModel:
             )
 
     def _geoms_of(self, body: int, data: Any) -> tuple[_Geom, ...]:
-        """Return the geoms of a body's footprint; () if one of their meshes is missing."""
+        """Return the geoms of a body's footprint; () if the mesh of a geom is missing."""
         model, types = self._model, self._mujoco.mjtGeom
         geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] == body)
         geoms = geoms[~np.isin(model.geom_type[geoms], (types.mjGEOM_PLANE, types.mjGEOM_HFIELD))]
@@ -363,8 +363,8 @@ def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneMo
 
     Args:
         place: name of the model in messages.
-        assets: folder in which meshes and included files are searched by the ends of their paths; files
-            outside it are not read.
+        assets: folder of meshes and included files, which are found by the ends of their paths; no other
+            folder is read.
 
     Raises:
         LogError: the XML is broken, too large, or no model of MuJoCo.
@@ -373,7 +373,7 @@ def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneMo
 
 
 def identity_of_model(model: Path | None, assets: Path | None) -> str:
-    """Return a hash of the files of a mapping's model, or of the assets for models in a data set.
+    """Return a hash of a mapping's model and its files; without a model, of the assets' names and times.
 
     Raises:
         LogError: the files cannot be read.
@@ -438,7 +438,7 @@ class _Folder:
         self._too_large_names: list[str] = []
 
     def read(self, name: str, directory: str = "") -> bytes | None:
-        """Return the content of a file; None if it is missing in the folder or too large."""
+        """Return the content of a file; None for a missing or too large file."""
         if self._folder is None:
             return None
         path = PurePosixPath(directory.replace("\\", "/")) / name.replace("\\", "/")

@@ -38,7 +38,7 @@ class _Steps(DataSet):
     qpos = "qpos"
 
     def divide(self, is_end: Booleans, missing: str) -> None:
-        """Divide the steps into episodes; `missing` says in a remark what a last episode lacks at its end."""
+        """Divide the steps into episodes; a remark says `missing` of a last episode without an end."""
         ends = np.flatnonzero(is_end)
         if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
             last_step_count = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
@@ -138,7 +138,7 @@ class _Npz(_Steps):
             for entry in archive.infolist():
                 name = entry.filename.removesuffix(".npy")
                 with archive.open(entry) as stream:
-                    # the header is checked first: a pickle is never loaded, nor an array that does not fit
+                    # the header is checked first, so that no pickle and no too large array is loaded
                     shape, dtype = _npy_header(cast("BinaryIO", stream), f"{self.name}: {name}")
                 if dtype.hasobject:
                     self.remarks += (f"{name} holds Python objects (a pickle), which are never loaded",)

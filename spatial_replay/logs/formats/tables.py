@@ -30,7 +30,7 @@ def read_json(file: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        LogError: the file holds something else.
+        LogError: the file holds no JSON object.
     """
     try:
         value = json.loads(read_head(file))

@@ -38,7 +38,7 @@ MOST_BLANK_LINES = 10_000_000
 
 
 def open_text(path: Path) -> BinaryIO:
-    """Open a file as bytes; a file with the gzip magic is decompressed, whatever its name."""
+    """Open a file as bytes; a file with the gzip magic is decompressed."""
     with path.open("rb") as stream:
         magic = stream.read(len(GZIP_MAGIC))
     return cast(BinaryIO, gzip.open(path, "rb")) if magic == GZIP_MAGIC else path.open("rb")
@@ -103,7 +103,7 @@ class ObjectReport:
 
 
 class ReportedSample(NamedTuple):
-    """An unchecked sample of a file; `place` is its position there, for messages."""
+    """An unchecked sample of a file; `place` names the sample's position in the file, for messages."""
 
     time_ns: int
     place: str
@@ -257,7 +257,7 @@ def _report(entry: Any) -> ObjectReport:
         if len(height) != 2:
             raise _NoSampleError(f"{object_text}: height has {len(height)} numbers; give [bottom, top]")
         report.bottom, report.top = (_number(value, f"{object_text}: height") for value in height)
-        # given, but unknown: NaN differs from itself
+        # a height of two unknown numbers; NaN differs from itself
         report.invalid = report.bottom != report.bottom and report.top != report.top
     if entry.get("yaw") is not None:
         report.yaw = _number(entry["yaw"], f"{object_text}: yaw")
@@ -423,7 +423,7 @@ def _row_report(row: dict[str, str]) -> ObjectReport:
     yaw = _cell(row, "yaw") if row["yaw"].strip() else nan
     if length < 0 or width < 0:
         raise _NoSampleError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
-    # for an orientation that is not finite, NaN as cosine and sine makes the box unknown
+    # an orientation that is not finite has NaN as cosine and sine, so that the box is unknown
     cosine, sine = (
         (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
     )
@@ -481,7 +481,7 @@ def iter_annotations(
     """Yield the samples of an `annotations.txt` in blocks; each frame in the file is a sample.
 
     Files are ordered by object, so the first frame is complete only after the last line. So all boxes are
-    read first, in 57 bytes a line, and samples are built block by block.
+    read first, with 57 bytes per line. Then samples are built block by block.
 
     A frame with an unreadable line is left out, and the line goes to `faults`.
 
@@ -579,7 +579,7 @@ def _last_frame(rate: float) -> int:
 def _observations(
     times_ns: Integers, sample_indices: Integers, boxes: _Boxes, classes: tuple[str | None, ...]
 ) -> Observations:
-    """Return boxes as observations; `sample` is the sample index of each box."""
+    """Return boxes as observations; `sample_indices` (n,) has the sample of each box."""
     object_ids, name_indices = np.unique(boxes["id"], return_inverse=True)
     box_count, corners = len(boxes), boxes["corners"]
     return Observations(

@@ -87,7 +87,7 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
     """Return the place of a chunk from the beginning of its record.
 
     Args:
-        record: first bytes of the record, at least 64 unless the file ends.
+        record: first bytes of the record, at least 64 unless the file ends earlier.
         length: length of the record with its head, bytes.
 
     Raises:
@@ -107,7 +107,7 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
 
 
 def _uncompressed_content(offset: int, record: bytes, next_offset: int) -> int | None:
-    """Return the offset of the records in an uncompressed chunk; None for another record."""
+    """Return the offset of the records in an uncompressed chunk; None for any other record."""
     if record[0] != Opcode.CHUNK:
         return None
     with suppress(DamageError):
@@ -127,13 +127,13 @@ _SIZE_BYTES = 8
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Channel and offset of a message index; the offset is not read."""
 _LOOSE_BYTES = 2**22
-"""Maximum number of bytes of messages outside chunks in one read; single messages would take a seek each."""
+"""Maximum size of one read of messages outside chunks, bytes; single reads would take a seek per message."""
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
 """Read size of a search for the next chunk, bytes."""
 _MOST_GAPS = 1_000
 """Number of damaged parts after which the rest of a file is not searched."""
-# a chunk has no magic bytes, so a search looks for the name of its compression with the length before it:
+# a chunk has no magic bytes, so a search looks for a compression's name after the name's length:
 # https://mcap.dev/spec#chunk-op0x06
 _COMPRESSIONS = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
@@ -147,7 +147,7 @@ class Directory:
         header: header record; None if it cannot be read.
         schemas, channels: declarations outside chunks, by number.
         chunks: places of chunks, in file order.
-        attachments, metadata: offset and length of each such record with its head.
+        attachments, metadata: offset and length of each record with its head, bytes.
         statistics: statistics of the summary; None without a summary.
         skipped: number of records with reserved opcodes that a scan skipped.
     """
@@ -180,7 +180,7 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
 
 
 def _is_own(header: records.Header | None) -> bool:
-    """Return whether our writer wrote a log; its logs have all checksums, so a missing one is damage."""
+    """Return whether our writer wrote a log. Our logs have all checksums, so a missing checksum is damage."""
     return header is not None and header.library == LIBRARY
 
 
@@ -198,7 +198,7 @@ def _tail(stream: BinaryIO, size: int) -> bytes:
 
 
 class _NoSummaryError(Exception):
-    """A file without a complete summary; other writers may leave out parts of it."""
+    """A file without a complete summary; other writers may leave out parts of a summary."""
 
 
 def _from_summary(stream: BinaryIO, size: int) -> Directory:
@@ -281,7 +281,7 @@ def _add_record(directory: Directory, opcode: int, body: bytes) -> None:
 
 
 def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
-    """Return the channels for which a chunk has a message index; None without any such index."""
+    """Return the channels for which a chunk has a message index; None for a chunk without message indexes."""
     entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + length]
     if not entries or len(entries) != length or length % _MESSAGE_INDEX.size:
         return None
@@ -289,7 +289,7 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
 
 
 def _check_complete(directory: Directory, data_end: int) -> None:
-    """Check that a summary is complete; other writers may leave out parts of it.
+    """Check that a summary is complete; other writers may leave out parts of a summary.
 
     Raises:
         _NoSummaryError: the summary is incomplete.
@@ -429,7 +429,7 @@ class _Scan:
                 next_opcode != 0 and next_position + RECORD_HEAD.size + next_length <= self._size
             )
         with suppress(DamageError):
-            # the head fits a chunk, so only its opcode is damaged
+            # the head fits a chunk, so only the opcode is damaged
             chunk_place(0, beginning, RECORD_HEAD.size + RECORD_HEAD.unpack_from(beginning)[1])
             is_followed = False
         if not is_followed:
@@ -456,13 +456,13 @@ class _Scan:
             self._loose = None
 
     def _next_chunk(self, position: int) -> ChunkPlace | None:
-        """Return the next chunk with a consistent head, from a position on; None if there is none."""
-        # a chunk at the end of a window needs bytes of the next one
+        """Return the next chunk with a consistent head, from a position on; None if no chunk follows."""
+        # a chunk at the end of a window needs bytes of the next window
         overlap_bytes = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
         while position < self._size:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap_bytes)
-            # in file order, whatever the compression
+            # in file order, with both compressions
             for window_offset in merge(*(_iter_places(window, mark) for mark in _COMPRESSIONS)):
                 record = window[window_offset : window_offset + _CHUNK_HEAD_BYTES]
                 opcode, length = RECORD_HEAD.unpack_from(record)
@@ -480,7 +480,7 @@ class _Scan:
 
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
-    """Yield the possible offsets of chunks, in order, from the name of their compression."""
+    """Yield the possible offsets of chunks in a window, in order, from the marks of one compression."""
     mark_offset = window.find(mark)
     while mark_offset >= 0:
         if mark_offset >= _BEFORE_COMPRESSION:
@@ -516,7 +516,7 @@ def iter_attachments(
 def iter_metadata(
     stream: BinaryIO, directory: Directory, faults: FaultList, name: str
 ) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the readable metadata records of a file with their names; damaged ones go to `faults`."""
+    """Yield the readable metadata records of a file with their names; damaged records go to `faults`."""
     for offset, length in directory.metadata:
         stream.seek(offset + RECORD_HEAD.size)
         try:

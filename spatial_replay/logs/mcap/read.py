@@ -71,9 +71,9 @@ from spatial_replay.trace.units import Axes
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 """Limits of a decompressed chunk or message: bytes that are always allowed, and compression ratio."""
 _ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
-"""Limits of messages that wait for earlier chunks: bytes, and multiple of the log; the larger one counts."""
+"""Limits of messages that wait for other chunks: bytes, and multiple of the log. The larger limit counts."""
 _AHEAD_BYTES: Final = 2**24
-"""Maximum decompressed bytes of chunks read ahead, if these are more than one chunk per core."""
+"""Maximum decompressed size of the chunks read ahead, bytes; one chunk per core is always read ahead."""
 BLOCK_BYTES = 64 * 2**20
 """Size of messages at which a block is closed, bytes."""
 AFTER_ALL_NS = 2**64
@@ -137,7 +137,7 @@ def _decompress(compression: bytes, data: memoryview, size: int) -> bytes:
                 raise DamageError("the chunk holds more than it says")
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
         if compression == b"lz4":
-            # one byte more shows a chunk that is larger than it says
+            # one more byte reveals a chunk that is larger than its head says
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise DamageError(f"the chunk does not decompress ({error})") from None
@@ -151,7 +151,7 @@ def iter_records(
 ) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
     """Yield places in their order, each with its decompressed records or its damage.
 
-    Threads read ahead from the stream, so the caller must not use it.
+    Threads read ahead from the stream, so the caller must not read from it.
     """
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
     stream_lock, is_over = RLock(), False
@@ -194,7 +194,7 @@ class Records:
 
     Attributes:
         heads: (M,) heads of the messages.
-        payloads: place of each message's payload in the bytes.
+        payloads: bounds of each message's payload in the bytes.
         declarations: opcodes and bodies of schemas and channels.
         breaks_off: whether the last record is incomplete.
     """
@@ -244,7 +244,7 @@ class ChunkWalk:
         """Begin with the channels that the directory declares.
 
         Args:
-            renamed: function from a channel of the log to the channel of its messages in the output.
+            renamed: function that returns the output's channel for a channel of the log.
         """
         self._renamed = renamed
         self.stream = stream
@@ -313,7 +313,7 @@ class ChunkWalk:
                 self._add_declarations(split_records(content).declarations)
 
     def _add_declarations(self, declarations: Iterable[tuple[int, bytes]]) -> str:
-        """Store new declarations; return the damage of the first invalid one, or ""."""
+        """Store new declarations; return the damage of the first invalid declaration, or ""."""
         damage = ""
         for opcode, body in declarations:
             number = int.from_bytes(body[:2], "little")
@@ -338,7 +338,7 @@ class ChunkWalk:
         self.channels[channel.id] = self._renamed(log_channel)
 
     def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
-        """Report a fault of the messages in a place, in words before and after their times."""
+        """Report a fault of a place's messages; their times are between the texts `before` and `after`."""
         time_words = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
         place_text = f"{self.name}: at byte {place.offset}: "
         self.faults.add(Sentence(place_text, Sentence(before, *time_words, after)))
@@ -534,7 +534,7 @@ def _blocks(
         sample_count += walk.sample_count(messages)
         if number < len(places) and (waiting_bytes >= BLOCK_BYTES or sample_count >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
-            # chunks are sorted by start, so no later chunk has a message before the start of the next one
+            # chunks are sorted by start, so no later chunk has a message before the start of the next chunk
             ready_count = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
             waiting = [ordered]
             if ready_count:
@@ -549,7 +549,7 @@ def _blocks(
 
 
 def _in_order(streams: Sequence[Messages]) -> Messages:
-    """Join and sort messages by log time, channel and sequence; equal ones stay in their order."""
+    """Join messages and sort them by log time, channel and sequence; the sort is stable."""
     joined = concatenate_tables([Messages(), *streams])
     times_ns = joined.log_time_ns
     if (times_ns[1:] > times_ns[:-1]).all():
@@ -564,7 +564,7 @@ def decode_samples(
     report: Callable[[Sentence], None],
     concave: Concave = "decompose",
 ) -> tuple[Trace, Integers]:
-    """Decode our samples; return them, and the places of the valid samples among the messages.
+    """Decode our samples; return the valid samples, and their places among the messages.
 
     Args:
         places: places of all samples among the messages.
@@ -585,7 +585,12 @@ def decode_samples(
 
 
 def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
-    """Return the places of all messages except damaged samples: samples in `own` that are not in `sound`."""
+    """Return the places of all messages except damaged samples.
+
+    Args:
+        own: places of all samples.
+        sound: places of the valid samples.
+    """
     return np.setdiff1d(np.arange(len(messages)), np.setdiff1d(own, sound))
 
 
@@ -612,7 +617,7 @@ class _BlockDecoder:
         )
         self._latest_ns = int(wanted_messages.log_time_ns[sample_places].max(initial=self._latest_ns))
         if len(valid_places) < len(sample_places):
-            # a copy must be sound, so it gets the valid samples only
+            # a copy must be readable, so it gets only the valid samples
             wanted_messages = select(wanted_messages, without(wanted_messages, sample_places, valid_places))
         self.any_sample = self.any_sample or len(trace) > 0
         new_faults = self._walk.faults.take()
@@ -687,7 +692,6 @@ def summarise_mcap(source: McapSource) -> LogSummary:
 
 
 def _counts(walk: ChunkWalk) -> Counter[int]:
-    """Count messages by channel."""
     if walk.directory.statistics is not None:
         return Counter(walk.directory.statistics.channel_message_counts)
     counts: Counter[int] = Counter()

@@ -42,7 +42,7 @@ WHOLE_CHUNK_NS = 10 * CHUNK_NS
 REPEAT_NS = 5 * 10**9
 """Time after which a channel is declared again, nanoseconds; its first two chunks declare it, too.
 
-Declarations in every chunk would add 15 % to an annotated log; these add up to 5 %.
+Declarations in every chunk would add 15 % to an annotated log; these declarations add up to 5 %.
 """
 WAITING_BYTES = 64 * 2**20
 """Maximum bytes of chunks that wait for compression; images and point clouds make large chunks."""
@@ -120,7 +120,7 @@ class _PackedChunk(NamedTuple):
     """A chunk with its message indexes, ready to be written.
 
     Attributes:
-        summary: its index for the summary; offsets are relative to the chunk.
+        summary: index of the chunk for the log's summary; offsets are relative to the chunk.
         counts: number of messages by channel.
     """
 
@@ -246,8 +246,8 @@ class _Declaration:
     """Records of a channel and its schema.
 
     Attributes:
-        count: number of chunks that declare them.
-        due_ns: time from which the next chunk declares them.
+        count: number of chunks that have these records.
+        due_ns: time from which the next chunk repeats these records, nanoseconds.
     """
 
     schema: bytes
@@ -304,7 +304,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # a stream that failed cannot take the summary
+        # a summary cannot be written to a failed stream
         if isinstance(error, OutputError):
             self._threads.shutdown(cancel_futures=True)
         else:
