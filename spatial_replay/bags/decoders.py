@@ -29,7 +29,7 @@ from spatial_replay.bags.ros_decoders import failure_text, ros_decoder, ros_defi
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Channel, Schema
 
-# early releases of ROS 2 write the number of a policy, later ones its name
+# early releases of ROS 2 write a policy's number, later releases its name
 _LATCHED = re.compile(r"durability: *(1|transient_local)\b")
 
 
@@ -44,8 +44,8 @@ class Topic:
         count: number of messages that the log declares, or None.
         schema: definition in the log, or None.
         latched: whether the last message before a window is valid in the window (latched, transient local).
-        unreadable: reason why its messages cannot be decoded, or None.
-        metadata: metadata of its channel, as in an MCAP log.
+        unreadable: reason why the topic's messages cannot be decoded, or None.
+        metadata: metadata of the topic's channel, as in an MCAP log.
     """
 
     name: str
@@ -76,7 +76,7 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
     """Return a decoder for the messages of a topic.
 
     Args:
-        distribution: ROS release that the log names, for types that it does not define.
+        distribution: ROS release that the log names, for types that the log does not define.
 
     Raises:
         LogError: the definition is missing or invalid, or the encoding is unknown.
@@ -152,7 +152,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
 
 
 def _add_well_known_types(descriptors: FileDescriptorSet) -> FileDescriptorSet:
-    """Add the files of well-known types, such as timestamps, that a set imports but does not contain."""
+    """Add the missing files of well-known types, such as timestamps, that files of a set import."""
     file_names = {file.name for file in descriptors.file}
     missing_names = {name for file in descriptors.file for name in file.dependency} - file_names
     for module in _WELL_KNOWN:
@@ -162,7 +162,7 @@ def _add_well_known_types(descriptors: FileDescriptorSet) -> FileDescriptorSet:
 
 
 def _in_order(descriptors: FileDescriptorSet) -> list[FileDescriptorProto]:
-    """Return the files in an order in which each follows its imports, as the descriptor pool requires."""
+    """Return the files, each after its imports, as the descriptor pool requires."""
     if len(descriptors.file) > _MOST_FILES:
         raise ValueError(f"it has {len(descriptors.file)} files; at most {_MOST_FILES} are read")
     files = {file.name: file for file in descriptors.file}
@@ -220,7 +220,7 @@ def channel_of(topic: Topic, distribution: str | None = None) -> Channel:
     """Return the channel of a topic in a copy of the log, where messages are unchanged.
 
     Args:
-        distribution: ROS release that the log names, for types that it does not define.
+        distribution: ROS release that the log names, for types that the log does not define.
     """
     schema = topic.schema
     if topic.encoding in ("ros1", "cdr") and (schema is None or not schema.data.strip()):

@@ -1,7 +1,7 @@
 """Parse definitions of message types in MSG form to fields with bounded sizes.
 
-A definition comes with the log and is not trusted. It is accepted only if names are plain identifiers,
-references resolve without a cycle, and sizes are bounded.
+A definition comes with the log and is not trusted. A definition is accepted only if names are plain
+identifiers, references resolve without a cycle, and sizes are bounded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MOST_FIELDS = 4_000
 MOST_VALUES = 4_000
 """Maximum number of values that a definition requires; each value becomes lines of generated code."""
 MOST_VALUES_IN_ALL = 12_000
-"""Maximum number of values of a type and of all types that it uses."""
+"""Maximum number of values of a type and of all types that the type uses."""
 
 BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("bool", "byte", "char", "octet", "int8", "uint8"), 1),
@@ -79,7 +79,7 @@ def full_type_name(name: str) -> str:
 
 
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
-    """Parse the types in a .msg text: its own type, then each used type after a line of equals signs.
+    """Parse the types in a .msg text: the main type, then each used type after a line of equals signs.
 
     Constants and default values are ignored, because messages do not depend on them.
 
@@ -96,7 +96,7 @@ def definitions_from_msg(text: str, type_name: str) -> Definitions:
 
 
 def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
-    """Yield each type's name and text; the first may lack a head line."""
+    """Yield each type's name and text; the first type may lack a head line."""
     if len(text) > LONGEST_TEXT:
         raise LogError(
             f"the definition of {type_name!r:.100} has {len(text)} characters;"
@@ -154,7 +154,7 @@ def _resolve(name: str, owner: str, type_names: set[str]) -> str:
 
 
 def check_definitions(definitions: Definitions, type_name: str, *, empty_bytes: int) -> Definitions:
-    """Return a type and the types that it uses, after checking that generating decoders is safe.
+    """Check that generating a type's decoder is safe; return the type and all types that it uses.
 
     Args:
         empty_bytes: size of a message without fields, bytes: 0 in ROS 1, 1 in ROS 2.

@@ -112,7 +112,7 @@ class McapLog(MessageReader):
 
     @property
     def channel_topics(self) -> frozenset[str]:
-        """Topics of its channels; their definitions are not checked."""
+        """Topics of the log's channels; definitions are not checked."""
         return frozenset(channel.topic for channel in self._declared.values())
 
     @property
@@ -136,7 +136,7 @@ class McapLog(MessageReader):
             walk = copy(self._walk)
             walk.stream = stream
             statistics = directory.statistics
-            # without counts of channels, all messages are read to compare them with the total
+            # without counts of channels, all messages are read to compare their number with the total
             is_total = statistics is not None and not statistics.channel_message_counts
             messages_of_places = walk.iter_messages(
                 [place for _, place in places], lambda topic: is_total or topic in topics
@@ -216,7 +216,7 @@ _File: TypeAlias = McapLog | SqliteBag
 
 
 def files_of_bag_around(path: Path) -> tuple[str, ...]:
-    """Return the names of all files in the bag of a file; () if no metadata lists the file."""
+    """Return the names of all files of the bag around a file; () if no metadata lists the file."""
     try:
         with path.with_name(BAG_METADATA).open("rb") as stream:
             files = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
@@ -311,7 +311,7 @@ class BagFolder(MessageReader):
 
     def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
         def read(file_number: int, file: _File) -> Columns:
-            # bits of a place: file from 48 on, chunk from 28 on, then the row
+            # a place has the file's number from bit 48 on, the chunk's from bit 28 on, and the row below
             for columns_of_file in file.iter_columns(topics, first_ns, end_ns, as_recorded=as_recorded):
                 file_place, first_channel = np.int64(file_number) << 48, self._first_channels[file_number]
                 channel_numbers = first_channel + columns_of_file.channel
@@ -356,12 +356,12 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _first_channels(self) -> tuple[int, ...]:
-        """Dense number of the first channel of each file."""
+        """Dense number of each file's first channel."""
         return tuple(accumulate((len(file._channels) for file in self._files[:-1]), initial=0))
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         if self._metadata is None:
-            # each file compares its own counts
+            # the reader of each file compares the counts of the file
             return columns
         name = name or f"{self.name}/{BAG_METADATA}"
         for topic in self._topics:
@@ -375,7 +375,7 @@ class BagFolder(MessageReader):
         return super()._count(columns, topics, name)
 
     def _open(self, path: Path) -> _File | None:
-        """Open a file by its content; return None and report a fault if it is unreadable."""
+        """Open a file by its content; report an unreadable file as a fault, and return None."""
         try:
             with path.open("rb") as stream:
                 first_bytes = stream.read(len(SQLITE_MAGIC))

@@ -42,8 +42,8 @@ class Message(NamedTuple):
     Attributes:
         log_time_ns: time of recording.
         publish_time_ns: time of sending; the log time if the log does not store it.
-        sequence: number within its topic, as in the log; 0 if the log has none. It orders the messages of one
-            topic and time.
+        sequence: number of the message within its topic; 0 for a log without such numbers. Messages of one
+            topic and time are ordered by this number.
         payload: message in the encoding of its topic.
     """
 
@@ -65,7 +65,7 @@ class MessageColumns(Messages):
     place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def sort_by_time(self) -> MessageColumns:
-        """Sort the messages by log time, topic and sequence; equal ones stay in their order."""
+        """Sort the messages by log time, topic and sequence; the sort is stable."""
         times_ns = self.log_time_ns
         if (times_ns[1:] > times_ns[:-1]).all():
             return self
@@ -99,7 +99,7 @@ def in_pieces(columns: Columns) -> Columns:
 
 
 def places_in(part: int, within: Integers) -> Integers:
-    """Return places in a log of several parts, such as chunks; they increase from part to part."""
+    """Return the places of messages in a log of several parts; places increase from part to part."""
     return (np.int64(part) << 28) + within
 
 
@@ -175,7 +175,7 @@ def _push_next(active: _Active, file_number: int, later_columns: Columns) -> Non
 
 
 DISORDER_NS = 10**9
-"""Default disorder of messages that is allowed, nanoseconds; recorders write topics from several threads."""
+"""Default of the largest accepted disorder, nanoseconds; recorders write topics from several threads."""
 JUMP_REMEDY = (
     "max_lateness='5s' (--read max_lateness=5s) takes messages that come later, 'all' sorts the whole log;"
     " on_time_jump='split' (--read on_time_jump=split) ends it where its clock jumps"
@@ -192,8 +192,8 @@ def without_jumps(
         disorder_ns: largest disorder of recording that is allowed.
 
     Raises:
-        LogError: a message was recorded before another one of its topic that is earlier by more than the
-            disorder.
+        LogError: a message was recorded before a message of its topic that is earlier by more than
+            `disorder_ns`.
     """
     first_ns: int | None = None
     # logs that were merged topic by topic are in order too, so each topic is checked separately
@@ -232,7 +232,7 @@ class _PlaceHistory:
                 messages of the previous call.
 
         Returns:
-            the index of the message; None if there is none.
+            the index of the message; None for messages without a jump.
         """
         furthest_places = np.maximum.accumulate(np.append(self._furthest_place, places))[1:]
         self._latest.append((times_ns, furthest_places))
@@ -258,7 +258,7 @@ class MessageReader(ABC):
     kind: str
 
     def __init__(self, path: LogFile) -> None:
-        # readers that open `_path` get local files only; for a remote file, it is a name
+        # for a remote file, `_path` is only a name; readers that open `_path` get local files only
         self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults, self._remarks = FaultList(), FaultList()
         self._part_readers: Sequence[MessageReader] = ()
@@ -270,13 +270,13 @@ class MessageReader(ABC):
 
     @property
     def profile(self) -> str:
-        """Return the profile of an MCAP log with its messages."""
+        """Profile of an MCAP log with the messages of this log."""
         # https://mcap.dev/spec/registry#well-known-profiles
         return {"ROS 1 bag": "ros1", "ROS 2 bag": "ros2"}.get(self.kind, "")
 
     @property
     def _distribution(self) -> str | None:
-        """ROS release that the log names, for types that it does not define."""
+        """ROS release that the log names, for types that the log does not define."""
         return None
 
     @property
@@ -285,8 +285,8 @@ class MessageReader(ABC):
         """Log time of the first message."""
 
     @abstractmethod
-    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        """Yield the messages of some topics with log times in [first, last)."""
+    def _read(self, topics: Collection[str], first_ns: int, end_ns: int, *, as_recorded: bool) -> Columns:
+        """Yield the messages of some topics with log times in [first_ns, end_ns)."""
 
     @property
     @abstractmethod
@@ -388,7 +388,7 @@ class MessageReader(ABC):
         """Yield the messages of `iter_messages` as columns.
 
         Args:
-            as_recorded: whether to yield them in the order of recording, which may jump back in time.
+            as_recorded: whether messages are in the order of recording, in which times may jump back.
         """
         first_ns, last_ns = start_ns or 0, LATEST_NS + 1 if end_ns is None else min(end_ns, LATEST_NS + 1)
         columns = self._read(topics, first_ns, last_ns, as_recorded=as_recorded)
@@ -415,7 +415,7 @@ class MessageReader(ABC):
             part.move_faults(self._faults)
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
-        """Yield all messages of some topics, then compare their numbers with the declared ones."""
+        """Yield all messages of some topics, then compare their numbers with the declared numbers."""
         read_counts = Counter[str]()
         for message_columns in columns:
             read_counts.update(message_columns.topics)

@@ -110,7 +110,7 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
             case b"none":
                 content = data
             case b"bz2":
-                # one byte more shows a chunk that is larger than it says
+                # one more byte reveals a chunk that is larger than its head says
                 content = bz2.BZ2Decompressor().decompress(data, size + 1)
             case b"lz4":
                 content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
@@ -126,7 +126,7 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
 def record_table(content: bytes) -> tuple[RecordTable, bool]:
     """Return the records in a chunk's content, and whether the last record breaks off."""
     view = np.frombuffer(content, np.uint8)
-    # a table without room, to count the records first
+    # an empty table, to count the records first
     record_count, _ = _walk(view, np.empty((6, 0), np.int64))
     table = np.empty((6, record_count), np.int64)
     _, end_offset = _walk(view, table)
@@ -165,7 +165,7 @@ def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, i
 
 @kernel
 def _walk(content: NDArray[np.uint8], table: NDArray[np.int64]) -> tuple[int, int]:
-    """Fill the table as far as it has room; return the number of complete records, and their end."""
+    """Fill the table's columns; return the number of complete records, and the end of the last record."""
     size = content.shape[0]
     position = 0
     count = 0
@@ -193,7 +193,7 @@ _STRIDE = 2**20
 # the field op of a chunk's head, with its length: http://wiki.ros.org/Bags/Format/2.0
 _CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
 _BEFORE_MARK = (4, 17, 23, 24, 36, 37)
-"""Possible distances from the beginning of a chunk's head to its opcode; other fields may come before it."""
+"""Possible offsets of the opcode field in a chunk's record, bytes; other fields may come first."""
 _CHUNK_HEAD_BYTES = range(20, 80)
 _MOST_GAPS, _MOST_MARKS = 1_000, 100_000
 """Numbers of damaged parts, and of possible chunks, after which the rest of a file is not searched."""
@@ -204,7 +204,7 @@ class Connection:
     """A publisher of a topic, as the bag describes it.
 
     Attributes:
-        data: fields of its description: type, md5sum, message_definition and others.
+        data: fields of the description: type, md5sum, message_definition and others.
     """
 
     number: int
@@ -229,8 +229,8 @@ class BagChunk:
     """Place and content of a chunk.
 
     Attributes:
-        offset: offset of its record in the file.
-        counts: number of messages of each connection; None if that takes reading the chunk.
+        offset: offset of the chunk's record in the file.
+        counts: number of messages of each connection; None if only reading the chunk shows them.
     """
 
     offset: int
@@ -449,7 +449,7 @@ class _Scan:
             )
 
     def _next_chunk(self, position: int) -> int | None:
-        """Return the offset of the next chunk with a consistent head, from a position on."""
+        """Return the offset of the next chunk with a consistent head; None if no chunk follows a position."""
         overlap_bytes = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
         while position < self._size:
             self._stream.seek(position)
@@ -530,7 +530,7 @@ class Ros1Bag(MessageReader):
 
     @cached_property
     def _is_in_parts(self) -> bool:
-        """Whether chunks do not overlap in time; then they are sorted by time, not by place in the file.
+        """Whether chunks do not overlap in time; such chunks are read by time, not by place in the file.
 
         Bags are played by their index. Tools that merge or repair bags write chunks in any order.
         """
@@ -601,7 +601,7 @@ class Ros1Bag(MessageReader):
             name=connection.topic,
             type=full_type_name(connection.type),
             encoding="ros1",
-            # a scan counts only the chunks that are left, so its count shows no loss
+            # a scan counts only the readable chunks, so its count shows no loss
             count=count if self._directory.is_indexed else None,
             schema=Schema(connection.type, "ros1msg", definition),
             latched=connection.is_latched,

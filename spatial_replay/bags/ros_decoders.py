@@ -55,11 +55,11 @@ _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 def ros_definitions(
     type_name: str, encoding: RosEncoding, schema: Schema | None, distribution: str | None = None
 ) -> tuple[Definitions, ...]:
-    """Return the possible definitions of a type: one from the log, or the standards of the ROS releases.
+    """Return the possible definitions of a type: from the log, or the standards of the ROS releases.
 
     Args:
         type_name: full name, such as geometry_msgs/msg/Pose.
-        schema: definition in the log; None if the log has none, which only standard types allow.
+        schema: definition in the log; None for a standard type without a definition in the log.
         distribution: ROS release that the log names.
 
     Raises:
@@ -209,7 +209,7 @@ def _without_enum(field: Field, definitions: Definitions, enum_names: Collection
 def _check_idl(text: str, type_name: str) -> None:
     """Check that rosbags can parse a text in IDL within seconds.
 
-    The time of its parser grows fast with the depth of parentheses, and by milliseconds per annotation.
+    The parser's time grows fast with the depth of parentheses, and by milliseconds per annotation.
     """
     bare_text = _IDL_ASIDE.sub(" ", text) if len(text) <= _LONGEST_IDL else ""
     fault = None
@@ -286,7 +286,7 @@ def _description(field: Field) -> FieldDesc:
 
 
 def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | None = None) -> Schema:
-    """Return the definition of a standard type, for a copy of a log that has none.
+    """Return the definition of a standard type, for a copy of a log without this definition.
 
     Raises:
         LogError: the type is not a standard type.

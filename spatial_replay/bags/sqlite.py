@@ -47,11 +47,11 @@ class BagMetadata:
     """Declarations of a bag.
 
     Attributes:
-        files: names of its files, without folders, in order.
+        files: names of the bag's files, without folders, in order.
         types: type of each topic.
         counts: number of messages of each topic.
         compression: unit of compression, "file" or "message"; "" without compression.
-        distribution: ROS release that wrote it; None if it is not named.
+        distribution: ROS release that wrote the bag; None if the metadata names no release.
     """
 
     files: tuple[str, ...]
@@ -146,7 +146,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _base_name(path: str) -> str:
-    """Return the name in a path, without the folder of early releases; no path may leave the bag."""
+    """Return the file name in a path; early releases wrote a folder, too. No path may leave the bag."""
     name = PureWindowsPath(PurePosixPath(path).name).name
     if name in ("", "..") or "\x00" in name:
         raise LogError(f"{path!r:.100} in it is not a file name")
@@ -156,9 +156,9 @@ def _base_name(path: str) -> str:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
 _PACKED_PIECE = 2**12
-"""Compressed bytes that are read at a time; few, because one may decompress to 32,000 bytes."""
+"""Size of one read of compressed data, bytes; small, because one byte may decompress to 32,000 bytes."""
 _LEFT_FREE = 2**26
-"""Space of a disk that is left free, bytes; at most a tenth of its free space."""
+"""Space that is left free on a disk, bytes, or a tenth of the free space if that is less."""
 
 
 def temporary_folder(owner: object) -> Path:
@@ -189,7 +189,7 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
     """Decompress a file into a folder.
 
     Returns:
-        the path of the decompressed file, without the suffix of the compression; a fault, or "".
+        the path of the decompressed file, without the suffix of the compression, and a fault or "".
 
     Raises:
         LogError: nothing decompresses, or the content is implausibly large.
@@ -236,7 +236,7 @@ def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
 
 
 def unpacked_size(payload: bytes) -> int:
-    """Return the largest decompressed size of a message, which may be plain, in bytes."""
+    """Return an upper bound of a message's decompressed size, bytes; the message may be plain."""
     try:
         size = zstandard.frame_content_size(payload)
     except zstandard.ZstdError:
@@ -269,7 +269,7 @@ _STEPS_A_BYTE = 20
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000
-"""Maximum number of tried parts of a damaged table; the other parts count as lost."""
+"""Maximum number of queries for parts of a damaged table; parts without a query count as lost."""
 
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message."""
@@ -456,7 +456,7 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         # immutable: no locks, and no file next to it: https://www.sqlite.org/uri.html#uriimmutable
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
-        # one thread reads, but garbage collection in another may close it
+        # one thread reads the database, but garbage collection in another thread may close it
         connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
         with closing(connection) as database:
             # no value is longer than its file
@@ -473,7 +473,7 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
             # pages of a damaged file can form a cycle, so the number of steps is limited
             database.set_progress_handler(lambda: next(step_numbers) > most_checks, _STEPS)
             yield database
-    # sqlite3 decodes names of columns as UTF-8, whatever their bytes are
+    # sqlite3 decodes names of columns as UTF-8, which a damaged file may violate
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise LogError(f"{path.name}: the database is damaged ({error})") from None
 
@@ -625,7 +625,7 @@ def _joined_spans(spans: Collection[_Span]) -> list[_Span]:
 
 
 def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]]:
-    """Return the rows of a small table; columns vary with the release that wrote it."""
+    """Return the rows of a small table; columns vary with the ROS release that wrote the table."""
     cursor = database.execute(f"SELECT * FROM {table} LIMIT {_MOST_TOPICS}")
     column_names = [column[0] for column in cursor.description]
     return [dict(zip(column_names, row, strict=True)) for row in cursor]
