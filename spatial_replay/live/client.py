@@ -68,7 +68,7 @@ class Offered(NamedTuple):
 
 
 class Disconnected(NamedTuple):
-    """Loss of the connection; all earlier messages of the server come before it."""
+    """Loss of the connection; the inbox has all earlier messages of the server before this item."""
 
     reason: str
     arrived_s: float
@@ -153,7 +153,7 @@ class Client:
         """Fill the inbox until cancelled.
 
         Raises:
-            UsageError: not an address of a server.
+            UsageError: `address` is not the address of a server.
             RemoteError: the first connection fails.
         """
         pause_s, was_connected = _FIRST_PAUSE_S, False

@@ -14,7 +14,7 @@ from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.trace.trace import LATEST_NS
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Subprotocols in order of preference: of the Foxglove SDK, and of earlier foxglove_bridge."""
+"""Subprotocols in order of preference: of the Foxglove SDK, and of early versions of foxglove_bridge."""
 
 _SCHEMA_ENCODINGS: Final = {
     "json": "jsonschema",
@@ -23,7 +23,7 @@ _SCHEMA_ENCODINGS: Final = {
     "ros1": "ros1msg",
     "cdr": "ros2msg",
 }
-"""Encodings of schemas by the encoding of messages, for servers that do not name them."""
+"""Encodings of schemas by the encoding of messages, for servers that name no schema encoding."""
 
 _BINARY_SCHEMAS: Final = frozenset({"protobuf", "flatbuffer"})
 # a binary frame with a message: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md

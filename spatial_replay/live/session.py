@@ -109,7 +109,7 @@ class ObjectsAssembler:
         return Trace.empty()
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Return a sample 1 ns after the newest one, in which every object is unknown."""
+        """Return a sample 1 ns after the newest sample, in which every object is unknown."""
         if self._newest_ns < 0 or not self._classes:
             return Trace.empty()
         self._newest_ns += 1
@@ -150,7 +150,8 @@ class SessionStatus:
         messages_dropped: number of messages that were dropped before they became samples.
         late: number of messages that arrived after the samples of their time.
         overdue: number of observations whose transforms did not arrive within `max_delay_s`.
-        delay_s: time from the arrival of the newest sample's message to its verdict, seconds; NaN before it.
+        delay_s: time from the arrival of the newest sample's message to the sample's verdict, seconds; NaN
+            before the first sample.
         time_ns: time of the newest sample; None before the first sample.
     """
 
@@ -237,13 +238,13 @@ _PAUSE_S: Final = 0.005
 """Pause before another attempt to reserve room in a full log, seconds."""
 
 _SAMPLES_BEFORE_DOUBTS: Final = 100
-"""Number of samples before a run is first compared with its mapping; it doubles each time."""
+"""Number of samples before a run is first compared with its mapping; each comparison doubles the number."""
 
 _USUAL: Final = 9
 """Number of latest intervals between messages of a topic; their median is its usual interval."""
 
 _GRACE_TURNS: Final = 5
-"""Number of turns of the event loop in which arrived messages reach the inbox."""
+"""Maximum number of turns of the event loop in which arrived messages reach the inbox."""
 
 _TURN_S: Final = 0.02
 """Time of evaluation between two polls of the inbox, seconds."""
@@ -331,7 +332,7 @@ class LiveSession:
         self.doubts: tuple[Doubt, ...] = ()
         """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
         self.failure: LogError | None = None
-        """Error that ended the run before it was stopped: time jumped back."""
+        """Error that ended the run: time jumped back. None for a run without a jump."""
 
     @property
     def status(self) -> SessionStatus:
@@ -367,7 +368,7 @@ class LiveSession:
         return notes
 
     def _note_overdue(self) -> None:
-        """Note once in a run that a transform is overdue; before the run begins, that is usual."""
+        """Note an overdue transform, once in a run; before the run begins, overdue transforms are usual."""
         assembler = self._assembler
         if not isinstance(assembler, LiveAssembler) or assembler.overdue == self._overdue_count:
             return
@@ -382,7 +383,7 @@ class LiveSession:
             )
 
     def close(self) -> None:
-        """Compare the run with the assumptions of its mapping, if `updates` was left before its end."""
+        """Compare the run with its mapping's assumptions, if the caller left `updates` before the end."""
         if self._assembler is not None and not self._is_closed:
             self._assembler.finish()
             self._conclude(self._assembler)
@@ -408,7 +409,7 @@ class LiveSession:
 
         Raises:
             RemoteError: the first connection fails.
-            UsageError: the mapping does not fit what the server sends.
+            UsageError: the mapping does not fit the messages of the server.
             LogError: a topic changes its type, or a message cannot be sorted by time.
         """
         inbox = self._inbox = Inbox()
@@ -426,7 +427,7 @@ class LiveSession:
                 async for update in self._turn(inbox):
                     yield update
             if self._assembler is None and self._is_connected and not self.failure:
-                # the run ends before all topics are offered: `_begin` reports the missing ones
+                # the run ends before all topics are offered: `_begin` reports the missing topics
                 async for update in self._turn(inbox):
                     yield update
                 if self._assembler is None:
@@ -474,7 +475,7 @@ class LiveSession:
                 self._notes.append(f"{channel.topic} is not recorded: {error}")
 
     async def _wait(self, inbox: Inbox) -> None:
-        """Wait until there is something to do."""
+        """Wait for an item of the inbox, or for the next deadline."""
         now_s = time.monotonic()
         due_times_s = [self._settle_deadline_s, self._offer_deadline_s]
         if self._assembler is not None:
@@ -488,7 +489,7 @@ class LiveSession:
                 due_times_s.append(min(last_times_s, default=math.inf) + self._topic_timeout_s)
         due_s = min(due_times_s)
         if inbox.filled.is_set() or due_s <= now_s:
-            # the client gets a turn, however many samples wait for evaluation
+            # the client gets a turn, even if many samples wait for evaluation
             await asyncio.sleep(0)
             return
         with suppress(TimeoutError):
@@ -714,7 +715,7 @@ class LiveSession:
             inbox.put(arrival._replace(arrived_s=now_s) if isinstance(arrival, Received) else arrival)
 
     def _sampled_by_default(self) -> str | None:
-        """Return the topic that is sampled, if a recording of the same topics may be sampled at another."""
+        """Return the sampled topic; None if a bag of the same topics is sampled at this topic, too."""
         if self._mapping is None or self._mapping.sampling != Sampling():
             return None
         entries = [entry for entry in self._mapping.topics if entry.topic in self._planned_channels]
@@ -729,10 +730,10 @@ class LiveSession:
     async def _evaluate(
         self, trace: Trace | None, arrived_s: float, remaining: Callable[[], list[Trace]] | None = None
     ) -> AsyncIterator[LiveUpdate]:
-        """Evaluate samples, and yield their updates; late samples are dropped if newer ones wait.
+        """Evaluate samples, and yield their updates; late samples are dropped if newer samples wait.
 
         Args:
-            remaining: function that returns the pending samples of `RunEnds`, to evaluate them too.
+            remaining: function that returns pending samples of `RunEnds`, which are evaluated, too.
         """
         if trace is not None:
             trace = self._relevant_samples(trace, remaining)
@@ -757,14 +758,14 @@ class LiveSession:
             yield self._update(sample, arrived_s)
 
     def _relevant_samples(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
-        """Return the samples that count.
+        """Return the samples of the run.
 
-        They begin when all needed topics can be judged, and stop where the run may have ended.
+        The run begins when all needed topics can be judged, and stops where it may have ended.
         """
         self._members.add(trace)
         ends = self._ends
         had_begun, remarks = ends.begin_ns is not None, ends.remarks
-        # samples are added one by one, so that none waits for the next one, which may not count
+        # samples are added one by one, so that no sample waits for a later sample
         samples = [trace.slice(index, index + 1) for index in range(len(trace))]
         counting_traces = [
             piece for new_trace in (samples if had_begun else [trace]) for piece in ends.add(new_trace)
@@ -822,7 +823,7 @@ _WAITING = 65_536
 
 
 class _RunRecorder(Recorder):
-    """A recorder of a live run; it drops samples only beyond `_WAITING`, however slow the disk is."""
+    """A recorder of a live run; it drops samples only beyond `_WAITING`, also on a slow disk."""
 
     most_lost_s: ClassVar[float] = math.inf
 
@@ -890,13 +891,14 @@ async def monitor(
 ) -> AsyncIterator[LiveUpdate]:
     """Monitor a running robot; yield an update for each sample.
 
-    After a lost connection, the client connects again; everything is unknown until then. Leave the loop to
-    end the run; its log is then closed.
+    After a lost connection, the client connects again; all objects and signals are unknown until then. Leave
+    the loop to end the run; its log is then closed.
 
     Args:
         address: address of foxglove_bridge or another server of Foxglove's WebSocket protocol, such as
             ws://robot:8765.
-        mapping: mapping as for a log of the same topics; without one, the server needs /spatial/objects.
+        mapping: mapping as for a log of the same topics; without a mapping, the server needs
+            /spatial/objects.
         output: path of a log of samples and messages, which is written as `Recorder` does.
         trigger, clips: trigger of clips, which are logs of a part of the run, and the folder of clips.
         topics: patterns of topics whose messages are written; by default, the mapped topics.

@@ -121,7 +121,7 @@ class Transport:
         return min(self._from_ns + max(played_ns, 0), self.end_ns)
 
     def state(self, now: float) -> PlaybackState:
-        """Return the state to show."""
+        """Return the state at the time `now`."""
         time_ns = self.time_ns(now)
         status = Status.PLAYING if self._is_playing else Status.PAUSED
         if not self._is_playing and time_ns >= self.end_ns:
@@ -143,14 +143,14 @@ class Transport:
         self._from_ns, self._since_s = min(max(time_ns, self.start_ns), self.end_ns), now
 
     def set_speed(self, speed: float, now: float) -> None:
-        """Set the speed, clipped to `SLOWEST` and `FASTEST`; ignore one that is not positive and finite."""
+        """Set the speed, clipped to `SLOWEST` and `FASTEST`; ignore 0, negative numbers, infinity and NaN."""
         if speed > 0.0 and not math.isinf(speed):
             self.move_to(self.time_ns(now), now)
             self._speed = min(max(speed, SLOWEST), FASTEST)
 
 
 Values = Mapping[str, float | str]
-"""Values by name of constant. Durations are texts, all others numbers."""
+"""Values by name of constant. Durations are texts, other values are numbers."""
 
 MOST_OPEN: Final = 8
 """Limit of open questions."""
@@ -250,7 +250,7 @@ The time in seconds after the log's zero, whether the log plays, the seconds of 
 whether the log starts again at its end."""
 
 ARROW: Final = "scene.arrow"
-"""Name of the parameter that chooses the arrow: the title of a result, or "" for the first violated one."""
+"""Name of the parameter that chooses the arrow: a result's title, or "" for the first violated result."""
 
 # int64 nanoseconds reach 9.2e9 seconds
 _LONGEST_S: Final = 9e9
@@ -267,7 +267,7 @@ class Session:
     """Requests of viewers, collected on any thread for the thread of the player.
 
     Only `wait_for_evaluation` waits for the player. If requests arrive faster than the player performs them,
-    the last one counts.
+    the last request of a kind counts.
 
     Attributes:
         edited: the specifications with the constants as viewers set them.
@@ -416,7 +416,7 @@ class Session:
                 name: value
                 for name, value in edited_before.given.items()
                 if name in loaded.constants
-                # `write_constants` wrote the viewer's earlier value; the present one may be newer
+                # `write_constants` wrote the viewer's earlier value; the viewer's present value may be newer
                 and (loaded.constants[name] == constants_before[name] or loaded.was_written(name))
             }
             try:
@@ -494,14 +494,14 @@ class Session:
     def continue_from(self, time_ns: int) -> None:
         """Continue at the time that was just shown, unless a seek is pending.
 
-        The duration of showing it is no playing time.
+        The duration of showing a time is not played.
         """
         with self._requested:
             if self._pending.seek_ns is None:
                 self._transport.move_to(time_ns, self._pace.now())
 
     def restore(self, edited: EditedFiles, failure: SpatialReplayError) -> Values:
-        """Restore former specifications, unless a newer change is pending, and return the present constants.
+        """Restore former specifications and return the present constants. A pending newer change stays.
 
         Args:
             failure: error of the latest specifications.
@@ -527,14 +527,14 @@ class Session:
         return self.pause()
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
-        """Return an evaluation to all calls of `wait_for_evaluation` before the last `next_requests`."""
+        """Give an evaluation to all calls of `wait_for_evaluation` before the last `next_requests`."""
         with self._requested:
             due_evaluation, self._due_evaluation = self._due_evaluation, None
         if due_evaluation is not None:
             due_evaluation.set_result(evaluated)
 
     def end(self) -> None:
-        """Make waiting and later calls of `wait_for_evaluation` raise."""
+        """Refuse waiting and later calls of `wait_for_evaluation` by an error."""
         with self._requested:
             self._is_over = True
             open_futures = [
@@ -554,7 +554,7 @@ MOST_DRAWN_A_SECOND: Final = 50
 It equals the rate of the scene in annotated logs, so that playback at speed 1 sends every message."""
 
 _MOST_AT_ONCE: Final = math.ceil(MOST_DRAWN_A_SECOND * MOST_LATE_S) + 1
-"""Burst allowance, messages: all of the longest turn at speed 1, and one more by its phase."""
+"""Burst allowance, messages: the messages of the longest turn at speed 1, and one more by its phase."""
 
 _NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
 _DRAWN: Final = (
@@ -585,7 +585,7 @@ class PlaybackThinning:
         self._allowances: dict[str, tuple[float, float]] = {}
 
     def thin(self, messages: Messages, elapsed_s: float) -> Messages:
-        """Return the messages to send from those of a turn that lasted `elapsed_s` seconds."""
+        """Return the messages to send, from the messages of a turn of `elapsed_s` seconds."""
         self._elapsed_s += elapsed_s
         most_samples = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
         is_sent = np.ones(len(messages), np.bool_)
@@ -594,7 +594,7 @@ class PlaybackThinning:
             if channel.topic in _NEVER_THINNED:
                 continue
             times_ns, time_indices = np.unique(messages.log_time_ns[message_indices], return_inverse=True)
-            # a turn at the limit has one sample more by its phase
+            # a turn at the limit has one more sample, depending on its phase
             limit = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most_samples
             if len(times_ns) <= limit + (not _is_drawn(channel)):
                 continue
@@ -633,7 +633,7 @@ def _is_drawn(channel: Channel) -> bool:
 
 
 def _with_deletions(payloads: Sequence[bytes], places: Integers, is_kept: Booleans) -> dict[int, bytes]:
-    """Return the kept scenes after dropped ones, by place, with the deletions of the dropped scenes added."""
+    """Return the kept scenes that follow dropped scenes, by place, with the dropped scenes' deletions."""
     scene_by_index = {}
     missed_deletions = SceneUpdate()
     for place in places.tolist():
@@ -755,7 +755,7 @@ class Player:
             self._viewers.send_values(self._session.restore(evaluated_before.edited, error))
             return False
         if edited.loaded is not evaluated_before.loaded:
-            # viewers know the constants that they set, not those of a file that was saved
+            # viewers know the constants that they set, but not the constants of a saved file
             self._viewers.send_values(constant_values(edited.constants))
         self._viewers.remove_note(CONSTANTS)
         return True
@@ -775,7 +775,7 @@ class Player:
     def _seek(self, time_ns: int) -> None:
         """Show a time and continue from it.
 
-        Some viewers drop messages only some time after a jump, so a paused playback sends them once more.
+        Some viewers drop messages only some time after a jump, so a paused playback sends the messages again.
         """
         self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
         self._show(time_ns)
@@ -785,7 +785,8 @@ class Player:
     def _show(self, time_ns: int) -> None:
         """Send the messages of a time, after making viewers drop earlier ones.
 
-        Viewers drop messages when time steps back, or at a state with `did_seek`. Times overtake messages.
+        Viewers drop messages when time steps back, or at a state with `did_seek`. Times can overtake messages
+        on their way to a viewer.
         """
         self._viewers.send_time(self._playback.start_ns)
         self._viewers.send_time(time_ns)

@@ -37,7 +37,7 @@ class Gate:
 
     Attributes:
         origins: origins of pages that may connect, in addition to pages of this machine.
-        token: token that each request must carry as `?token=…`; None if none is needed.
+        token: token that each request must carry as `?token=…`; None if no token is needed.
     """
 
     origins: frozenset[str]
@@ -45,7 +45,7 @@ class Gate:
 
     @classmethod
     def of(cls, host: str, origins: Iterable[str]) -> Gate:
-        """Return the gate of a server, with a new token if other machines can reach it.
+        """Return the gate of a server, with a new token if other machines can reach the server.
 
         Raises:
             UsageError: an origin is malformed.
@@ -61,7 +61,7 @@ class Gate:
         return cls(frozenset(allowed), None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES))
 
     def refusal(self, head: bytes) -> str | None:
-        """Return the HTTP status for a refused request; None for an accepted one."""
+        """Return the HTTP status for a refused request; None for an accepted request."""
         request, *lines = head.decode("latin-1").split("\r\n")
         split_lines = (line.partition(":") for line in lines)
         fields = [(name.strip().lower(), value.strip()) for name, _, value in split_lines]
@@ -99,7 +99,7 @@ _PATIENCE_S: Final = 10.0
 """Timeout of a viewer's request, and of each wait for a viewer that does not read, seconds."""
 
 _MOST_TEXT: Final = 1 << 20
-"""Limit of a text message that the relay decodes, bytes; longer ones pass unchanged."""
+"""Limit of a text message that the relay decodes, bytes; longer messages pass unchanged."""
 
 # bits and opcodes in the first byte of a frame: RFC 6455, section 5.2
 _FINAL: Final = 0x80
@@ -113,18 +113,18 @@ _PLAYBACK_STATE: Final = 5
 
 
 class Relay:
-    """Listens for viewers and connects each to the server behind it, on a thread of its own."""
+    """Listens for viewers on a separate thread, and connects each viewer to the server."""
 
     def __init__(self, host: str, port: int, behind: tuple[str, int], gate: Gate) -> None:
-        """Listen.
+        """Listen at an address.
 
         Args:
-            port: 0 for any that is free.
+            port: TCP port; 0 for any free port.
             behind: host and port of the server on this machine.
-            gate: which requests are passed on.
+            gate: access rules for requests.
 
         Raises:
-            OSError: nothing can listen there.
+            OSError: the address cannot be used.
         """
         # asyncio takes an empty host for all interfaces:
         # https://docs.python.org/3/library/asyncio-eventloop.html#asyncio.loop.create_server
@@ -255,7 +255,7 @@ def with_exact_numbers(text: bytes) -> bytes:
             if isinstance(parameter["value"], str) and parameter.get("type") == "float64":
                 del parameter["type"]
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        # the SDK answers with the fault
+        # the SDK answers the request with the fault
         return text
     return json.dumps(request).encode()
 

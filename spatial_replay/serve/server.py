@@ -58,7 +58,7 @@ class _ServiceDefinition(NamedTuple):
 
     Attributes:
         request, response: JSON schemas.
-        answer: computes the response to a request.
+        answer: function that computes the response to a request.
     """
 
     request: Mapping[str, Any]
@@ -256,8 +256,8 @@ _CAPABILITIES: Final = (
 class PublishingServer:
     """A WebSocket server that sends new messages to viewers.
 
-    No method waits for a viewer or fails because of one. A slow viewer loses the oldest messages. A viewer
-    that reads nothing is disconnected.
+    No method waits for a viewer or fails because of a viewer. A slow viewer loses the oldest messages. A
+    viewer that reads nothing is disconnected.
     """
 
     def __init__(
@@ -266,7 +266,7 @@ class PublishingServer:
         """Listen.
 
         Args:
-            channels: channels that are known at the start; others are added with their first message.
+            channels: channels that are known at the start; other channels are added with their first message.
             port: TCP port; 0 for any free port.
             origins: origins of pages that may connect, in addition to `VIEWERS` and pages of this machine.
 
@@ -363,7 +363,7 @@ class PublishingServer:
         """Offer a channel if viewers can decode it: with a schema, or in JSON."""
         if channel.schema is None and channel.encoding != "json":
             return
-        # channels that differ only in their publisher are one to a viewer
+        # for viewers, channels that differ only in their publisher are one channel
         viewer_key = channel.topic, channel.encoding, channel.schema
         if viewer_key not in self._channel_by_key:
             self._channel_by_key[viewer_key] = self._channel(channel)
@@ -422,15 +422,15 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
-        """Send the state of the playback to all viewers. Handlers return it to a single viewer."""
+        """Send the playback's state to all viewers; handlers of requests return it to a single viewer."""
         self._server.broadcast_playback_state(_playback_state(state, None))
 
     def send_values(self, values: Values) -> None:
-        """Send the constants to all viewers. Handlers return them to a single viewer."""
+        """Send the constants to all viewers; handlers of requests return them to a single viewer."""
         self._server.publish_parameter_values(_constants(values))
 
     def send_playback(self) -> None:
-        """Send the parameters of the playback to all viewers. Handlers return them to a single viewer."""
+        """Send the playback's parameters to all viewers; handlers of requests return them to one viewer."""
         self._server.publish_parameter_values(_parameters(self.steering))
 
     @property
@@ -610,7 +610,7 @@ def _json_service(
     response: Mapping[str, Any],
     handle: Callable[[ServiceRequest], bytes],
 ) -> Service:
-    """Return a service whose request and response are JSON, by their schemas."""
+    """Return a service with requests and responses in JSON."""
     request_schema, response_schema = (
         foxglove.MessageSchema(
             encoding="json",
@@ -729,7 +729,7 @@ PORT = 8765
 """Default port of viewers and servers."""
 
 _LAST_S = 0.25
-"""Timeout of a running evaluation at the end, seconds."""
+"""Timeout of a running evaluation when the server stops, seconds."""
 
 
 @dataclass(frozen=True)
