@@ -96,7 +96,7 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
 
 def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     """Return the reason why the messages of a topic cannot be decoded, or None."""
-    start = f"topic {topic.name!r}: "
+    prefix = f"topic {topic.name!r}: "
     try:
         if topic.encoding in ("ros1", "cdr"):
             # making a decoder takes longer than checking its definition
@@ -104,7 +104,7 @@ def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
         else:
             decoder_of(topic)
     except LogError as error:
-        return start + str(error).removeprefix(start)
+        return prefix + str(error).removeprefix(prefix)
     return None
 
 

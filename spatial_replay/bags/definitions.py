@@ -103,9 +103,9 @@ def iter_sections(text: str, type_name: str) -> Iterator[tuple[str, str]]:
             f" at most {LONGEST_TEXT} are read"
         )
     for section in _SEPARATOR.split(text):
-        head = _HEAD.match(section)
-        if head:
-            yield checked_type_name(full_type_name(head["name"])), section[head.end() :]
+        head_match = _HEAD.match(section)
+        if head_match:
+            yield checked_type_name(full_type_name(head_match["name"])), section[head_match.end() :]
         elif section.strip():
             yield checked_type_name(full_type_name(type_name)), section
 
@@ -135,10 +135,12 @@ def _iter_fields(body: str, owner: str, type_names: set[str]) -> Iterator[Field]
         # a constant is not in the bytes of a message
         if field_match["rest"].startswith("="):
             continue
-        limit, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
-        kind: Kind = "scalar" if not field_match["brackets"] else "array" if limit.isdigit() else "sequence"
+        limit_text, longest = field_match["limit"] or "", int(field_match["longest"] or 0)
+        kind: Kind = (
+            "scalar" if not field_match["brackets"] else "array" if limit_text.isdigit() else "sequence"
+        )
         type_name = _resolve(field_match["type"], owner, type_names)
-        yield Field(field_match["name"], type_name, kind, int(limit.removeprefix("<=") or 0), longest)
+        yield Field(field_match["name"], type_name, kind, int(limit_text.removeprefix("<=") or 0), longest)
 
 
 def _resolve(name: str, owner: str, type_names: set[str]) -> str:
@@ -194,8 +196,8 @@ class _Walk:
         self.used[checked_type_name(name)] = fields
         _check_field_names(name, fields)
         value_count = least_bytes = 0
-        for member in fields:
-            field_values, field_bytes = self._field(member, name, (*above, name))
+        for field in fields:
+            field_values, field_bytes = self._field(field, name, (*above, name))
             value_count += field_values
             least_bytes += field_bytes
         if value_count > MOST_VALUES:
@@ -232,12 +234,12 @@ class _Walk:
 
 def _check_field_names(name: str, fields: tuple[Field, ...]) -> None:
     field_names: set[str] = set()
-    for member in fields:
-        if len(member.name) > 256 or not _NAME.fullmatch(member.name):
-            raise LogError(f"{member.name!r:.100} is not a name of a field; it is in {name!r}")
-        if member.name in field_names:
-            raise LogError(f"the type {name!r} has two fields {member.name!r}")
-        field_names.add(member.name)
+    for field in fields:
+        if len(field.name) > 256 or not _NAME.fullmatch(field.name):
+            raise LogError(f"{field.name!r:.100} is not a name of a field; it is in {name!r}")
+        if field.name in field_names:
+            raise LogError(f"the type {name!r} has two fields {field.name!r}")
+        field_names.add(field.name)
 
 
 def _used_by(above: tuple[str, ...]) -> str:

@@ -137,19 +137,19 @@ class McapLog(MessageReader):
             walk.stream = stream
             statistics = directory.statistics
             # without counts of channels, all messages are read to compare their number with the total
-            is_total = statistics is not None and not statistics.channel_message_counts
+            is_counting_all = statistics is not None and not statistics.channel_message_counts
             messages_of_places = walk.iter_messages(
-                [place for _, place in places], lambda topic: is_total or topic in topics
+                [place for _, place in places], lambda topic: is_counting_all or topic in topics
             )
-            contents = (
+            chunk_columns = (
                 self._columns(rank, place, messages, channel_numbers, first_ns, end_ns)
                 for (rank, _), (place, messages) in zip(places, messages_of_places, strict=True)
             )
             if as_recorded:
-                yield from contents
+                yield from chunk_columns
                 return
             most_bytes = most_waiting(place.length for _, place in places)
-            yield from in_order([place.start_ns for _, place in places], contents, self.name, most_bytes)
+            yield from in_order([place.start_ns for _, place in places], chunk_columns, self.name, most_bytes)
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         yield from super()._count(columns, topics, name)
@@ -190,17 +190,17 @@ class McapLog(MessageReader):
             )
             self._faults.add(f"{self.name}: {fault} in the index")
         times_ns = messages.log_time_ns
-        rows = np.flatnonzero(
+        wanted_indices = np.flatnonzero(
             np.isin(messages.channel, wanted_channels) & (times_ns >= first_ns) & (times_ns < end_ns)
         )
-        wanted_messages = select(messages, rows)
+        wanted_messages = select(messages, wanted_indices)
         times_of_messages = wanted_messages.log_time_ns, wanted_messages.publish_time_ns
         return self._make_columns(
             wanted_messages.channel,
             times_of_messages,
             wanted_messages.sequence,
             wanted_messages.payloads,
-            places_in(rank, rows),
+            places_in(rank, wanted_indices),
         )
 
 
@@ -322,11 +322,11 @@ class BagFolder(MessageReader):
                     place=file_place + columns_of_file.place,
                 )
 
-        reads = [partial(read, file_number, file) for file_number, file in enumerate(self._files)]
-        if as_recorded or len(reads) == 1:
-            merged: Columns = (columns_of_file for open_file in reads for columns_of_file in open_file())
+        openers = [partial(read, file_number, file) for file_number, file in enumerate(self._files)]
+        if as_recorded or len(openers) == 1:
+            merged: Columns = (columns_of_file for open_file in openers for columns_of_file in open_file())
         else:
-            file_reads = zip(self._files, reads, strict=True)
+            file_reads = zip(self._files, openers, strict=True)
             merged = merge_files((file.start_ns or 0, open_file) for file, open_file in file_reads)
         if self._metadata and self._metadata.compression == "message":
             return self._unpack_all(merged)

@@ -201,13 +201,17 @@ def without_jumps(
     for message_columns in columns:
         if first_ns is None and len(message_columns):
             first_ns = int(message_columns.log_time_ns[0])
-        for topic, rows in message_columns.by_topic():
+        for topic, message_indices in message_columns.by_topic():
             if topic not in checked:
                 continue
             history = history_by_topic.setdefault(topic, _PlaceHistory(disorder_ns))
-            jump_index = history.first_jump(message_columns.log_time_ns[rows], message_columns.place[rows])
+            jump_index = history.first_jump(
+                message_columns.log_time_ns[message_indices], message_columns.place[message_indices]
+            )
             if jump_index is not None:
-                jump_instant = Instant(int(message_columns.log_time_ns[rows][jump_index]), first_ns or 0)
+                jump_instant = Instant(
+                    int(message_columns.log_time_ns[message_indices][jump_index]), first_ns or 0
+                )
                 raise LogError(
                     f"{name}: time jumps back: the message on {topic!r} logged at {jump_instant} was recorded"
                     f" before others that were logged more than {disorder_ns / 1e9:g} s earlier;"

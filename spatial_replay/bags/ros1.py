@@ -459,7 +459,7 @@ class _Scan:
                 self._mark_count += 1
                 if self._mark_count > _MOST_MARKS:
                     return None
-                for begin in (mark_offset - before for before in reversed(_BEFORE_MARK)):
+                for begin in (mark_offset - distance for distance in reversed(_BEFORE_MARK)):
                     length = int.from_bytes(window[max(0, begin) : max(0, begin) + 4], "little")
                     if begin >= 0 and length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
                         return position + begin
@@ -521,12 +521,14 @@ class Ros1Bag(MessageReader):
             if self._is_in_parts:
                 chunks = [(rank, chunk) for rank, (_, chunk) in enumerate(chunks)]
         with self._path.open("rb") as stream:
-            contents = (self._messages(stream, *ranked, connections, first_ns, end_ns) for ranked in chunks)
+            chunk_columns = (
+                self._messages(stream, *ranked, connections, first_ns, end_ns) for ranked in chunks
+            )
             if as_recorded:
-                yield from contents
+                yield from chunk_columns
                 return
             most_bytes = most_waiting([self._path.stat().st_size])
-            yield from in_order([chunk.start_ns for _, chunk in chunks], contents, self.name, most_bytes)
+            yield from in_order([chunk.start_ns for _, chunk in chunks], chunk_columns, self.name, most_bytes)
 
     @cached_property
     def _is_in_parts(self) -> bool:

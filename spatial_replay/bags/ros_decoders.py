@@ -73,9 +73,9 @@ def ros_definitions(
     checked_type_name(type_name)
     if schema is None or not schema.data.strip():
         definitions = [
-            check_definitions(standard, type_name, empty_bytes=empty_bytes)
-            for standard in _standards(encoding, distribution)
-            if type_name in standard
+            check_definitions(standard_types, type_name, empty_bytes=empty_bytes)
+            for standard_types in _standards(encoding, distribution)
+            if type_name in standard_types
         ]
         if not definitions:
             raise LogError(f"the log has no definition of {type_name!r}, which is not a standard ROS type")
@@ -85,8 +85,8 @@ def ros_definitions(
             if definition not in definitions[:index]
         )
     log_definitions = _parse(type_name, schema)
-    standard = next(iter(_standards(encoding, distribution)))
-    return (check_definitions({**standard, **log_definitions}, type_name, empty_bytes=empty_bytes),)
+    standard_types = next(iter(_standards(encoding, distribution)))
+    return (check_definitions({**standard_types, **log_definitions}, type_name, empty_bytes=empty_bytes),)
 
 
 @lru_cache(64)
@@ -98,8 +98,8 @@ def ros_decoder(
     Raises:
         LogError: the definition of the type is missing or invalid.
     """
-    choices = ros_definitions(type_name, encoding, schema, distribution)
-    decoders = [_decoder(type_name, encoding, definitions) for definitions in choices]
+    possible_definitions = ros_definitions(type_name, encoding, schema, distribution)
+    decoders = [_decoder(type_name, encoding, definitions) for definitions in possible_definitions]
     return decoders[0] if len(decoders) == 1 else _first_that_fits(decoders)
 
 
@@ -107,13 +107,13 @@ def _decoder(type_name: str, encoding: RosEncoding, definitions: Definitions) ->
     from rosbags.typesys import Stores, get_typestore
 
     try:
-        store = get_typestore(Stores.EMPTY)
-        store.register(_describe(definitions, store))
-        store.get_msgdef(type_name)
+        type_store = get_typestore(Stores.EMPTY)
+        type_store.register(_describe(definitions, type_store))
+        type_store.get_msgdef(type_name)
     # rosbags raises errors of many undocumented types if it cannot generate code
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be used: {failure_text(error)}") from None
-    return _cdr_decoder(store, type_name) if encoding == "cdr" else _ros1_decoder(store, type_name)
+    return _cdr_decoder(type_store, type_name) if encoding == "cdr" else _ros1_decoder(type_store, type_name)
 
 
 def _ros1_decoder(store: Typestore, type_name: str) -> Decoder:
@@ -145,8 +145,8 @@ def _cdr_decoder(store: Typestore, type_name: str) -> Decoder:
         except Exception as error:
             raise LogError(f"a message is not a {type_name}: {failure_text(error)}") from None
         if not 4 <= len(payload) - end <= _MOST_AROUND or payload[:2] not in _PLAIN:
-            sizes = f"it has {len(payload)} bytes, {end + 4} were expected"
-            raise LogError(f"a message is not a {type_name} in plain CDR: {sizes}")
+            size_text = f"it has {len(payload)} bytes, {end + 4} were expected"
+            raise LogError(f"a message is not a {type_name} in plain CDR: {size_text}")
         return message
 
     return decode
@@ -177,8 +177,8 @@ def _parse(type_name: str, schema: Schema) -> Definitions:
         return definitions_from_msg(text, type_name)
     if schema.encoding == "ros2idl":
         return _from_idl(text, type_name)
-    readable = "ros1msg, ros2msg and ros2idl are read"
-    raise LogError(f"the definition of {type_name!r} is in {schema.encoding!r:.100}; {readable}")
+    readable_text = "ros1msg, ros2msg and ros2idl are read"
+    raise LogError(f"the definition of {type_name!r} is in {schema.encoding!r:.100}; {readable_text}")
 
 
 def _from_idl(text: str, type_name: str) -> Definitions:

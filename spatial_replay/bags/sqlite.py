@@ -120,16 +120,16 @@ def _metadata_topic(entry: object) -> tuple[str, str, int]:
 
 
 def _compression(topic_metadata: dict[str, object]) -> Compression:
-    mode = str(topic_metadata.get("compression_mode") or "none").lower()
+    compression_mode = str(topic_metadata.get("compression_mode") or "none").lower()
     compression_format = str(topic_metadata.get("compression_format") or "")
-    if mode == "none":
+    if compression_mode == "none":
         return ""
-    if mode not in ("file", "message") or compression_format != "zstd":
+    if compression_mode not in ("file", "message") or compression_format != "zstd":
         raise LogError(
-            f"the bag is compressed by {mode!r:.40} with {compression_format!r:.40}; zstd by file or"
-            " message is read"
+            f"the bag is compressed by {compression_mode!r:.40} with {compression_format!r:.40}; zstd by"
+            " file or message is read"
         )
-    return "file" if mode == "file" else "message"
+    return "file" if compression_mode == "file" else "message"
 
 
 def _list(mapping: dict[str, object], name: str) -> list[object]:
@@ -177,12 +177,12 @@ def temporary_folder(owner: object) -> Path:
 
 def copy_beginning(path: Path, size: int, folder: Path) -> Path:
     """Copy the first `size` bytes of a file into a folder."""
-    target = folder / path.name
-    with path.open("rb") as source_file, open_output(target) as target_file:
+    target_path = folder / path.name
+    with path.open("rb") as source_file, open_output(target_path) as target_file:
         while size > 0 and (piece := source_file.read(min(size, _PIECE))):
             target_file.write(piece)
             size -= len(piece)
-    return target
+    return target_path
 
 
 def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
@@ -519,10 +519,10 @@ def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Top
     counts = metadata.counts if metadata else {}
     topics = {}
     for row in topic_rows:
-        number, topic, type_name = row.get("id"), row.get("name"), row.get("type")
-        if not (isinstance(number, int) and isinstance(topic, str) and isinstance(type_name, str)):
+        topic_number, topic_name, type_name = row.get("id"), row.get("name"), row.get("type")
+        if not (isinstance(topic_number, int) and isinstance(topic_name, str) and isinstance(type_name, str)):
             raise LogError(f"{name} is damaged: its table 'topics' has a row without an id, a name or a type")
-        topics[number] = _topic(row, schemas.get(type_name), counts.get(topic))
+        topics[topic_number] = _topic(row, schemas.get(type_name), counts.get(topic_name))
     return topics, distribution
 
 
@@ -574,9 +574,9 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
                 spans.append((first_id, last_id))
                 break
             middle_id = (first_id + last_id) // 2
-            halves = [(first_id, middle_id), (middle_id + 1, last_id)] if first_id < last_id else []
-            spans.extend(halves)
-            lost_spans.update([] if halves else [(first_id, last_id)])
+            half_spans = [(first_id, middle_id), (middle_id + 1, last_id)] if first_id < last_id else []
+            spans.extend(half_spans)
+            lost_spans.update([] if half_spans else [(first_id, last_id)])
     lost_spans.update(spans)
     return sorted(row_by_id.values()), lost_spans
 
@@ -634,17 +634,22 @@ def _records(database: sqlite3.Connection, table: str) -> list[dict[str, object]
 def _schemas(database: sqlite3.Connection) -> dict[str, Schema]:
     schemas = {}
     for row in _records(database, "message_definitions"):
-        name, text = row.get("topic_type"), row.get("encoded_message_definition")
-        if isinstance(name, str) and isinstance(text, str) and text.strip() and len(text) <= LONGEST_TEXT:
-            schemas[name] = Schema(name, str(row.get("encoding")), text.encode())
+        type_name, text = row.get("topic_type"), row.get("encoded_message_definition")
+        if (
+            isinstance(type_name, str)
+            and isinstance(text, str)
+            and text.strip()
+            and len(text) <= LONGEST_TEXT
+        ):
+            schemas[type_name] = Schema(type_name, str(row.get("encoding")), text.encode())
     return schemas
 
 
 def _metadata(database: sqlite3.Connection) -> BagMetadata | None:
     for row in _records(database, "metadata"):
-        text = row.get("metadata")
-        if isinstance(text, str) and text.strip():
-            return bag_metadata_from_bytes(text.encode())
+        metadata_text = row.get("metadata")
+        if isinstance(metadata_text, str) and metadata_text.strip():
+            return bag_metadata_from_bytes(metadata_text.encode())
     return None
 
 

@@ -188,7 +188,7 @@ class Client:
     async def _listen(self, connection: ClientConnection) -> str:
         """Put all items into the inbox until the connection ends; return the reason of its end."""
         offered_channels: dict[int, Channel] = {}
-        channels_now = offered_channels.values()
+        current_channels = offered_channels.values()
         subscribed_channels: dict[int, Channel] = {}
         has_warned = False
         definition_bytes = 0
@@ -231,12 +231,12 @@ class Client:
                         if new_channels:
                             subscribed_channels |= new_channels
                             await connection.send(subscribe(new_channels))
-                        self.inbox.put(Offered(channels_now))
+                        self.inbox.put(Offered(current_channels))
                     case Unadvertised(numbers):
                         for number in numbers:
                             offered_channels.pop(number, None)
                             subscribed_channels.pop(number, None)
-                        self.inbox.put(Offered(channels_now))
+                        self.inbox.put(Offered(current_channels))
                     case Warned(text):
                         self.inbox.put(Warned(f"{self.address} says: {text}"))
                     case _:

@@ -90,8 +90,8 @@ class ObjectsAssembler:
         for fault in faults:
             self._faults.add(f"{self._name}: {fault}")
         if len(trace):
-            rows = zip(trace.names, trace.rows[-1].tolist(), strict=True)
-            present_rows = {name: row if row >= 0 else -2 - row for name, row in rows if row != ABSENT}
+            named_rows = zip(trace.names, trace.rows[-1].tolist(), strict=True)
+            present_rows = {name: row if row >= 0 else -2 - row for name, row in named_rows if row != ABSENT}
             self._classes = {
                 name: trace.classes[int(trace.class_code[row])] for name, row in present_rows.items()
             }
@@ -601,10 +601,10 @@ class LiveSession:
         trace = self._assembler.add(messages, time.monotonic())
         self._notes += self._assembler.take_faults()
         if self._assembler.is_finished and self.failure is None:
-            jump = self._assembler.jump or "time jumps back by more than a second"
+            jump_text = self._assembler.jump or "time jumps back by more than a second"
             self.failure = LogError(
-                f"{self._address}: {jump}, as when a simulation or a player starts again; the run ends there:"
-                " start the monitor again"
+                f"{self._address}: {jump_text}, as when a simulation or a player starts again; the run ends"
+                " there: start the monitor again"
             )
         return trace
 
@@ -719,11 +719,11 @@ class LiveSession:
         if self._mapping is None or self._mapping.sampling != Sampling():
             return None
         entries = [entry for entry in self._mapping.topics if entry.topic in self._planned_channels]
-        topics = {entry.topic for entry in entries if entry.reads_objects} or {
+        candidate_topics = {entry.topic for entry in entries if entry.reads_objects} or {
             entry.topic for entry in entries
         }
-        first_topic = next((entry.topic for entry in entries if entry.topic in topics), None)
-        return first_topic if len(topics) > 1 else None
+        first_topic = next((entry.topic for entry in entries if entry.topic in candidate_topics), None)
+        return first_topic if len(candidate_topics) > 1 else None
 
     # ------------------------------------------------------------------------------ evaluating
 
@@ -763,25 +763,27 @@ class LiveSession:
         The run begins when all needed topics can be judged, and stops where it may have ended.
         """
         self._members.add(trace)
-        ends = self._ends
-        had_begun, remarks = ends.begin_ns is not None, ends.remarks
+        run_ends = self._ends
+        had_begun, remarks = run_ends.begin_ns is not None, run_ends.remarks
         # samples are added one by one, so that no sample waits for a later sample
         samples = [trace.slice(index, index + 1) for index in range(len(trace))]
-        counting_traces = [
-            piece for new_trace in (samples if had_begun else [trace]) for piece in ends.add(new_trace)
+        run_traces = [
+            run_trace
+            for new_trace in (samples if had_begun else [trace])
+            for run_trace in run_ends.add(new_trace)
         ]
         if remaining is not None:
-            counting_traces += remaining()
-        if ends.begin_ns is not None:
-            self._notes += counted_from(ends.remarks[len(remarks) :], ends.begin_ns)
-            if ends.late and not had_begun:
-                topic_names = ", ".join(ends.late)
+            run_traces += remaining()
+        if run_ends.begin_ns is not None:
+            self._notes += counted_from(run_ends.remarks[len(remarks) :], run_ends.begin_ns)
+            if run_ends.late and not had_begun:
+                topic_names = ", ".join(run_ends.late)
                 self._notes.append(
                     f"the run begins although {topic_names} cannot be judged yet: until then, what it"
                     " reports is unknown, and groups lack its objects; --start-within (start_within_s)"
                     " waits longer"
                 )
-        return counting_traces[0] if len(counting_traces) == 1 else Trace.concatenate(counting_traces)
+        return run_traces[0] if len(run_traces) == 1 else Trace.concatenate(run_traces)
 
     def _note_doubts(self) -> None:
         """Note new contradictions of the run to its mapping; compare again after twice as many samples."""

@@ -108,7 +108,7 @@ class Messages:
     def topic_ranks(self) -> Integers:
         """(M,) int64, rank of each message's topic among the sorted topics."""
         topics = {channel.topic for channel in self.channels.values()}
-        rank_by_topic = {topic: place for place, topic in enumerate(sorted(topics))}
+        rank_by_topic = {topic: rank for rank, topic in enumerate(sorted(topics))}
         rank_by_channel = np.zeros(max(self.channels, default=-1) + 1, np.int64)
         for number, channel in self.channels.items():
             rank_by_channel[number] = rank_by_topic[channel.topic]
@@ -187,12 +187,12 @@ def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
     # by identity: a rank holds the whole schema, so it is computed only once for each channel
     channel_by_id = {id(channel): channel for stream in streams for channel in stream.channels.values()}
-    by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
-    number_by_rank = {rank: number for number, rank in enumerate(sorted(by_rank))}
+    channel_by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
+    number_by_rank = {rank: number for number, rank in enumerate(sorted(channel_by_rank))}
     number_by_id = {object_id: number_by_rank[_rank(channel)] for object_id, channel in channel_by_id.items()}
-    renumbered = [replace(stream, channel=_renumber(stream, number_by_id)) for stream in streams]
-    channels = {number: by_rank[rank] for rank, number in number_by_rank.items()}
-    return replace(concatenate_tables([Messages(), *renumbered]), channels=channels)
+    renumbered_streams = [replace(stream, channel=_renumber(stream, number_by_id)) for stream in streams]
+    channels = {number: channel_by_rank[rank] for rank, number in number_by_rank.items()}
+    return replace(concatenate_tables([Messages(), *renumbered_streams]), channels=channels)
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

@@ -331,17 +331,17 @@ def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
         samples_of_groups = np.concatenate(
             [group.samples for group in groups if name in group.layout.signals]
         )
-        samples, counts = np.unique(samples_of_groups, return_counts=True)
-        faults |= {int(index): f"signal {name!r} is there twice" for index in samples[counts > 1]}
+        samples, sample_counts = np.unique(samples_of_groups, return_counts=True)
+        faults |= {int(index): f"signal {name!r} is there twice" for index in samples[sample_counts > 1]}
     return faults
 
 
 def _pad(words: Words) -> Floats:
-    padded = np.empty((len(words), words.shape[1] + 2))
-    padded[:, :-2] = words.view(np.float64)
+    padded_words = np.empty((len(words), words.shape[1] + 2))
+    padded_words[:, :-2] = words.view(np.float64)
     # UNKNOWN and ZERO
-    padded[:, -2:] = np.nan, 0.0
-    return padded
+    padded_words[:, -2:] = np.nan, 0.0
+    return padded_words
 
 
 def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
@@ -400,12 +400,12 @@ def _report_times(groups: Sequence[_Group], times_ns: Integers) -> Integers | No
 
 
 def _signal_report_times(groups: Sequence[_Group], times_ns: Integers) -> dict[str, Integers]:
-    reported: dict[str, Integers] = {}
+    report_times: dict[str, Integers] = {}
     for group in groups:
         for name, slot in group.layout.signals_reported.items():
             if slot != UNKNOWN:
-                reported.setdefault(name, times_ns.copy())[group.samples] = _whole(group, slot)
-    return reported
+                report_times.setdefault(name, times_ns.copy())[group.samples] = _whole(group, slot)
+    return report_times
 
 
 def _invalid(group: _Group) -> NDArray[np.bool_]:
@@ -542,20 +542,20 @@ def _numbers(trace: Trace, message: ObjectStates, rows: Integers) -> Floats:
     """Return (K, W) the numbers of observations of one layout, in the order of the message's fields."""
     (state,) = message.objects
     shapes = trace.footprints
-    columns: list[Floats] = []
+    number_columns: list[Floats] = []
     first_parts = shapes.part_start[rows]
     for part_index, part in enumerate(state.parts):
         first_vertices = shapes.vertex_start[first_parts + part_index]
         vertex_offsets = np.arange(len(part.coordinates) // 2)
-        columns.append(
+        number_columns.append(
             shapes.vertices[first_vertices[:, None] + vertex_offsets].reshape(
                 len(rows), len(part.coordinates)
             )
         )
-        columns.append(shapes.radius[first_parts + part_index, None])
+        number_columns.append(shapes.radius[first_parts + part_index, None])
     if state.HasField("yaw"):
-        columns.append(trace.yaw[rows, None])
+        number_columns.append(trace.yaw[rows, None])
     if state.HasField("height"):
-        columns += [shapes.bottom[rows, None], shapes.top[rows, None]]
-    columns.append(trace.uncertainty[rows, None])
-    return np.concatenate(columns, axis=1)
+        number_columns += [shapes.bottom[rows, None], shapes.top[rows, None]]
+    number_columns.append(trace.uncertainty[rows, None])
+    return np.concatenate(number_columns, axis=1)

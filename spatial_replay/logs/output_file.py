@@ -39,19 +39,19 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
     # a symbolic link stays, and its target is replaced
     output = output.resolve()
     # named before it is created, so that `finally` removes it after an interruption at any step
-    partial = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
+    partial_path = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
     try:
         with _writing(output):
             # exclusive, so that two writers never share a partial file; 0o666 leaves the mode to the umask
-            descriptor = os.open(partial, _CREATE | os.O_EXCL, 0o666)
+            descriptor = os.open(partial_path, _CREATE | os.O_EXCL, 0o666)
         with _stream(descriptor, output) as stream:
             yield stream
         with _writing(output):
-            partial.replace(output)
+            partial_path.replace(output)
     finally:
         # the partial file is missing if it was not created or is renamed already
         with suppress(OSError):
-            partial.unlink()
+            partial_path.unlink()
 
 
 Durability: TypeAlias = Literal["process", "disk"]

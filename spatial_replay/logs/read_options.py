@@ -255,9 +255,9 @@ class FaultKinds(FaultList):
         faults = super().take()
         if not last:
             return faults
-        counts, self._repeat_counts = self._repeat_counts, Counter()
-        more = (
+        repeat_counts, self._repeat_counts = self._repeat_counts, Counter()
+        repeat_lines = (
             f"… and {count:,} more like this: {self._first_by_kind.get(kind, kind)}"
-            for kind, count in counts.items()
+            for kind, count in repeat_counts.items()
         )
-        return (*faults, *more)
+        return (*faults, *repeat_lines)

@@ -161,9 +161,9 @@ def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
 
 def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
     """Return sorted ranges, joined over the smallest gaps; joining adds at most `_WASTE` of their bytes."""
-    ordered = sorted(span for span in ranges if span[1] > span[0])
-    needed_bytes = sum(end - begin for begin, end in ordered)
-    gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
+    sorted_ranges = sorted(span for span in ranges if span[1] > span[0])
+    needed_bytes = sum(end - begin for begin, end in sorted_ranges)
+    gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(sorted_ranges)))
     bridged_gaps, wasted_bytes = set[int](), 0
     for gap, index in gaps:
         wasted_bytes += max(gap, 0)
@@ -171,7 +171,7 @@ def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
             break
         bridged_gaps.add(index)
     merged_ranges: list[Range] = []
-    for index, (begin, end) in enumerate(ordered):
+    for index, (begin, end) in enumerate(sorted_ranges):
         if index - 1 in bridged_gaps:
             merged_ranges[-1] = (merged_ranges[-1][0], max(merged_ranges[-1][1], end))
         else:
@@ -217,11 +217,11 @@ class HeldBytes:
     def _overlapping(self, begin: int, end: int) -> list[tuple[int, bytes]]:
         """Return the parts that overlap a range, in order, each with its offset in the file."""
         first_index = max(bisect_right(self._begins, begin) - 1, 0)
-        parts = (
+        cached_parts = (
             (start, self._parts[start])
             for start in self._begins[first_index : bisect_left(self._begins, end)]
         )
-        return [(start, data) for start, data in parts if start + len(data) > begin]
+        return [(start, data) for start, data in cached_parts if start + len(data) > begin]
 
 
 _CREDENTIALS: Final = {
@@ -669,12 +669,12 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
         address: address of the remote folder, for messages.
         below: name of the local folder; "" for any name.
     """
-    versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
+    versions, limit_bytes = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     downloads_folder = user_cache_folder("downloads")
     # with the version, so that each version has its own copy
-    identities = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
-    folder = downloads_folder / hashlib.sha256("\n".join(identities).encode()).hexdigest()[:32]
+    version_texts = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
+    folder = downloads_folder / hashlib.sha256("\n".join(version_texts).encode()).hexdigest()[:32]
     # without a strong tag, a copy may be outdated, so it is made again
     if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
@@ -683,17 +683,18 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
             # the time of the last use, see `_make_room`
             os.utime(folder)
         return folder / below
-    if size > limit:
+    if size > limit_bytes:
         raise LogError(
-            f"{address} has {size / _GIGABYTE:.2f} GB, but downloads are limited to {limit / _GIGABYTE:g} GB;"
-            f" set {_LIMIT} to more gigabytes, or copy the log to this machine"
+            f"{address} has {size / _GIGABYTE:.2f} GB, but downloads are limited to"
+            f" {limit_bytes / _GIGABYTE:g} GB; set {_LIMIT} to more gigabytes, or copy the log to this"
+            " machine"
         )
     if reason:
         _LOG.warning("%s: downloading %.1f MB once, to %s: %s", address, size / 1e6, downloads_folder, reason)
     show = _shows.get()
     try:
         downloads_folder.mkdir(parents=True, exist_ok=True)
-        _make_room(downloads_folder, limit - size)
+        _make_room(downloads_folder, limit_bytes - size)
         # renamed when it is complete, so that no process reads a partial copy
         partial_folder = Path(tempfile.mkdtemp(".partial", "", downloads_folder))
         try:

@@ -83,11 +83,11 @@ class WireTemplate:
     @cached_property
     def fixed(self) -> Bytes:
         """(L,) uint8, 0 in all slots, 0xFF elsewhere."""
-        fixed = np.full(len(self), 0xFF, np.uint8)
-        fixed[self.mark_offsets] = 0
+        fixed_mask = np.full(len(self), 0xFF, np.uint8)
+        fixed_mask[self.mark_offsets] = 0
         for offset in self.word_offsets.tolist():
-            fixed[offset : offset + 8] = 0
-        return fixed
+            fixed_mask[offset : offset + 8] = 0
+        return fixed_mask
 
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""

@@ -360,23 +360,23 @@ class Session:
             UsageError: a value has another type, or a number is outside its limits.
         """
         current_values = self.playback
-        time, play, speed, loop = PLAYBACK
+        time_name, play_name, speed_name, loop_name = PLAYBACK
         for name, value in values.items():
             is_flag = isinstance(current_values[name], bool)
             if isinstance(value, str) or isinstance(value, bool) != is_flag:
                 kind_text = "true or false" if is_flag else "a number"
                 raise UsageError(f"{name} cannot be {value!r}: give {kind_text}")
-            if name == speed and not (SLOWEST <= value <= FASTEST):
+            if name == speed_name and not (SLOWEST <= value <= FASTEST):
                 raise UsageError(f"{name} cannot be {value!r}: give a number from {SLOWEST:g} to {FASTEST:g}")
             if not is_flag and not (0.0 <= value < float("inf")):
                 raise UsageError(f"{name} cannot be {value!r}: give a number of seconds, at least 0")
-        self._is_looping = bool(values.get(loop, self._is_looping))
+        self._is_looping = bool(values.get(loop_name, self._is_looping))
         seek_ns = None
-        if time in values:
-            seek_ns = self._zero_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
+        if time_name in values:
+            seek_ns = self._zero_ns + round(min(float(values[time_name]), _LONGEST_S) * 1e9)
         return self.control(
-            is_playing=bool(values.get(play, current_values[play])),
-            speed=float(values.get(speed, current_values[speed])),
+            is_playing=bool(values.get(play_name, current_values[play_name])),
+            speed=float(values.get(speed_name, current_values[speed_name])),
             seek_ns=seek_ns,
         )
 
@@ -619,8 +619,8 @@ class PlaybackThinning:
 
         At most `count` messages are charged to the topic's allowance.
         """
-        allowance, at_s = self._allowances.get(topic, (float(_MOST_AT_ONCE), self._elapsed_s))
-        allowance = min(allowance + MOST_DRAWN_A_SECOND * (self._elapsed_s - at_s), _MOST_AT_ONCE)
+        allowance, last_turn_s = self._allowances.get(topic, (float(_MOST_AT_ONCE), self._elapsed_s))
+        allowance = min(allowance + MOST_DRAWN_A_SECOND * (self._elapsed_s - last_turn_s), _MOST_AT_ONCE)
         limit = max(1, math.floor(allowance))
         self._allowances[topic] = allowance - min(count, limit), self._elapsed_s
         return limit
@@ -734,8 +734,8 @@ class Player:
         shows_again, self._shows_again = self._shows_again, False
         time_ns = self._playback.time_ns if requests.seek_ns is None else requests.seek_ns
         is_changed = requests.edited is not None and self._evaluate(requests.edited)
-        is_moved = requests.arrow is not None and self._point_at(requests.arrow)
-        if is_moved or is_changed or requests.seek_ns is not None:
+        is_arrow_moved = requests.arrow is not None and self._point_at(requests.arrow)
+        if is_arrow_moved or is_changed or requests.seek_ns is not None:
             self._seek(time_ns)
         elif shows_again and self._session.state.status is not Status.PLAYING:
             self._show(time_ns)

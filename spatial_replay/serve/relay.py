@@ -319,9 +319,9 @@ async def _read_head(reader: asyncio.StreamReader) -> _Frame:
         length = int.from_bytes(head_bytes[2:], "big")
     mask = await reader.readexactly(4) if is_masked else b"\0"
     first_byte = await reader.readexactly(min(length, 1))
-    first_content = first_byte[0] ^ mask[0] if first_byte else -1
+    content_byte = first_byte[0] ^ mask[0] if first_byte else -1
     head_bytes += (mask if is_masked else b"") + first_byte
-    return _Frame(head_bytes, length - len(first_byte), (head_bytes[0] & 0x0F, first_content))
+    return _Frame(head_bytes, length - len(first_byte), (head_bytes[0] & 0x0F, content_byte))
 
 
 async def _pass_on(frame: _Frame, reader: asyncio.StreamReader, writer: asyncio.StreamWriter | None) -> None:

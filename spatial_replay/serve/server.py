@@ -99,11 +99,11 @@ def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, A
 
 def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Write constants from viewers and from the request into the specification files."""
-    values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
-    changed_names = evaluated.loaded.write_constants(values)
+    new_values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
+    changed_names = evaluated.loaded.write_constants(new_values)
     return {
         "written": _in_seconds(changed_names),
-        "constants": _constants_of(evaluated) | _in_seconds(values),
+        "constants": _constants_of(evaluated) | _in_seconds(new_values),
     }
 
 
@@ -207,16 +207,16 @@ def asset(evaluated: Evaluated, uri: str) -> bytes | None:
     Returns:
         None if there is no such file.
     """
-    kind, _, name = uri.removeprefix(_PREFIX).partition("/")
+    asset_kind, _, asset_name = uri.removeprefix(_PREFIX).partition("/")
     if not uri.startswith(_PREFIX):
         return None
-    if (kind, name) == (LAYOUT, ""):
+    if (asset_kind, asset_name) == (LAYOUT, ""):
         return evaluated.layout.data
-    if kind == "specification":
-        return {file.filename: file.source.encode() for file in evaluated.edited.files}.get(name)
-    if kind == "automaton" and name.endswith(".dot"):
+    if asset_kind == "specification":
+        return {file.filename: file.source.encode() for file in evaluated.edited.files}.get(asset_name)
+    if asset_kind == "automaton" and asset_name.endswith(".dot"):
         automata = automata_attachments(evaluated.evaluation.automata, "")
-        return {automaton.name.rpartition("/")[2]: automaton.data for automaton in automata}.get(name)
+        return {automaton.name.rpartition("/")[2]: automaton.data for automaton in automata}.get(asset_name)
     return None
 
 
@@ -311,9 +311,9 @@ class PublishingServer:
 
     def stop(self) -> None:
         """Disconnect all viewers, and wait at most `_STOP_S` for their responses."""
-        stopping = Thread(target=self._server.stop, daemon=True)
-        stopping.start()
-        stopping.join(_STOP_S)
+        stop_thread = Thread(target=self._server.stop, daemon=True)
+        stop_thread.start()
+        stop_thread.join(_STOP_S)
         self._relay.stop()
         for channel in self._channels.values():
             channel.close()
@@ -496,7 +496,7 @@ class LiveServer(PublishingServer, protocol.ServerListener):
             values = {
                 parameter.name: _value(parameter) for parameter in parameters if parameter.name != _REJECTED
             }
-            playback = {name: value for name, value in values.items() if name in PLAYBACK}
+            playback_values = {name: value for name, value in values.items() if name in PLAYBACK}
             constants = {
                 name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
             }
@@ -504,8 +504,8 @@ class LiveServer(PublishingServer, protocol.ServerListener):
                 self._session.point_at(values[ARROW])
             if constants:
                 self._session.set_constants(_stored_values(constants, self._session.values))
-            if playback:
-                self.send_state(self._session.steer(playback))
+            if playback_values:
+                self.send_state(self._session.steer(playback_values))
         except SpatialReplayError as error:
             self.send_note(Note(CONSTANTS, str(error)))
         return self.on_get_parameters(client, [])

@@ -96,7 +96,7 @@ class Group:
         """Yield the arrays below the group with their paths; refused links are left out."""
         import h5py
 
-        visited: set[bytes] = set()
+        visited_addresses: set[bytes] = set()
 
         def arrays(group: Any, prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
             for name in Group(group).names:
@@ -109,8 +109,8 @@ class Group:
                 elif isinstance(node, h5py.Group) and depth < _DEEPEST:
                     # hard links may form cycles
                     address = h5py.h5o.get_info(node.id).addr
-                    if address not in visited:
-                        visited.add(address)
+                    if address not in visited_addresses:
+                        visited_addresses.add(address)
                         yield from arrays(node, f"{prefix}{name}/", depth + 1)
 
         return arrays(self._group, "", 0)

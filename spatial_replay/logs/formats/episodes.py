@@ -193,12 +193,14 @@ class DataSet:
             UsageError: no such episode, or the mapping lacks a key, such as `fps`.
             LogError: the data cannot be read.
         """
-        names = [feature.name for feature in self.features if feature.width] if features is None else features
-        with self._open_run(number, names, reading) as run:
+        feature_names = (
+            [feature.name for feature in self.features if feature.width] if features is None else features
+        )
+        with self._open_run(number, feature_names, reading) as run:
             arrays, count = run.arrays, self.count_states(run)
             columns, success = self.poses(run, count), self._success(run, count)
         feature_arrays, remarks = dict[str, Floats](), list(columns.remarks)
-        for name in names:
+        for name in feature_names:
             if name in arrays and len(arrays[name]) in (count, count - 1):
                 feature_arrays[name] = _with_last(arrays[name], count)
             elif name in arrays:
@@ -219,9 +221,11 @@ class DataSet:
     def _open_run(self, number: int, names: Iterable[str], reading: EpisodeReading) -> Iterator[Run]:
         episode = self.episode(number)
         with self.open_episode(episode) as group:
-            label = reading.label or (self.label.field if self.label else None)
-            arrays = self.read(group, {*names, *self.always_read, *([] if label is None else [label])})
-            yield Run(episode, group, arrays, reading, label)
+            label_name = reading.label or (self.label.field if self.label else None)
+            arrays = self.read(
+                group, {*names, *self.always_read, *([] if label_name is None else [label_name])}
+            )
+            yield Run(episode, group, arrays, reading, label_name)
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Any]:
         """Open an episode as a context; its value is the `group` of `read`.
@@ -250,23 +254,23 @@ class DataSet:
 
     def _success(self, run: Run, count: int) -> Booleans | None:
         """Return the label of each state (T,), or of the episode (); None without a label."""
-        label = run.label
-        if label is None:
+        label_name = run.label
+        if label_name is None:
             return None
-        if label in run.arrays:
-            return _success_of_states(run.arrays[label], count, f"{self.name}: {label}")
-        episode_label = self.whole_label(run, label)
-        if episode_label is None and run.reading.label is not None and self.feature(label) is None:
+        if label_name in run.arrays:
+            return _success_of_states(run.arrays[label_name], count, f"{self.name}: {label_name}")
+        episode_label = self.whole_label(run, label_name)
+        if episode_label is None and run.reading.label is not None and self.feature(label_name) is None:
             feature_names = [feature.name for feature in self.features]
-            hint = nearest_hint(label, feature_names) or f"it has {listing(feature_names)}"
-            raise UsageError(f"{self.name} has no {label!r} for `label`; {hint}")
+            hint = nearest_hint(label_name, feature_names) or f"it has {listing(feature_names)}"
+            raise UsageError(f"{self.name} has no {label_name!r} for `label`; {hint}")
         return None if episode_label is None else np.array(episode_label)
 
     def shared_files(self) -> list[Path]:
         """Return the files that every episode depends on; by default, all files."""
         if self.path.is_file():
-            about = self.path.with_suffix(".json")
-            return [self.path, *([about] if about.is_file() else [])]
+            json_file = self.path.with_suffix(".json")
+            return [self.path, *([json_file] if json_file.is_file() else [])]
         return sorted(file for file in self.path.rglob("*") if file.is_file())
 
     def files_of(self, number: int) -> list[Path]:

@@ -164,12 +164,12 @@ def _body(poses: Any | None, name: str, place: str, component_order: str) -> Bod
     """
     pose_rows = _pose_rows(poses, place)
     quaternions = pose_rows[:, 3:7]
-    lengths = np.linalg.norm(quaternions, axis=1)
-    wrong_rows = np.flatnonzero(np.abs(lengths - 1) > 0.01)
+    quaternion_lengths = np.linalg.norm(quaternions, axis=1)
+    wrong_rows = np.flatnonzero(np.abs(quaternion_lengths - 1) > 0.01)
     if len(wrong_rows):
         raise LogError(
-            f"{place} has a quaternion of length {lengths[wrong_rows[0]]:.3g} at row {wrong_rows[0]}; an"
-            " orientation has length 1, so these are other numbers"
+            f"{place} has a quaternion of length {quaternion_lengths[wrong_rows[0]]:.3g} at row"
+            f" {wrong_rows[0]}; an orientation has length 1, so these are other numbers"
         )
     return Body(
         name, pose_rows[:, :3], quaternions if component_order == "xyzw" else quaternions[:, [1, 2, 3, 0]]
@@ -210,8 +210,8 @@ class _ManiSkill(_Demonstrations):
         }
         environment = _object(info.get("env_info"))
         self.task = str(environment["env_id"]) if environment.get("env_id") else None
-        options = _object(environment.get("env_kwargs"))
-        fps = options.get("control_freq") or _object(options.get("sim_config")).get("control_freq")
+        env_kwargs = _object(environment.get("env_kwargs"))
+        fps = env_kwargs.get("control_freq") or _object(env_kwargs.get("sim_config")).get("control_freq")
         if isinstance(fps, (int, float)) and 0 < fps <= 1e6:
             self.fps = float(fps)
         first_group = self.list_episodes(path, file)
@@ -332,8 +332,8 @@ class _IsaacLab(_Demonstrations):
         for name, place, poses in self._bodies_in(run.episode, run.group):
             body = _body(poses, name, place, component_order)
             if len(body.positions) != count:
-                rows = len(body.positions)
-                raise LogError(f"{place} has {rows} poses, and the first body {count}; record it again")
+                pose_count = len(body.positions)
+                raise LogError(f"{place} has {pose_count} poses, and the first body {count}; record it again")
             bodies.append(body)
         return EpisodeColumns(times_ns, bodies=tuple(bodies))
 

@@ -171,15 +171,16 @@ class _LeRobot(DataSet):
         )
         # metadata of copied or merged data sets names wrong files, so all files are searched
         files = [named_file] if named_file is not None and is_alone else self._files
-        places = [rows for file in files if (rows := self._rows_of(file).get(number)) is not None]
-        if not places:
-            file = "" if named_file else f" ({likely_ending} is missing)"
+        row_ranges = [rows for file in files if (rows := self._rows_of(file).get(number)) is not None]
+        if not row_ranges:
+            missing_note = "" if named_file else f" ({likely_ending} is missing)"
             raise LogError(
-                f"{self.name}#{number}: no file in data/ has its rows{file}; download the whole data set"
+                f"{self.name}#{number}: no file in data/ has its rows{missing_note}; download the"
+                " whole data set"
             )
-        if not all(rows.is_whole for rows in places):
+        if not all(rows.is_whole for rows in row_ranges):
             raise LogError(f"{self.name}#{number}: its rows lie between those of other episodes; sort them")
-        return places
+        return row_ranges
 
     def _rows_of(self, file: Path) -> Mapping[int, _Rows]:
         """Return the rows of each episode in a file."""
@@ -230,7 +231,7 @@ def _features(features: Mapping[str, Any]) -> Iterator[Feature]:
 def _places_of(names: object, width: int) -> tuple[str, ...]:
     """Return the names of a feature's numbers, from a list or from an object with one list."""
     if isinstance(names, dict):
-        lists = [part for part in names.values() if isinstance(part, list)]
+        lists = [value for value in names.values() if isinstance(value, list)]
         names = lists[0] if len(lists) == 1 else None
     if not isinstance(names, list) or len(names) != width or len(set(map(str, names))) != width:
         return ()
@@ -243,12 +244,12 @@ def _episodes(path: Path) -> tuple[dict[int, str], tuple[Episode, ...], list[str
     if not episode_rows:
         remarks.append("meta has no episodes; their numbers are those in data/")
         files = sorted((path / "data").rglob("*.parquet"))
-        numbers = {
+        episode_numbers = {
             int(number)
             for file in files
             for number in _read_columns(file, {"episode_index"})["episode_index"]
         }
-        episode_rows = [{"episode_index": number} for number in numbers]
+        episode_rows = [{"episode_index": number} for number in episode_numbers]
     row_by_number: dict[int, Mapping[str, Any]] = {}
     for row in episode_rows:
         if isinstance(row.get("episode_index"), int):

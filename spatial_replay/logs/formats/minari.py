@@ -208,14 +208,14 @@ class _Tables(_Minari):
 
 
 def _leaves(table: Any, library: Any) -> Iterator[tuple[str, Any]]:
-    pending = [(name, table.column(name)) for name in reversed(table.column_names)]
-    while pending:
-        name, column = pending.pop()
+    pending_columns = [(name, table.column(name)) for name in reversed(table.column_names)]
+    while pending_columns:
+        name, column = pending_columns.pop()
         if not library.types.is_struct(column.type):
             yield name, column
             continue
         field_names = [column.type.field(index).name for index in range(column.type.num_fields)]
-        pending += [
+        pending_columns += [
             (f"{name}/{field_name}", library.compute.struct_field(column, [index]))
             for index, field_name in reversed(list(enumerate(field_names)))
         ]

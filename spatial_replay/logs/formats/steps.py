@@ -39,12 +39,12 @@ class _Steps(DataSet):
 
     def divide(self, is_end: Booleans, missing: str) -> None:
         """Divide the steps into episodes; a remark says `missing` of a last episode without an end."""
-        ends = np.flatnonzero(is_end)
-        if len(is_end) and (len(ends) == 0 or ends[-1] != len(is_end) - 1):
-            last_step_count = len(is_end) - 1 - (int(ends[-1]) if len(ends) else -1)
+        end_steps = np.flatnonzero(is_end)
+        if len(is_end) and (len(end_steps) == 0 or end_steps[-1] != len(is_end) - 1):
+            last_step_count = len(is_end) - 1 - (int(end_steps[-1]) if len(end_steps) else -1)
             self.remarks += (f"its last episode, of {plural(last_step_count, 'step')}, {missing}",)
-            ends = np.append(ends, len(is_end) - 1)
-        self._bounds = [0, *(ends + 1).tolist()]
+            end_steps = np.append(end_steps, len(is_end) - 1)
+        self._bounds = [0, *(end_steps + 1).tolist()]
         numbered_counts = enumerate(np.diff(self._bounds).tolist())
         self.episodes = tuple(Episode(number, str(number), count) for number, count in numbered_counts)
 

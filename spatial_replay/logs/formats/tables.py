@@ -58,19 +58,19 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     """Return a column as (T,) or (T, W) float64, null as NaN; None for texts, or lists of several lengths."""
     library = arrow()
     types = library.types
-    array, widths = column.combine_chunks(), list[int]()
+    array, list_widths = column.combine_chunks(), list[int]()
     if isinstance(array, library.ChunkedArray):
         array = array.chunk(0) if array.num_chunks else library.array([], column.type)
     row_count, is_null = len(array), np.zeros(0, np.bool_)
     while (
         types.is_list(array.type) or types.is_large_list(array.type) or types.is_fixed_size_list(array.type)
     ):
-        if array.null_count and not widths:
+        if array.null_count and not list_widths:
             is_null = array.is_null().to_numpy(zero_copy_only=False)
         lengths = np.unique(library.compute.list_value_length(array).drop_null().to_numpy())
         if len(lengths) > 1:
             return None
-        widths.append(int(lengths[0]) if len(lengths) else 0)
+        list_widths.append(int(lengths[0]) if len(lengths) else 0)
         array = array.flatten()
     if not (types.is_floating(array.type) or types.is_integer(array.type) or types.is_boolean(array.type)):
         return None
@@ -79,9 +79,9 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     if array.null_count or not types.is_float64(array.type):
         array = array.cast(library.float64(), safe=False)
     numbers = array.to_numpy(zero_copy_only=False)
-    if not widths:
+    if not list_widths:
         return cast("Floats", numbers)
-    width = int(np.prod(widths))
+    width = int(np.prod(list_widths))
     if len(is_null) == 0:
         return cast("Floats", numbers.reshape(row_count, width))
     # `flatten` drops lists that are null

@@ -220,9 +220,9 @@ def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
     if type(time_ns) is not int or not 0 <= time_ns <= LATEST_NS:
         raise _NoSampleError(f"time_ns is {_short(time_ns)}; give integer nanoseconds from 0 to 2**63 - 1")
     reports = [_report(entry) for entry in _list(sample.get("objects", []), "objects")]
-    names = [report.name for report in reports]
-    if len(set(names)) < len(names):
-        repeated_name = next(name for name in names if names.count(name) > 1)
+    object_names = [report.name for report in reports]
+    if len(set(object_names)) < len(object_names):
+        repeated_name = next(name for name in object_names if object_names.count(name) > 1)
         raise _NoSampleError(f"object {repeated_name!r} is there twice; name each object once")
     return time_ns, reports, _signals(sample.get("signals", {}))
 
@@ -498,7 +498,7 @@ def iter_annotations(
         first_boxes[is_complete],
         np.append(first_boxes, len(boxes))[1:][is_complete],
     )
-    classes, period_ns = tuple(label or None for label in labels), frame_times(rate)
+    class_names, period_ns = tuple(label or None for label in labels), frame_times(rate)
     end = 0
     while end < len(frames):
         begin = end
@@ -510,7 +510,7 @@ def iter_annotations(
         if lost == "drop":
             block, sample_indices = block[~block["lost"]], sample_indices[~block["lost"]]
         times_ns = np.array([round(frame * period_ns) for frame in frames[begin:end].tolist()], np.int64)
-        observations = _observations(times_ns, sample_indices, block, classes)
+        observations = _observations(times_ns, sample_indices, block, class_names)
         trace, fault_by_index = trace_from_observations(observations, concave=concave)
         for index, fault in sorted(fault_by_index.items()):
             faults.add(f"{path.name}: frame {frames[begin + index]}: {fault}")

@@ -111,8 +111,8 @@ def _uncompressed_content(offset: int, record: bytes, next_offset: int) -> int |
     if record[0] != Opcode.CHUNK:
         return None
     with suppress(DamageError):
-        size = chunk_place(offset, record, next_offset - offset).size
-        if next_offset - offset == _UNCOMPRESSED_HEAD_BYTES + size:
+        content_bytes = chunk_place(offset, record, next_offset - offset).size
+        if next_offset - offset == _UNCOMPRESSED_HEAD_BYTES + content_bytes:
             return offset + _UNCOMPRESSED_HEAD_BYTES
     return None
 
@@ -164,14 +164,14 @@ class Directory:
 
 def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
     """Read the directory of an MCAP file; damage goes to `faults`."""
-    size = stream.seek(0, os.SEEK_END)
+    file_bytes = stream.seek(0, os.SEEK_END)
     try:
-        directory = _from_summary(stream, size)
+        directory = _from_summary(stream, file_bytes)
     except _NoSummaryError:
-        directory = _Scan(stream, size, faults, name).directory()
+        directory = _Scan(stream, file_bytes, faults, name).directory()
     except DamageError as damage:
         fault_count = len(faults)
-        directory = _Scan(stream, size, faults, name).directory()
+        directory = _Scan(stream, file_bytes, faults, name).directory()
         if len(faults) == fault_count:
             faults.add(f"{name}: {damage}; the log was read without its index")
     if _is_own(directory.header):

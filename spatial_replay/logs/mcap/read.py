@@ -465,13 +465,13 @@ class McapSource(FileSource):
 
     def _channel_of_copy(self, channel: Channel, renamed: set[Channel]) -> Channel:
         """Return the channel in a copy; add `channel` to `renamed` if the copy has another topic."""
-        copied = copied_channel(channel)
+        channel_in_copy = copied_channel(channel)
         # other programs may write our topics, even with our types
         is_ours = has_our_type(channel) and METADATA in dict(self.metadata())
-        if is_ours or channel.topic == OBJECTS or copied == channel:
+        if is_ours or channel.topic == OBJECTS or channel_in_copy == channel:
             return channel
         renamed.add(channel)
-        return copied
+        return channel_in_copy
 
     def _without_objects(self, walk: ChunkWalk, fault: str | None) -> LogError | UsageError:
         topics = sorted({channel.topic for channel in walk.channels.values()})
@@ -533,13 +533,13 @@ def _blocks(
         waiting_bytes += messages.nbytes
         sample_count += walk.sample_count(messages)
         if number < len(places) and (waiting_bytes >= BLOCK_BYTES or sample_count >= BLOCK_SAMPLES):
-            ordered = _in_order(waiting)
+            ordered_messages = _in_order(waiting)
             # chunks are sorted by start, so no later chunk has a message before the start of the next chunk
-            ready_count = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
-            waiting = [ordered]
+            ready_count = int(np.searchsorted(ordered_messages.log_time_ns, places[number].start_ns))
+            waiting = [ordered_messages]
             if ready_count:
-                yield select(ordered, slice(ready_count))
-                later = select(ordered, slice(ready_count, None))
+                yield select(ordered_messages, slice(ready_count))
+                later = select(ordered_messages, slice(ready_count, None))
                 waiting, waiting_bytes, sample_count = [later], later.nbytes, walk.sample_count(later)
             if waiting_bytes > waiting_limit:
                 raise too_many_waiting(walk.name, waiting_limit)
@@ -550,11 +550,11 @@ def _blocks(
 
 def _in_order(streams: Sequence[Messages]) -> Messages:
     """Join messages and sort them by log time, channel and sequence; the sort is stable."""
-    joined = concatenate_tables([Messages(), *streams])
-    times_ns = joined.log_time_ns
+    joined_messages = concatenate_tables([Messages(), *streams])
+    times_ns = joined_messages.log_time_ns
     if (times_ns[1:] > times_ns[:-1]).all():
-        return joined
-    return select(joined, np.lexsort((joined.sequence, joined.channel, times_ns)))
+        return joined_messages
+    return select(joined_messages, np.lexsort((joined_messages.sequence, joined_messages.channel, times_ns)))
 
 
 def decode_samples(

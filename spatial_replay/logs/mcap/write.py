@@ -112,8 +112,8 @@ def _run_ends(times_ns: Integers, lanes: Integers) -> list[int]:
     """Return the ends of runs of messages that share a lane and have times that do not decrease."""
     if len(lanes) == 1:
         return [1]
-    breaks = np.flatnonzero((np.diff(times_ns) < 0) | (np.diff(lanes) != 0)) + 1
-    return [*breaks.tolist(), len(lanes)]
+    break_indices = np.flatnonzero((np.diff(times_ns) < 0) | (np.diff(lanes) != 0)) + 1
+    return [*break_indices.tolist(), len(lanes)]
 
 
 class _PackedChunk(NamedTuple):
@@ -151,7 +151,7 @@ def _pack(lane: _Lane, declarations: bytes) -> _PackedChunk:
             entry_bytes,
         )
         index_offset += _INDEX_HEAD.size + len(entry_bytes)
-    index = records.ChunkIndex(
+    chunk_index = records.ChunkIndex(
         chunk_length=record_bytes,
         chunk_start_offset=0,
         compression=_ZSTD,
@@ -162,7 +162,7 @@ def _pack(lane: _Lane, declarations: bytes) -> _PackedChunk:
         message_start_time=start_ns,
         uncompressed_size=len(content),
     )
-    return _PackedChunk(b"".join(chunk_pieces), index, message_counts)
+    return _PackedChunk(b"".join(chunk_pieces), chunk_index, message_counts)
 
 
 _local = local()
@@ -209,7 +209,7 @@ class _Summary:
 
     def section(self, offset: int) -> bytes:
         """Encode the summary section and the footer for an offset in the file."""
-        groups = (
+        record_groups = (
             (Opcode.SCHEMA, encode_records(*self.schemas)),
             (Opcode.CHANNEL, encode_records(*self.channels)),
             (Opcode.STATISTICS, encode_records(self._statistics())),
@@ -218,7 +218,7 @@ class _Summary:
             (Opcode.METADATA_INDEX, encode_records(*self.metadata)),
         )
         section, summary_offsets = b"", []
-        for opcode, content in groups:
+        for opcode, content in record_groups:
             if content:
                 summary_offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
                 section += content
@@ -329,8 +329,8 @@ class LogWriter:
             # in parts, because the memory of a part is reused: new memory takes as long as filling it
             filled_bytes = int(payload_ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
             end = max(begin + 1, int(np.searchsorted(payload_ends, filled_bytes)))
-            part = select(replace(messages, payloads=payloads), slice(begin, end))
-            self._write_part(part, channel_numbers[begin:end], lanes[begin:end])
+            part_messages = select(replace(messages, payloads=payloads), slice(begin, end))
+            self._write_part(part_messages, channel_numbers[begin:end], lanes[begin:end])
             begin = end
 
     def _write_part(self, messages: Messages, numbers: Integers, lanes: Integers) -> None:
@@ -371,20 +371,20 @@ class LogWriter:
                 lane.first_ns = time_ns
             first_ns = min([time_ns, *(lane.first_ns for lane in self._lanes if lane.records)])
             # all messages up to the end of the chunk at once: one by one, they take 2 µs each
-            stop = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
-            start_offset, last_index = int(starts[begin]), stop - 1
+            stop_index = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
+            start_offset, last_index = int(starts[begin]), stop_index - 1
             added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
             if added_bytes + lane.size >= CHUNK_BYTES:
                 full_offset = start_offset + CHUNK_BYTES - lane.size
-                stop = begin + 1 + int(np.searchsorted(starts[begin + 1 : stop], full_offset))
-                last_index = stop - 1
+                stop_index = begin + 1 + int(np.searchsorted(starts[begin + 1 : stop_index], full_offset))
+                last_index = stop_index - 1
                 added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
-            columns = (column[begin:stop] for column in part[1:])
+            columns = (column[begin:stop_index] for column in part[1:])
             lane.records.append(_Records(part.content[start_offset : start_offset + added_bytes], *columns))
             lane.size += added_bytes
             if lane.size >= CHUNK_BYTES:
                 self._end(lane_number)
-            begin = stop
+            begin = stop_index
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Close the chunks, and add a metadata record with its keys in the given order."""
@@ -409,9 +409,9 @@ class LogWriter:
 
     def flush(self) -> None:
         """Close the chunks and hand everything written so far to the operating system."""
-        for number, lane in enumerate(self._lanes):
+        for lane_number, lane in enumerate(self._lanes):
             if lane.records:
-                self._end(number)
+                self._end(lane_number)
         self._write_ready_chunks(0)
 
     def close(self) -> None:
