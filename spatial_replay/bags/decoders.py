@@ -39,7 +39,7 @@ class Topic:
 
     Attributes:
         type: full ROS type (`turtlesim/msg/Pose`), or name of the schema (`foxglove.SceneUpdate`); "" if the
-            log does not say.
+            log names no type.
         encoding: encoding of the messages: ros1, cdr, protobuf or json.
         count: number of messages that the log declares, or None.
         schema: definition in the log, or None.
@@ -184,7 +184,7 @@ def _decode_json(payload: bytes) -> object:
 
 
 def topics_by_name(described: Iterable[Topic], distribution: str | None = None) -> tuple[Topic, ...]:
-    """Return one topic for each name, sorted by name, with `unreadable` set.
+    """Return one topic for each name, sorted by name; `unreadable` is set for topics that cannot be decoded.
 
     Args:
         distribution: ROS release that the log names.

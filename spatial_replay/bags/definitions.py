@@ -217,7 +217,7 @@ class _Walk:
         if field.type in _NOT_READ:
             raise LogError(f"{field.name!r} of {owner!r} is a {field.type}, which is not read")
         if field.type in BASE_BYTES:
-            # generated code reads an array of numbers as one block, but strings one by one
+            # generated code reads an array of numbers as one block, but an array of strings string by string
             value_count, least_bytes = 1, BASE_BYTES[field.type]
             is_block = field.type != "string"
         else:

@@ -366,7 +366,7 @@ class BagFolder(MessageReader):
         name = name or f"{self.name}/{BAG_METADATA}"
         for topic in self._topics:
             type_name = self._metadata.types.get(topic.name, topic.type)
-            # recorders write pkg/Type and pkg/msg/Type for one type
+            # recorders write both pkg/Type and pkg/msg/Type for a type
             if topic.name in topics and full_type_name(type_name) != full_type_name(topic.type):
                 self._faults.add(
                     f"{name}: it declares messages of {type_name!r:.100} on {topic.name!r}; they are of"

@@ -229,7 +229,7 @@ class _PlaceHistory:
         self._place_before = self._furthest_place = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
-        """Return the first message recorded before a message that is earlier by more than the disorder.
+        """Return the first jump: a message recorded before a message earlier by more than the disorder.
 
         Args:
             times_ns, places: (M,) times and places of at least one message, sorted by time, later than the
@@ -327,7 +327,7 @@ class MessageReader(ABC):
         """Return the channels of some topics by their numbers in `MessageColumns.channel`.
 
         A copy of the log declares these channels, with the schema, encoding and metadata of the log. A ROS
-        type without a definition in the log gets the standard definition, if there is one.
+        type without a definition in the log gets the standard definition of the type.
         """
         return {number: channel for number, channel in self._channels.items() if channel.topic in topics}
 

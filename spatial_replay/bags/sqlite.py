@@ -89,7 +89,7 @@ def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
 
 
 def _plain(text: str) -> Any:
-    """Parse a YAML text; refuse aliases, because they can expand a short text to a very long one."""
+    """Parse a YAML text; refuse aliases, because aliases can expand a short text without bound."""
     import yaml
 
     if len(text) > LARGEST_METADATA:

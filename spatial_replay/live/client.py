@@ -49,7 +49,7 @@ _ALIVE_S: Final = 10.0
 
 _FIRST_PAUSE_S: Final = 0.25
 _LONGEST_PAUSE_S: Final = 8.0
-"""First and longest pause before a reconnect, seconds; each pause is twice as long as the previous one."""
+"""First and longest pause before a reconnect, seconds; each pause is twice as long as the previous pause."""
 
 
 class Received(NamedTuple):
@@ -127,7 +127,7 @@ class Inbox:
         return arrivals
 
     def _drop(self) -> None:
-        # only messages may be lost: other items before the oldest one are kept
+        # only messages may be lost, so other items before the oldest message are kept
         while not isinstance(oldest := self._items.popleft(), Received):
             self._earlier_items.append(oldest)
         self._message_count -= 1

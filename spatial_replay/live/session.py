@@ -148,7 +148,7 @@ class SessionStatus:
         samples, messages: numbers of evaluated samples and of received messages.
         dropped: number of samples that were dropped because evaluation fell behind.
         messages_dropped: number of messages that were dropped before they became samples.
-        late: number of messages that arrived after the samples of their time.
+        late: number of messages that arrived after the sample of their time was complete.
         overdue: number of observations whose transforms did not arrive within `max_delay_s`.
         delay_s: time from the arrival of the newest sample's message to the sample's verdict, seconds; NaN
             before the first sample.
@@ -225,7 +225,7 @@ MAX_DELAY_S: Final = 0.2
 """Default time that a sample waits for transforms and for lagging topics, seconds."""
 
 LATE_S: Final = 1.0
-"""Longest wait of a sample for its evaluation, seconds; then it is dropped if there is a newer sample."""
+"""Longest wait of a sample for evaluation, seconds; then the sample is dropped if a newer sample waits."""
 
 _OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3
@@ -870,7 +870,7 @@ def open_recorders(
 
 
 def _about(mapping: LogMapping | None) -> Mapping[str, str]:
-    """Return the metadata of a run in its log; nothing in it depends on the machine."""
+    """Return the metadata of a run for its log; no entry depends on the machine."""
     if mapping is None:
         return {"source": "live"}
     mapping_metadata = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
@@ -936,7 +936,7 @@ async def monitor(
             async for update in session.updates():
                 yield update
         finally:
-            # the log also gets the doubts of a run whose loop was left
+            # the log also gets the doubts if the caller left the loop
             session.close()
         if session.failure is not None:
             raise session.failure

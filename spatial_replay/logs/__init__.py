@@ -1,1 +1,1 @@
-"""Our own logs and the track formats: messages, samples, and files of both."""
+"""Our own logs and the track formats: their messages, samples and files."""

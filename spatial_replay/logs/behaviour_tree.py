@@ -83,7 +83,7 @@ class Nav2Tree:
         for change in log.event_log:
             node_key = getattr(change, "uid", change.node_name)
             if node_key in self._nodes and self._nodes[node_key].name != change.node_name:
-                # Nav2 loaded another tree, whose uids start at 1 again
+                # Nav2 loaded another tree, and its uids start at 1 again
                 self._nodes.clear()
             is_active = change.current_status in ("RUNNING", "SUCCESS", "FAILURE")
             status = change.current_status if is_active else "INVALID"

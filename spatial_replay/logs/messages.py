@@ -141,7 +141,7 @@ class Messages:
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
     """Return messages of one channel, with sequence numbers from `first`.
 
-    Their publish times are their log times.
+    The publish time of each message is its log time.
     """
     return Messages(
         channels={0: channel},

@@ -433,8 +433,9 @@ def sample_messages(trace: Trace, first: int) -> Messages:
 def encode_objects(trace: Trace) -> Payloads:
     """Encode each sample of a trace as one ObjectStates message.
 
-    In protobuf, concatenated encodings are the encoding of one message with the fields of both. So a sample
-    is joined from pieces: its time, its objects and its signals. Pieces of one layout are encoded together.
+    In protobuf, two concatenated encodings decode to one message with the fields of both messages. So a
+    sample is joined from pieces: its time, its objects and its signals. Pieces of one layout are encoded
+    together.
     """
     # https://protobuf.dev/programming-guides/encoding/#last-one-wins
     sample_count = len(trace)
@@ -519,7 +520,8 @@ def _row_layout(trace: Trace) -> Integers:
 def _message(trace: Trace, name_index: int, row: int, *, is_unreadable: bool) -> ObjectStates:
     """Return the message of one observation, with all its numbers 0.
 
-    An unreadable observation gets orientation and height, because either may be the value that is not finite.
+    An unreadable observation gets orientation and height, because its orientation or its height is not
+    finite.
     """
     shapes = trace.footprints
     message = ObjectStates()

@@ -175,7 +175,7 @@ def _check_rate(rate: object) -> None:
 
 
 def frame_times(rate: float) -> Fraction:
-    """Return the exact frame period in nanoseconds. The rate counts as written: 29.97 is 2997/100."""
+    """Return the exact frame period in nanoseconds. The rate is exact as written: 29.97 is 2997/100."""
     return Fraction(10**9) / Fraction(repr(float(rate)))
 
 

@@ -121,7 +121,7 @@ class Source:
 
     @property
     def max_gap_ns(self) -> int | None:
-        """Longest pause; objects and signals are unknown in a longer one. None for no limit."""
+        """Longest pause; objects and signals are unknown in longer pauses. None for no limit."""
         return None
 
     @property
@@ -295,7 +295,7 @@ def read_blocks(
 
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
-    """Yield the blocks unchanged. From the third on, a thread reads the next block in advance.
+    """Yield the blocks unchanged. From the third block on, a thread reads the next block in advance.
 
     A short log has one or two blocks, and reading them takes less time than starting a thread.
     """

@@ -65,7 +65,7 @@ def copied_channel(channel: Channel) -> Channel:
 
 
 def remarks_on_copies(name: str, channels: Iterable[Channel]) -> list[str]:
-    """Return remarks on channels of a log whose topics are renamed in a copy."""
+    """Return remarks on the channels of a log that a copy stores on other topics."""
     renamed_topics = {channel.topic for channel in channels if copied_channel(channel) != channel}
     return [
         f"{name}: a copy has its messages on {topic} on {ORIGINAL_PREFIX}{topic},"
@@ -125,7 +125,7 @@ PLAN_METADATA = "spatial_replay_plan"
 """The metadata record with the settings and the specification of a planner."""
 
 RECOVERY = "spatial_replay_recovery"
-"""The metadata record of a log that was recovered from a damaged one: source and losses."""
+"""The metadata record of a log that was recovered from a damaged log: source and losses."""
 
 VERDICTS = "spatial_replay_verdicts"
 """The metadata record with the verdict and robustness of each result of a replay."""
@@ -179,7 +179,7 @@ def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
     """Return whether a copy of a log keeps the messages of a topic.
 
     Args:
-        keep: "all", "mapped", or topic patterns such as "/camera/*"; one match is enough.
+        keep: "all", "mapped", or topic patterns such as "/camera/*", of which one must match.
         mapped: topics of the samples.
     """
     return any(

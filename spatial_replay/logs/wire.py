@@ -145,7 +145,7 @@ class Payloads(Sequence[bytes]):
 
     @classmethod
     def of(cls, payloads: Sequence[bytes]) -> Payloads:
-        """Convert messages: small ones are joined into one buffer, large ones keep a buffer each."""
+        """Convert messages: small messages are joined into one buffer, large messages keep a buffer each."""
         if isinstance(payloads, Payloads):
             return payloads
         message_count = len(payloads)
@@ -250,7 +250,7 @@ _LARGE_BYTES: Final = 2**12
 _JOINED_BYTES: Final = 2**20
 """Size below which buffers are merged, bytes."""
 _FEW: Final = 4
-"""Number of messages of one size below which they are copied one by one."""
+"""Number of messages of one size below which messages are copied one by one."""
 
 
 def rows_of(payloads: Sequence[bytes]) -> Bytes:

@@ -183,7 +183,7 @@ class PendingRequests:
 
 
 class Questions:
-    """A queue of questions, answered one by one on a thread of its own, so that playback continues."""
+    """A queue of questions, which a separate thread answers one by one, so that playback continues."""
 
     def __init__(self, wait_for_evaluation: Callable[[], Evaluated]) -> None:
         """Begin with an empty queue.
@@ -472,7 +472,7 @@ class Session:
             return pending
 
     def play_up_to(self, reach_ns: int) -> PlaySpan | None:
-        """Return the next stretch to play; None if the log is paused or a seek is pending.
+        """Return the next stretch to play; None while the log is paused, or a seek is pending.
 
         The first turn after a pause still plays the stretch up to the time of the pause.
 
@@ -783,7 +783,7 @@ class Player:
         self._shows_again = True
 
     def _show(self, time_ns: int) -> None:
-        """Send the messages of a time, after making viewers drop earlier ones.
+        """Make viewers drop earlier messages, then send the messages of a time.
 
         Viewers drop messages when time steps back, or at a state with `did_seek`. Times can overtake messages
         on their way to a viewer.

@@ -82,7 +82,7 @@ def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[st
 
 
 def _evaluate(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Replay with other constants. Viewers keep the present evaluation."""
+    """Replay with other constants; viewers still see the present evaluation."""
     changed_values = _constants_in(request, evaluated)
     if changed_values:
         evaluated = evaluated.loaded.evaluate({**evaluated.edited.given, **changed_values})
@@ -566,7 +566,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
         super().send_time(time_ns)
 
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        """Send the last messages of a channel again, at the time of the newest sample if there is one."""
+        """Send the last messages of a channel again, at the newest sample's time, if there is a sample."""
         latest = None
         # `publish` may store newer messages on another thread while these are sent
         while latest is not self._latest.get(channel.id):

@@ -29,7 +29,7 @@ _LARGEST_ATTRIBUTE: Final = 2**24
 _DEEPEST: Final = 12
 """Deepest nesting of groups, and longest chain of soft links."""
 _WIDEST: Final = 4096
-"""Maximum width of a feature per frame, in numbers; a wider one is an image."""
+"""Maximum width of a feature per frame, in numbers; a wider array counts as an image."""
 _COPY: Final = "copy its data into the file"
 
 
@@ -190,7 +190,7 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
     """Read an array as (T,) or (T, W) float64.
 
     Raises:
-        LogError: the array holds no numbers, fails the checks of `row_count`, or cannot be read.
+        LogError: the array holds no numbers, `row_count` refuses it, or it cannot be read.
     """
     row_count(array)
     if width_of(array) == 0:

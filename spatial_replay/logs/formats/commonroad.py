@@ -46,7 +46,7 @@ class Element:
     text: str = ""
 
     def child(self, name: str) -> Element | None:
-        """Return the first child with a name; None if there is none."""
+        """Return the first child with a name; None if no child has the name."""
         return next(self.all(name), None)
 
     def all(self, name: str) -> Iterator[Element]:

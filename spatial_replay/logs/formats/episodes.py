@@ -113,7 +113,7 @@ class EpisodeReading(NamedTuple):
     Attributes:
         fps: frames per second.
         label: name of the field with the label.
-        model: path of a MuJoCo model, for data sets without one.
+        model: path of a MuJoCo model, for data sets without a model.
         order: order of the bodies' quaternions, "xyzw" or "wxyz".
         assets: folder with the meshes of models.
     """
@@ -134,7 +134,7 @@ class Run(NamedTuple):
     Attributes:
         group: value of `DataSet.open_episode`.
         arrays: arrays of numbers by name.
-        label: name of the label; None without one.
+        label: name of the label; None without a label.
     """
 
     episode: Episode
@@ -152,9 +152,9 @@ class DataSet:
     Attributes:
         path: path of the folder or file.
         kind: name of the format with its version, such as `LeRobot v3.0`.
-        fps: frames per second; None if the data set does not say.
+        fps: frames per second; None if the data set does not name them.
         has_times: whether frames have times, so that `fps` is not needed.
-        robot: type of the robot; "" if the data set does not say.
+        robot: type of the robot; "" if the data set does not name it.
         features: columns that a mapping can use, in the data set's order.
         episodes: episodes in the order of their numbers.
         label: success label; None without a label.
@@ -339,7 +339,7 @@ def _success_of_states(labels: Floats, count: int, place: str) -> Booleans:
     """Return the label (T,) of each state; a step's label describes the state after the step.
 
     Raises:
-        LogError: the number of labels is neither the number of states nor one less.
+        LogError: the number of labels is neither the number of states nor smaller by one.
     """
     is_success = _as_label(labels, place)
     if len(labels) == count - 1:
@@ -391,7 +391,7 @@ def _as_label(values: Floats, place: str) -> Booleans:
 
 
 def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
-    """Return the order of quaternions (T, 4) of bodies that mostly stand upright; None if it is ambiguous.
+    """Return the order of quaternions (T, 4) of mostly upright bodies; None for an ambiguous order.
 
     A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
     upright in both orders: no turn as x y z w, half a turn as w x y z. So this quaternion is no evidence.

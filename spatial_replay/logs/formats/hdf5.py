@@ -150,7 +150,7 @@ class _Demonstrations(InGroups):
 
 
 def _first_group(group: Group | None, prefix: str) -> Group | None:
-    """Return the first group whose name is the prefix and a number; None if there is none."""
+    """Return the first group with a name of the prefix and a number; None without such a group."""
     names = [] if group is None else [name for name in group.names if _NUMBERED.fullmatch(name)]
     names = [name for name in names if name.startswith(prefix)]
     return group.group(min(names, key=natural_key)) if group is not None and names else None

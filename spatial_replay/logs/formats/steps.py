@@ -38,7 +38,12 @@ class _Steps(DataSet):
     qpos = "qpos"
 
     def divide(self, is_end: Booleans, missing: str) -> None:
-        """Divide the steps into episodes; a remark says `missing` of a last episode without an end."""
+        """Divide the steps into episodes.
+
+        Args:
+            missing: predicate of the remark on a last episode without an end, such as "does not end with a
+                terminal".
+        """
         end_steps = np.flatnonzero(is_end)
         if len(is_end) and (len(end_steps) == 0 or end_steps[-1] != len(is_end) - 1):
             last_step_count = len(is_end) - 1 - (int(end_steps[-1]) if len(end_steps) else -1)

@@ -397,7 +397,7 @@ def _column_order(path: Path, header: str) -> list[str]:
 
 def _row(line: str, columns: list[str]) -> dict[str, str]:
     try:
-        # one line at a time, so that an open quote does not swallow later lines
+        # each line is parsed alone, so that an open quote does not swallow later lines
         cells = next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
         raise _NoSampleError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
@@ -571,7 +571,7 @@ def _integer(text: str, field_name: str, largest: int) -> int:
 
 
 def _last_frame(rate: float) -> int:
-    """Return the last frame whose time a sample can have."""
+    """Return the last frame with a time within the limit of samples."""
     last_frame = LATEST_NS // frame_times(rate) - 1
     return min(max(last_frame, 0), _LARGEST)
 

@@ -127,7 +127,7 @@ _SIZE_BYTES = 8
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Channel and offset of a message index; the offset is not read."""
 _LOOSE_BYTES = 2**22
-"""Maximum size of one read of messages outside chunks, bytes; single reads would take a seek per message."""
+"""Maximum size of a read of messages outside chunks, bytes; single reads would take a seek per message."""
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
 """Read size of a search for the next chunk, bytes."""
@@ -480,7 +480,7 @@ class _Scan:
 
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
-    """Yield the possible offsets of chunks in a window, in order, from the marks of one compression."""
+    """Yield the possible offsets of chunks in a window, in order, from a compression's marks."""
     mark_offset = window.find(mark)
     while mark_offset >= 0:
         if mark_offset >= _BEFORE_COMPRESSION:

@@ -4,7 +4,7 @@ The reader is our own for two reasons. The MCAP library fails 112 of the 416 fil
 suite. It gives up on truncated and unindexed files, which crashed recorders leave behind.
 
 Chunks may overlap in time. So they are read in the order of their start times, and a message is yielded only
-when no later chunk can hold an earlier one.
+when no later chunk can hold an earlier message.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ class ChunkWalk:
                 continue
             messages = self._messages(place, split_records(content, unwanted), content)
             if declared_count < len(self.channels):
-                # this chunk declares channels, whose topics may not be wanted
+                # this chunk declares channels, and their topics may not be wanted
                 topics = [self.channels[n].topic for n in messages.channel.tolist()]
                 messages = select(messages, np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
             yield place, messages
@@ -285,7 +285,7 @@ class ChunkWalk:
         return int(np.count_nonzero(self._is_objects[messages.channel]))
 
     def _messages(self, place: ChunkPlace, chunk: Records, content: bytes) -> Messages:
-        """Return the valid messages of a place; report the number of invalid ones."""
+        """Return the valid messages of a place; report the number of invalid messages."""
         damage = self._add_declarations(chunk.declarations) or (
             "a record breaks off" if chunk.breaks_off else ""
         )
@@ -496,7 +496,7 @@ def is_samples(channel: Channel) -> bool:
 def directory_remarks(
     name: str, directory: Directory, metadata: Sequence[tuple[str, Mapping[str, str]]]
 ) -> tuple[str, ...]:
-    """Return remarks on skipped records, and on the recovery of the log from a damaged one."""
+    """Return remarks on skipped records, and on the recovery of the log from a damaged log."""
     skip_remarks = (
         (f"{name}: {plural(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
         if directory.skipped
@@ -672,7 +672,7 @@ class LogSummary:
 
     @property
     def has_objects(self) -> bool:
-        """Whether there is a channel for samples."""
+        """Whether the log has a channel for samples."""
         return any(summary.channel.topic == OBJECTS for summary in self.channels)
 
 

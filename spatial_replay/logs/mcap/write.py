@@ -370,7 +370,7 @@ class LogWriter:
                 lane.began_s = self._clock() if self._clock else 0.0
                 lane.first_ns = time_ns
             first_ns = min([time_ns, *(lane.first_ns for lane in self._lanes if lane.records)])
-            # all messages up to the end of the chunk at once: one by one, they take 2 µs each
+            # all messages up to the end of the chunk at once; one by one, each message takes 2 µs
             stop_index = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
             start_offset, last_index = int(starts[begin]), stop_index - 1
             added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
@@ -478,7 +478,7 @@ class LogWriter:
         counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
         declarations = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
         due_declarations = [declaration for declaration in declarations if start_ns >= declaration.due_ns]
-        # declared more than once, so that a broken chunk costs no other chunk its declarations
+        # repeated, so that other chunks keep their declarations when a chunk is broken
         for declaration in due_declarations:
             declaration.count += 1
             declaration.due_ns = -FOREVER if declaration.count < 2 else start_ns + REPEAT_NS
