@@ -55,63 +55,67 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
         address: address of the page, relative to the page over all logs.
     """
     content = page.read_bytes()
-    facts, numbers = _FACTS.search(content), _NUMBERS.search(content)
-    if facts is None or numbers is None:
+    facts_match, numbers_match = _FACTS.search(content), _NUMBERS.search(content)
+    if facts_match is None or numbers_match is None:
         return
-    run, data = json.loads(facts[1]), zlib.decompress(base64.b64decode(numbers[1]))
-    times = unpack_array(run["times"], data)
-    for number, result in enumerate(run["results"]):
+    run, array_bytes = json.loads(facts_match[1]), zlib.decompress(base64.b64decode(numbers_match[1]))
+    times = unpack_array(run["times"], array_bytes)
+    for result_index, result in enumerate(run["results"]):
         samples = result["samples"]
-        places = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
+        sample_indices = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
         if not samples:
             continue
         # the series of the root holds the robustness of the prefix up to each sample
-        values = unpack_array(result["series"], data)[:samples].astype(np.float64)
+        robustness = unpack_array(result["series"], array_bytes)[:samples].astype(np.float64)
         title = f"{log}: {result['object']}" if result["object"] else log
         yield Curve(
             title,
-            f"{quote(address)}#r={number}",
+            f"{quote(address)}#r={result_index}",
             result["name"],
             result["verdict"],
-            times[result["first"] + places],
-            values[places],
+            times[result["first"] + sample_indices],
+            robustness[sample_indices],
         )
 
 
 def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
     """Return the curves of a spec as SVG. The worst is on top, and each curve links to its page."""
-    finite = [curve for curve in curves if np.isfinite(curve.values).any()]
+    finite_curves = [curve for curve in curves if np.isfinite(curve.values).any()]
     # SVG draws later elements on top
-    worst_last = sorted(finite, key=lambda curve: -_final(curve))[-MOST_CURVES:]
+    worst_last = sorted(finite_curves, key=lambda curve: -_final(curve))[-MOST_CURVES:]
     if not worst_last:
         return Html("")
-    end = max(float(curve.times[-1]) for curve in worst_last) or 1.0
-    numbers = np.concatenate([curve.values[np.isfinite(curve.values)] for curve in worst_last])
-    low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
-    size = high - low or 1.0
-    zero = _HEIGHT * high / size
+    end_s = max(float(curve.times[-1]) for curve in worst_last) or 1.0
+    robustness = np.concatenate([curve.values[np.isfinite(curve.values)] for curve in worst_last])
+    low, high = min(float(robustness.min()), 0.0), max(float(robustness.max()), 0.0)
+    span = high - low or 1.0
+    zero_y = _HEIGHT * high / span
     links = [
         element(
             "a",
-            *_lines(curve, end, high, size),
+            *_lines(curve, end_s, high, span),
             href=curve.address,
             **{"aria-label": f"{curve.title}, {curve.verdict}"},
         )
         for curve in worst_last
     ]
-    bottom = f"{_HEIGHT + 12:.0f}"
+    label_y = f"{_HEIGHT + 12:.0f}"
     parts = [
-        element("line", x1="0", x2=f"{_WIDTH:.0f}", y1=f"{zero:.2f}", y2=f"{zero:.2f}"),
+        element("line", x1="0", x2=f"{_WIDTH:.0f}", y1=f"{zero_y:.2f}", y2=f"{zero_y:.2f}"),
         *links,
         element("text", with_unit(high, unit), x="0", y="9"),
-        element("text", "0 s", x="0", y=bottom),
-        element("text", f"{number_text(end)} s", x=f"{_WIDTH:.0f}", y=bottom, **{"text-anchor": "end"}),
+        element("text", "0 s", x="0", y=label_y),
+        element("text", f"{number_text(end_s)} s", x=f"{_WIDTH:.0f}", y=label_y, **{"text-anchor": "end"}),
     ]
     if low < 0.0:
         parts.append(element("text", with_signs(with_unit(low, unit)), x="0", y=f"{_HEIGHT - 3:.0f}"))
-    view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
+    view_box = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
     return element(
-        "svg", *parts, viewBox=view, role="group", **{"aria-label": "Robustness over time", "class": "curves"}
+        "svg",
+        *parts,
+        viewBox=view_box,
+        role="group",
+        **{"aria-label": "Robustness over time", "class": "curves"},
     )
 
 
@@ -119,15 +123,15 @@ def _final(curve: Curve) -> float:
     return float(curve.values[np.isfinite(curve.values)][-1])
 
 
-def _lines(curve: Curve, end: float, high: float, size: float) -> Iterator[Html]:
+def _lines(curve: Curve, end_s: float, high: float, span: float) -> Iterator[Html]:
     """Yield the tooltip of a curve, a wide invisible line to point at, and the line itself."""
     yield element("title", f"{curve.title}, {curve.verdict}")
-    pieces, is_open = list[str](), False
-    for time, value in zip(curve.times, curve.values, strict=True):
+    commands, is_open = list[str](), False
+    for time_s, value in zip(curve.times, curve.values, strict=True):
         if math.isfinite(value):
             letter = "L" if is_open else "M"
-            pieces.append(f"{letter}{_WIDTH * time / end:.1f} {_HEIGHT * (high - value) / size:.1f}")
+            commands.append(f"{letter}{_WIDTH * time_s / end_s:.1f} {_HEIGHT * (high - value) / span:.1f}")
         is_open = math.isfinite(value)
-    line = "".join(pieces)
-    yield element("path", d=line, **{"class": "area"})
-    yield element("path", d=line, **{"class": "bad" if curve.verdict == "violated" else "quiet"})
+    path = "".join(commands)
+    yield element("path", d=path, **{"class": "area"})
+    yield element("path", d=path, **{"class": "bad" if curve.verdict == "violated" else "quiet"})

@@ -58,26 +58,26 @@ def explain_rows(
     import pyarrow as pa
 
     record = RunRecord.of(table)
-    names = ("case", "log", "file", "spec", "object", "key", "verdict", "explanation")
-    logs: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    columns = ("case", "log", "file", "spec", "object", "key", "verdict", "explanation")
+    rows_by_log: dict[tuple[str, str], list[Row]] = defaultdict(list)
     places = list(dict.fromkeys(places))
-    rows = table.select(names).take(pa.array(places, pa.int64())).to_pylist()
-    for row in (Row(place, **values) for place, values in zip(places, rows, strict=True)):
+    row_values = table.select(columns).take(pa.array(places, pa.int64())).to_pylist()
+    for row in (Row(place, **values) for place, values in zip(places, row_values, strict=True)):
         if row.verdict is not None and row.explanation is None and row.case in record.cases:
-            logs[row.case, row.log].append(row)
+            rows_by_log[row.case, row.log].append(row)
     # two cases may request the same explanation
-    requests: dict[ExplanationTask, list[Row]] = defaultdict(list)
-    for rows_of_log in logs.values():
-        requests[_task(record, rows_of_log)] += rows_of_log
+    rows_by_task: dict[ExplanationTask, list[Row]] = defaultdict(list)
+    for rows_of_log in rows_by_log.values():
+        rows_by_task[_task(record, rows_of_log)] += rows_of_log
     explanations, remarks = dict[int, Explanation](), list[str]()
-    with progress("explanations", len(requests)) as advance:
-        for request, result in workers.results(explanations_of, requests) if requests else ():
+    with progress("explanations", len(rows_by_task)) as advance:
+        for task, result in workers.results(explanations_of, rows_by_task) if rows_by_task else ():
             if isinstance(result, WorkerLost | str):
-                remarks.append(f"{requests[request][0].log} is not explained: {result}")
+                remarks.append(f"{rows_by_task[task][0].log} is not explained: {result}")
             else:
-                for row in requests[request]:
-                    name = record.result_name(row.case, row.file, row.spec, row.object)
-                    explanations |= {row.place: result[name]} if name in result else {}
+                for row in rows_by_task[task]:
+                    result_name = record.result_name(row.case, row.file, row.spec, row.object)
+                    explanations |= {row.place: result[result_name]} if result_name in result else {}
             advance(1)
     return with_explanations(table, explanations), remarks
 
@@ -85,9 +85,9 @@ def explain_rows(
 def _task(record: RunRecord, rows: Sequence[Row]) -> ExplanationTask:
     """Return the task that explains rows of one log."""
     case, keys = rows[0].case, {row.file: row.key for row in rows}
-    names = frozenset(record.result_name(case, row.file, row.spec, row.object) for row in rows)
+    result_names = frozenset(record.result_name(case, row.file, row.spec, row.object) for row in rows)
     return ExplanationTask(
-        record.task(case, rows[0].log), tuple(keys.get(file) for file in record.files(case)), names
+        record.task(case, rows[0].log), tuple(keys.get(file) for file in record.files(case)), result_names
     )
 
 
@@ -105,8 +105,8 @@ def explanations_of(request: ExplanationTask) -> dict[ResultName, Explanation] |
     if any(expected_key not in (None, key) for expected_key, key in zip(request.keys, keys, strict=True)):
         return "the log, the mapping or the version has changed since; run the batch again"
     rows = {
-        (number, row.spec, row.object): row
-        for number, rows_of_file in enumerate(rows_from_task(task, request.results))
+        (file_index, row.spec, row.object): row
+        for file_index, rows_of_file in enumerate(rows_from_task(task, request.results))
         for row in rows_of_file
     }
     errors = [row.error for row in rows.values() if row.error is not None]
@@ -130,8 +130,8 @@ def worst_places(table: pa.Table, count: int) -> list[int]:
     """Return the places of the worst rows, see `worst_rows`."""
     import pyarrow as pa
 
-    numbered = table.append_column("place", pa.array(range(len(table)), pa.int64()))
-    return [row["place"] for row in worst_rows(numbered, count)]
+    numbered_table = table.append_column("place", pa.array(range(len(table)), pa.int64()))
+    return [row["place"] for row in worst_rows(numbered_table, count)]
 
 
 def explain_batch(

@@ -50,14 +50,14 @@ class ResultChange:
     def text(self) -> str:
         """The verdicts of both runs with their numbers; only one if the other run lacks the result."""
         result = self.difference
-        before, now = (
+        before_text, now_text = (
             "error" if verdict is None else f"{verdict} ({self._number(number)})"
             for verdict, number in (
                 (result.before, result.before_robustness),
                 (result.now, result.robustness),
             )
         )
-        return {"gone": before, "new": now}.get(self.kind, f"{before} → {now}")
+        return {"gone": before_text, "new": now_text}.get(self.kind, f"{before_text} → {now_text}")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -112,11 +112,11 @@ class RunDiff:
         """Yield the lines of a table that counts the changes of each spec."""
         yield f"{plural(self.logs, 'log')}, {plural(self.results, 'result')}"
         counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
-        edited = set()
+        edited_specs = set()
         for change in self.changes:
             spec = change.difference.case, change.difference.file, change.difference.spec
             counts[spec][change.kind] += 1
-            edited |= {spec} if change.difference.is_edited else set()
+            edited_specs |= {spec} if change.difference.is_edited else set()
         cases = {case for case, _, _ in counts}
         titles = {
             spec: f"{spec[0]}: {spec[2] or spec[1]}" if len(cases) > 1 else spec[2] or spec[1]
@@ -125,11 +125,11 @@ class RunDiff:
         always = ("flipped", "less")
         columns = [kind for kind in KINDS if kind in always or any(count[kind] for count in counts.values())]
         width = max([4, *map(len, titles.values())])
-        yield f"  {'spec':<{width}}  {'  '.join(f'{head:>7}' for head in [*columns, 'same'])}"
+        yield f"  {'spec':<{width}}  {'  '.join(f'{heading:>7}' for heading in [*columns, 'same'])}"
         for spec, count in counts.items():
             numbers = [*(count[kind] for kind in columns), self.specs[spec] - count.total()]
             cells = "  ".join(f"{number or '-':>7}" for number in numbers)
-            yield f"  {titles[spec]:<{width}}  {cells}{'  edited' if spec in edited else ''}"
+            yield f"  {titles[spec]:<{width}}  {cells}{'  edited' if spec in edited_specs else ''}"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -169,25 +169,27 @@ def diff_runs(
         examples = [f"{name} has {_example(table)}" for name, table in zip(names, (before, now), strict=True)]
         raise UsageError(f"no result is in both: {', and '.join(examples)}; give runs over the same logs")
     differences = compare(now, before, tolerance, with_all=True)
-    different = {difference.key for difference in differences if difference.change not in ("new", "more")}
+    changed_keys = {difference.key for difference in differences if difference.change not in ("new", "more")}
     before, now = (
-        _with_reasons(table, explain(rows, [at for at, key in enumerate(keys_of(table)) if key in different]))
+        _with_reasons(
+            table, explain(rows, [place for place, key in enumerate(keys_of(table)) if key in changed_keys])
+        )
         for table, rows in zip((before, now), unexplained, strict=True)
     )
     rows = {key: row for table in (before, now) for key, row in _rows(table)}
-    firsts = dict(_rows(before))
+    earlier_rows = dict(_rows(before))
     changes = []
     for difference in differences:
         row = rows.get(difference.key) or rows[*difference.key[:-1], None]
-        is_fixed = difference.change == "better" and difference.key in firsts
-        reason = (firsts[difference.key] if is_fixed else row)["reason"] or row["error"] or ""
+        is_fixed = difference.change == "better" and difference.key in earlier_rows
+        reason = (earlier_rows[difference.key] if is_fixed else row)["reason"] or row["error"] or ""
         changes.append(
             ResultChange(difference, row["unit"] or "", f"before: {reason}" if is_fixed else reason)
         )
     # the sort is stable, so the worst stay first within each kind
     changes.sort(key=lambda change: KINDS.index(change.kind))
-    specs = Counter((case, file, spec) for case, _, file, spec, _ in rows)
-    return RunDiff(len({log for _, log, *_ in rows}), len(rows), tuple(changes), specs)
+    result_counts = Counter((case, file, spec) for case, _, file, spec, _ in rows)
+    return RunDiff(len({log for _, log, *_ in rows}), len(rows), tuple(changes), result_counts)
 
 
 def _with_reasons(table: pa.Table, explained: pa.Table) -> pa.Table:
@@ -201,21 +203,21 @@ def _rows(table: pa.Table) -> Iterator[tuple[Key, dict[str, Any]]]:
 
 
 def _example(table: pa.Table) -> str:
-    lines = [f"{log}: {result_name(spec or file, name)}" for _, log, file, spec, name in keys_of(table)]
-    return first_lines(lines, 1)[0] if lines else "none"
+    results = [f"{log}: {result_name(spec or file, name)}" for _, log, file, spec, name in keys_of(table)]
+    return first_lines(results, 1)[0] if results else "none"
 
 
 def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
     """Rename the only file that another table lacks to the only file that this table lacks."""
     import pyarrow as pa
 
-    files, others = (set(rows.column("file").to_pylist()) for rows in (table, other))
-    if len(files - others) != 1 or len(others - files) != 1:
+    files, other_files = (set(rows.column("file").to_pylist()) for rows in (table, other))
+    if len(files - other_files) != 1 or len(other_files - files) != 1:
         return table
-    (old,), (new,) = files - others, others - files
-    names = [new if file == old else file for file in table.column("file").to_pylist()]
-    place = table.schema.get_field_index("file")
-    return table.set_column(place, table.schema.field(place), pa.array(names, pa.string()))
+    (old_name,), (new_name,) = files - other_files, other_files - files
+    file_names = [new_name if file == old_name else file for file in table.column("file").to_pylist()]
+    column_index = table.schema.get_field_index("file")
+    return table.set_column(column_index, table.schema.field(column_index), pa.array(file_names, pa.string()))
 
 
 def _replace_untested_verdicts(table: pa.Table) -> pa.Table:
@@ -224,5 +226,5 @@ def _replace_untested_verdicts(table: pa.Table) -> pa.Table:
 
     is_untested = pc.fill_null(pc.equal(table.column("tested"), "nothing"), False)
     verdicts = pc.if_else(is_untested, "untested", table.column("verdict"))
-    place = table.schema.get_field_index("verdict")
-    return table.set_column(place, table.schema.field(place), verdicts)
+    column_index = table.schema.get_field_index("verdict")
+    return table.set_column(column_index, table.schema.field(column_index), verdicts)

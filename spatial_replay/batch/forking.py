@@ -22,9 +22,9 @@ def forking_context(modules: Sequence[str]) -> ForkServerContext:
     context.set_forkserver_preload([*modules])
     # before the signal is blocked, because `resource_tracker.ensure_running` unblocks SIGINT
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
     return context

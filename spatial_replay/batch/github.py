@@ -52,8 +52,8 @@ def annotation(
     title: str = "",
 ) -> str:
     """Return the workflow command that marks a line of a file."""
-    place = {"file": file, "line": str(line), "col": str(column) if column else "", "title": title}
-    properties = ",".join(f"{name}={_property(value)}" for name, value in place.items() if value)
+    location = {"file": file, "line": str(line), "col": str(column) if column else "", "title": title}
+    properties = ",".join(f"{name}={_property(value)}" for name, value in location.items() if value)
     return f"::{severity} {properties}::{_data(message)}"
 
 
@@ -66,9 +66,11 @@ def repository_path(file: str | Path) -> str:
     if is_address(file):
         return str(file)
     path, current = Path(file).absolute(), Path.cwd()
-    job = os.environ.get("GITHUB_WORKSPACE")
-    above = next((folder for folder in (current, *current.parents) if (folder / ".git").exists()), current)
-    for base in (Path(job) if job else above, above):
+    job_folder = os.environ.get("GITHUB_WORKSPACE")
+    repository = next(
+        (folder for folder in (current, *current.parents) if (folder / ".git").exists()), current
+    )
+    for base in (Path(job_folder) if job_folder else repository, repository):
         # as written first, because a link in the repository may lead outside
         for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
             if candidate.is_relative_to(root):
@@ -85,17 +87,17 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
         folder: base of the paths of specifications.
     """
     rows = [row for row in worst_rows(table, _MOST_COMPARED) if row["failure"] is not None]
-    kinds = Counter[tuple[str, str, str]]()
-    ranks = []
+    kind_counts = Counter[tuple[str, str, str]]()
+    kind_ranks = []
     for row in rows:
         kind = (row["file"], row["spec"], verdict_word(row))
-        ranks.append(kinds[kind])
-        kinds[kind] += 1
+        kind_ranks.append(kind_counts[kind])
+        kind_counts[kind] += 1
     # the first row of every kind comes before the second row of any kind
-    order = sorted(range(len(rows)), key=lambda place: ranks[place])
-    for row in (rows[place] for place in order[:_ANNOTATIONS]):
-        about = requirement_of(row)
-        name = f"{row['spec']} ({about})" if about else row["spec"]
+    row_indices = sorted(range(len(rows)), key=lambda place: kind_ranks[place])
+    for row in (rows[place] for place in row_indices[:_ANNOTATIONS]):
+        requirement = requirement_of(row)
+        name = f"{row['spec']} ({requirement})" if requirement else row["spec"]
         message = f"{row['log']}: {row['failure'].rstrip('.')}. {row['reason'] or ''}".rstrip()
         file = row["file"] if is_address(row["file"]) else folder / row["file"]
         yield annotation("error", repository_path(file), row["line"], message, title=name)
@@ -119,30 +121,30 @@ def write_summary(table: pa.Table) -> None:
 
 def markdown(table: pa.Table) -> str:
     """Return the totals and the worst rows as Markdown."""
-    numbers, rows = total_cells(totals(table))
+    number_headings, total_rows = total_cells(totals(table))
     lines = [
         "### spatial-replay\n",
         f"{summary_text(table)}\n",
-        f"| case | spec | requirement | {' | '.join(numbers)} |",
-        f"|---|---|---|{'--:|' * len(numbers)}",
-        *map(_line, rows),
+        f"| case | spec | requirement | {' | '.join(number_headings)} |",
+        f"|---|---|---|{'--:|' * len(number_headings)}",
+        *map(_line, total_rows),
     ]
     failing = [row for row in worst_rows(table, MOST_WORST) if row["failure"] is not None]
     if failing:
-        count = len(table) - table.column("failure").null_count
+        failure_count = len(table) - table.column("failure").null_count
         lines += [
             "",
-            f"{plural(count, 'result')} failed; the worst:",
+            f"{plural(failure_count, 'result')} failed; the worst:",
             "",
             "| log | spec | requirement | verdict | failure | reason |",
             "|---|---|---|---|---|---|",
         ]
         for row in failing:
-            names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
+            name_cells = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
             verdict = f"{verdict_word(row)}{damage_word(row)}"
-            lines.append(_line([*names, verdict, row["failure"], row["reason"] or ""]))
-    flaky = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
-    lines += ["", *(f"- {_markdown_cell(line)}" for line in flaky)] if flaky else []
+            lines.append(_line([*name_cells, verdict, row["failure"], row["reason"] or ""]))
+    flaky_lines = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
+    lines += ["", *(f"- {_markdown_cell(line)}" for line in flaky_lines)] if flaky_lines else []
     return "\n".join([*lines, "", ""])
 
 
@@ -153,12 +155,12 @@ def _line(cells: list[str]) -> str:
 def _markdown_cell(sentence: str) -> str:
     """Return a sentence for a cell of a Markdown table: formulas as code, everything else escaped."""
     pieces = []
-    for number, piece in enumerate(sentence_parts(sentence)):
-        if number % 2:
+    for index, piece in enumerate(sentence_parts(sentence)):
+        if index % 2:
             # in code, a backslash escapes only a pipe: https://github.github.com/gfm/#tables-extension-
             fence = "`" * (max(map(len, _BACKQUOTES.findall(piece)), default=0) + 1)
-            pad = " " if "`" in piece else ""
-            pieces.append(f"{fence}{pad}{piece.replace('|', _PIPE)}{pad}{fence}")
+            padding = " " if "`" in piece else ""
+            pieces.append(f"{fence}{padding}{piece.replace('|', _PIPE)}{padding}{fence}")
         else:
             pieces.append(_MARKUP.sub(r"\\\g<0>", piece).replace("<", "&lt;"))
     return "".join(pieces)

@@ -35,13 +35,15 @@ def identify(
         progress: shows the number of logs read.
     """
     states = states_of(paths)
-    unknown = [path for path, state in states.items() if state is None or state not in known]
-    groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
+    unknown_paths = [path for path, state in states.items() if state is None or state not in known]
+    groups = [
+        tuple(unknown_paths[start : start + _TOGETHER]) for start in range(0, len(unknown_paths), _TOGETHER)
+    ]
     # one group is read sooner than a process starts
-    at_work = ThisProcess() if len(groups) == 1 else workers
+    executor = ThisProcess() if len(groups) == 1 else workers
     identity_by_path: dict[str, str | None] = {}
-    with progress("logs read", len(unknown)) as advance:
-        for group, identities in at_work.results(identities_of, groups) if groups else ():
+    with progress("logs read", len(unknown_paths)) as advance:
+        for group, identities in executor.results(identities_of, groups) if groups else ():
             identity_by_path |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
             advance(len(group))
     return {
@@ -80,9 +82,9 @@ class _LogFiles:
         """
         address = data_set_address(path)
         if address is not None:
-            data_set, shared = self._data_set(address[0])
+            data_set, shared_files = self._data_set(address[0])
             if data_set is not None:
-                return [*shared, *map(str, data_set.files_of(address[1]))], address[1]
+                return [*shared_files, *map(str, data_set.files_of(address[1]))], address[1]
         # on texts: building `Path` objects takes longer than the system call
         if not os.path.isdir(path):  # noqa: PTH112
             return [path], None
@@ -97,8 +99,8 @@ class _LogFiles:
     def _data_set(self, path: str) -> tuple[DataSet | None, list[str]]:
         if path not in self._data_sets:
             data_set = open_data_set(path)
-            shared = [] if data_set is None else [str(file) for file in data_set.shared_files()]
-            self._data_sets[path] = data_set, shared
+            shared_files = [] if data_set is None else [str(file) for file in data_set.shared_files()]
+            self._data_sets[path] = data_set, shared_files
         return self._data_sets[path]
 
 
@@ -113,37 +115,37 @@ def states_of(paths: Sequence[str]) -> dict[str, str | None]:
 
 def _state(path: str, files: _LogFiles) -> str | None:
     try:
-        names, number = files.of(path)
-        states = [files.state(name) for name in names]
+        file_names, episode_number = files.of(path)
+        states = [files.state(name) for name in file_names]
     except (OSError, ValueError, SpatialReplayError):
         return None
     # with the time of change (ctime), because tools such as rsync restore the modification time
-    text = json.dumps(
+    state_json = json.dumps(
         [
-            *([] if number is None else [number]),
+            *([] if episode_number is None else [episode_number]),
             *(
                 (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
                 for name, state in states
             ),
         ]
     )
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+    return hashlib.sha256(state_json.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _hash_of_log(path: str, files: _LogFiles) -> str:
-    names, number = files.of(path)
+    file_names, episode = files.of(path)
     if Path(path).is_file():
         return _hash_of(Path(path))
-    if number is None and not Path(path).is_dir():
+    if episode is None and not Path(path).is_dir():
         raise OSError(f"{path} is no regular file")
-    total = hashlib.sha256()
-    for name in names:
+    log_hash = hashlib.sha256()
+    for name in file_names:
         digest = (
-            _hash_of(Path(name)) if number is None else _cached_hash(name, files.state(name)[1].st_mtime_ns)
+            _hash_of(Path(name)) if episode is None else _cached_hash(name, files.state(name)[1].st_mtime_ns)
         )
         # names that are not UTF-8 contain surrogates (PEP 383)
-        total.update(f"{Path(name).name}\0{digest}\0".encode("utf-8", "surrogatepass"))
-    return f"files:{total.hexdigest()}" + ("" if number is None else f"#{number}")
+        log_hash.update(f"{Path(name).name}\0{digest}\0".encode("utf-8", "surrogatepass"))
+    return f"files:{log_hash.hexdigest()}" + ("" if episode is None else f"#{episode}")
 
 
 @lru_cache(maxsize=64)
@@ -171,8 +173,8 @@ def _version_of(file: RemoteFile) -> tuple[int, str]:
     if version.is_exact:
         return version.size, str(version.tag)
     digest = hashlib.sha256()
-    for piece in file.iter_whole():
-        digest.update(piece)
+    for chunk in file.iter_whole():
+        digest.update(chunk)
     return version.size, digest.hexdigest()
 
 

@@ -55,8 +55,8 @@ def write_junit(
     """
     text = ""
     # the full report, then with short texts, then without passing test cases
-    for limit, keeps in ((None, True), (_SHORT, True), (_SHORT, False)):
-        text = "".join(_lines(table, name, reports or {}, limit, keeps))
+    for text_limit, has_passing in ((None, True), (_SHORT, True), (_SHORT, False)):
+        text = "".join(_lines(table, name, reports or {}, text_limit, has_passing))
         if len(text.encode()) <= largest:
             break
     with replacing(path, inputs) as stream:
@@ -66,27 +66,27 @@ def write_junit(
 def _lines(
     table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, keeps: bool
 ) -> Iterator[str]:
-    suites: dict[tuple[str, ...], list[Values]] = {}
-    keys = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
-    results = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
-    faults = ("failure", "expected", "error", "error_kind")
-    edited = {
+    rows_by_spec: dict[tuple[str, ...], list[Values]] = {}
+    key_columns = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
+    result_columns = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
+    failure_columns = ("failure", "expected", "error", "error_kind")
+    edited_specs = {
         (total.group["case"], total.group["file"], total.group["spec"])
         for total in totals(table)
         if total.is_edited
     }
-    flaky: dict[tuple[str, str, str], list[str]] = {}
+    flaky_texts: dict[tuple[str, str, str], list[str]] = {}
     for result in flaky_results(table):
-        flaky.setdefault((result.case, result.file, result.spec), []).append(result.text)
-    for row in table.select([*keys, *results, *faults]).to_pylist():
-        suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
-    failures, errors = _counts(row for rows in suites.values() for row in rows)
+        flaky_texts.setdefault((result.case, result.file, result.spec), []).append(result.text)
+    for row in table.select([*key_columns, *result_columns, *failure_columns]).to_pylist():
+        rows_by_spec.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
+    failures, errors = _counts(row for rows in rows_by_spec.values() for row in rows)
     yield '<?xml version="1.0" encoding="utf-8"?>\n'
     yield (
         f'<testsuites name={_quote(name)} tests="{len(table)}" failures="{failures}" errors="{errors}" '
-        f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
+        f'time="{_time(row for rows in rows_by_spec.values() for row in rows)}">\n'
     )
-    for (case, file, spec), rows in suites.items():
+    for (case, file, spec), rows in rows_by_spec.items():
         listed_rows = rows if keeps else [row for row in rows if row["failure"] is not None]
         failures, errors = _counts(rows)
         title = f"{case}.{spec or file}"
@@ -96,13 +96,16 @@ def _lines(
         )
         properties = {"specification": f"{file}:{rows[0]['line']}"}
         properties |= {key: rows[0][key] for key in ("requirement", "title") if rows[0][key]}
-        tested = Counter(row["tested"] for row in rows if row["tested"])
-        if tested:
-            properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(tested.items()))
-        if (case, file, spec) in edited:
+        kinds = Counter(row["tested"] for row in rows if row["tested"])
+        if kinds:
+            properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+        if (case, file, spec) in edited_specs:
             properties["baseline"] = EDITED_SINCE
-        pairs = [*properties.items(), *(("flaky", line) for line in flaky.get((case, file, spec), ()))]
-        for key, value in pairs:
+        entries = [
+            *properties.items(),
+            *(("flaky", line) for line in flaky_texts.get((case, file, spec), ())),
+        ]
+        for key, value in entries:
             yield f"<property name={_quote(key)} value={_quote(value)}/>\n"
         yield "</properties>\n"
         # with the stem of the file, because two files may have a spec of the same name
@@ -110,31 +113,33 @@ def _lines(
         for row in listed_rows:
             yield from _case(row, class_name, reports, limit)
         if len(listed_rows) < len(rows):
-            left_out = plural(len(rows) - len(listed_rows), "test case")
-            yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
+            left_out_text = plural(len(rows) - len(listed_rows), "test case")
+            yield (
+                f"<system-out>{left_out_text} that passed left out, to keep this report small</system-out>\n"
+            )
         yield "</testsuite>\n"
     yield "</testsuites>\n"
 
 
 def _case(
-    row: Values, class_name: str, reports: Mapping[tuple[str, str], str], limit: int | None
+    row: Values, class_name: str, reports: Mapping[tuple[str, str], str], text_limit: int | None
 ) -> Iterator[str]:
     name = row["log"] if row["object"] is None else f"{row['log']}[{row['object']}]"
     yield f'<testcase classname={_quote(class_name)} name={_quote(name)} time="{row["seconds"]:.3f}">\n'
-    tested = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
+    tested_lines = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
     if row["failure"] is not None:
         # in JUnit, an error concerns the test, and a failure its subject
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or _unmet(row)
         texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
-        text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
-        text = cut(text, limit or len(text))
-        message = printable(row["failure"], limit or 1_000)
+        text = "\n".join(filter(None, [requirement_of(row), *texts, *tested_lines]))
+        text = cut(text, text_limit or len(text))
+        message = printable(row["failure"], text_limit or 1_000)
         yield f"<{tag} type={_quote(kind)} message={_quote(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
-    elif row["untested"] and limit is None:
-        text = _text("\n".join([*tested, *row["untested"]]))
+    elif row["untested"] and text_limit is None:
+        text = _text("\n".join([*tested_lines, *row["untested"]]))
         yield f"<system-out>{text}</system-out>\n"
     yield "</testcase>\n"
 
@@ -153,8 +158,8 @@ def _unmet(row: Values) -> str:
 
 def _counts(rows: Any) -> tuple[int, int]:
     """Return the numbers of failures and of errors."""
-    kinds = [row["error"] is None for row in rows if row["failure"] is not None]
-    return sum(kinds), len(kinds) - sum(kinds)
+    are_failures = [row["error"] is None for row in rows if row["failure"] is not None]
+    return sum(are_failures), len(are_failures) - sum(are_failures)
 
 
 def _time(rows: Any) -> str:

@@ -79,28 +79,30 @@ def _headline(table: pa.Table) -> str:
 
 
 def _header(table: pa.Table, name: str) -> Html:
-    failed = table.column("failure").null_count < len(table)
-    chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
-    logs = len(set(table.column("log").to_pylist()))
-    about = " · ".join([plural(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
+    has_failed = table.column("failure").null_count < len(table)
+    chip = element(
+        "span", _headline(table), **{"class": f"chip is-{'violated' if has_failed else 'satisfied'}"}
+    )
+    log_count = len(set(table.column("log").to_pylist()))
+    summary = " · ".join([plural(log_count, "log"), summary_text(table), f"spatial-replay {__version__}"])
     title = element("div", element("h1", text(name)), chip, **{"class": "title"})
-    return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
+    return element("header", title, element("p", text(summary), **{"class": "about"}), **{"class": "top"})
 
 
 def _panels(
     table: pa.Table, reports: Mapping[tuple[str, str], str], curves: Mapping[str, Sequence[Curve]]
 ) -> Iterator[Html]:
-    by_spec = totals(table)
-    yield _panel("Specifications", _totals(by_spec))
-    worst = [row for row in worst_rows(table, MOST_WORST) if row["failure"] is not None]
-    if worst:
-        yield _panel("The worst", _worst(worst, reports))
-    flaky = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
-    if flaky:
-        yield _panel("Flaky", element("ul", *(element("li", text(line)) for line in flaky)))
-    plots = _plots(table, by_spec[:_MOST_SPECS], curves)
+    spec_totals = totals(table)
+    yield _panel("Specifications", _totals(spec_totals))
+    failing_rows = [row for row in worst_rows(table, MOST_WORST) if row["failure"] is not None]
+    if failing_rows:
+        yield _panel("The worst", _worst(failing_rows, reports))
+    flaky_lines = first_lines([result.text for result in flaky_results(table)], MOST_FLAKY)
+    if flaky_lines:
+        yield _panel("Flaky", element("ul", *(element("li", text(line)) for line in flaky_lines)))
+    plots = _plots(table, spec_totals[:_MOST_SPECS], curves)
     yield _panel("Robustness", element("div", *plots, **{"class": "plots"}))
-    yield _panel("Logs", *_matrix(table, by_spec[:_MOST_SPECS], reports))
+    yield _panel("Logs", *_matrix(table, spec_totals[:_MOST_SPECS], reports))
 
 
 def _panel(title: str, *content: Html) -> Html:
@@ -109,26 +111,29 @@ def _panel(title: str, *content: Html) -> Html:
     return element("section", element("h2", title), *content, **attributes)
 
 
-def _totals(by_spec: Sequence[Total]) -> Html:
-    names = ("case", "spec", "requirement")
-    numbers, cells = total_cells(by_spec)
-    head = [*(element("th", name) for name in names), *(_number("th", name) for name in numbers)]
+def _totals(spec_totals: Sequence[Total]) -> Html:
+    name_headings = ("case", "spec", "requirement")
+    number_headings, cell_rows = total_cells(spec_totals)
+    head = [
+        *(element("th", name) for name in name_headings),
+        *(_number("th", name) for name in number_headings),
+    ]
     rows = [
         element(
             "tr",
-            *(element("td", text(cell)) for cell in row[: len(names)]),
-            *(_number("td", cell) for cell in row[len(names) :]),
+            *(element("td", text(cell)) for cell in row[: len(name_headings)]),
+            *(_number("td", cell) for cell in row[len(name_headings) :]),
         )
-        for row in cells
+        for row in cell_rows
     ]
     return element("table", element("thead", element("tr", *head)), element("tbody", *rows))
 
 
 def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
-    names = [element("th", name) for name in ("log", "spec")]
-    texts = [element("th", name) for name in ("failure", "reason")]
-    head = element("tr", *names, _number("th", "robustness"), *texts)
-    body = [
+    name_headings = [element("th", name) for name in ("log", "spec")]
+    text_headings = [element("th", name) for name in ("failure", "reason")]
+    heading_row = element("tr", *name_headings, _number("th", "robustness"), *text_headings)
+    body_rows = [
         element(
             "tr",
             element("td", _log_link((row["case"], row["log"]), reports), **{"class": "log"}),
@@ -139,7 +144,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
         )
         for row in rows
     ]
-    return element("table", element("thead", head), element("tbody", *body))
+    return element("table", element("thead", heading_row), element("tbody", *body_rows))
 
 
 def _result_cell(row: Values) -> Iterator[Html]:
@@ -156,27 +161,29 @@ def _with_code(sentence: str) -> Iterator[Html]:
 
 
 def _plots(
-    table: pa.Table, by_spec: Sequence[Total], curves: Mapping[str, Sequence[Curve]]
+    table: pa.Table, spec_totals: Sequence[Total], curves: Mapping[str, Sequence[Curve]]
 ) -> Iterator[Html]:
     import pyarrow.compute as pc
 
-    has_cases = len({total.group["case"] for total in by_spec}) > 1
-    for total in by_spec:
+    has_cases = len({total.group["case"] for total in spec_totals}) > 1
+    for total in spec_totals:
         group = total.group
-        fits = pc.and_(
+        is_of_spec = pc.and_(
             pc.and_(pc.equal(table["case"], group["case"]), pc.equal(table["file"], group["file"])),
             pc.equal(table["spec"], group["spec"]),
         )
-        rows = table.filter(fits)
-        numbers = np.asarray(rows.column("robustness").to_numpy(), np.float64)
-        finite = numbers[np.isfinite(numbers)]
+        rows = table.filter(is_of_spec)
+        robustness = np.asarray(rows.column("robustness").to_numpy(), np.float64)
+        finite = robustness[np.isfinite(robustness)]
         unit = next(filter(None, rows.column("unit").to_pylist()), "")
         if len(finite):
             case = group["case"] if has_cases else None
             title = " · ".join(filter(None, (case, total.requirement, group["spec"])))
             caption = element("figcaption", text(title), **_tip(total.about))
-            of_spec = [curve for curve in curves.get(group["case"], ()) if group["spec"] in ("", curve.spec)]
-            yield element("figure", caption, _histogram(finite, unit), draw_curves(of_spec, unit))
+            spec_curves = [
+                curve for curve in curves.get(group["case"], ()) if group["spec"] in ("", curve.spec)
+            ]
+            yield element("figure", caption, _histogram(finite, unit), draw_curves(spec_curves, unit))
 
 
 def _histogram(numbers: Floats, unit: str) -> Html:
@@ -184,22 +191,27 @@ def _histogram(numbers: Floats, unit: str) -> Html:
     low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
     if low == high:
         high = low + 1.0
-    width = (high - low) / _BINS
-    below = math.ceil(-low / width) if low < 0.0 else 0
+    bin_width = (high - low) / _BINS
+    negative_bins = math.ceil(-low / bin_width) if low < 0.0 else 0
     # one bin more than `_BINS`, because 0 is an edge
-    edges = (np.arange(_BINS + 2) - below) * width
+    edges = (np.arange(_BINS + 2) - negative_bins) * bin_width
     counts, _ = np.histogram(numbers, edges)
-    tallest, step = max(1, int(counts.max())), _WIDTH / len(counts)
+    largest_count, bar_width = max(1, int(counts.max())), _WIDTH / len(counts)
     bars = []
-    for number, count in enumerate(counts.tolist()):
-        height = _HEIGHT * count / tallest
-        side = "bad" if number < below else "good"
-        place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
+    for index, count in enumerate(counts.tolist()):
+        height = _HEIGHT * count / largest_count
+        css_class = "bad" if index < negative_bins else "good"
+        box = {
+            "x": index * bar_width + 0.5,
+            "y": _HEIGHT - height,
+            "width": bar_width - 1.0,
+            "height": height,
+        }
         # only the tooltip of a bar gives its count: bars have no text
-        tip = element("title", with_signs(f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}"))
-        attributes = {name: f"{value:.2f}" for name, value in place.items()}
-        bars.append(element("rect", tip, **attributes, **{"class": side}))
-    zero = f"{below * step:.2f}"
+        tooltip = element("title", with_signs(f"{count:,} from {edges[index]:.4g} to {edges[index + 1]:.4g}"))
+        attributes = {label: f"{value:.2f}" for label, value in box.items()}
+        bars.append(element("rect", tooltip, **attributes, **{"class": css_class}))
+    zero = f"{negative_bins * bar_width:.2f}"
     axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
     labels = [
         element("text", with_signs(with_unit(low, unit)), x="0", y=f"{_HEIGHT + 12:.0f}"),
@@ -211,65 +223,68 @@ def _histogram(numbers: Floats, unit: str) -> Html:
             **{"text-anchor": "end"},
         ),
     ]
-    name = with_signs(f"Distribution of robustness from {low:.4g} to {high:.4g}")
-    view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
-    return element("svg", *bars, axis, *labels, viewBox=view, role="img", **{"aria-label": name})
+    label = with_signs(f"Distribution of robustness from {low:.4g} to {high:.4g}")
+    view_box = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
+    return element("svg", *bars, axis, *labels, viewBox=view_box, role="img", **{"aria-label": label})
 
 
 def _matrix(
-    table: pa.Table, by_spec: Sequence[Total], reports: Mapping[tuple[str, str], str]
+    table: pa.Table, spec_totals: Sequence[Total], reports: Mapping[tuple[str, str], str]
 ) -> Iterator[Html]:
     """Yield a row for each log, the worst first, and a column for each spec."""
-    columns = [(total.group["case"], total.group["file"], total.group["spec"]) for total in by_spec]
-    cells: dict[str, dict[tuple[str, str, str], Values]] = {}
+    specs = [(total.group["case"], total.group["file"], total.group["spec"]) for total in spec_totals]
+    rows_by_log: dict[str, dict[tuple[str, str, str], Values]] = {}
     rows = worst_rows(table, len(table))
     is_judged = LABEL in table.column_names
     if is_judged:
         rows.sort(key=_agrees)
     for row in rows:
-        column = (row["case"], row["file"], row["spec"])
-        log = cells.get(row["log"])
-        if log is None:
-            if len(cells) >= _MOST_LOGS:
+        spec_key = (row["case"], row["file"], row["spec"])
+        log_rows = rows_by_log.get(row["log"])
+        if log_rows is None:
+            if len(rows_by_log) >= _MOST_LOGS:
                 continue
-            log = cells[row["log"]] = {}
+            log_rows = rows_by_log[row["log"]] = {}
         # rows are sorted, so the first one of a template is the worst object
-        log.setdefault(column, row)
-    logs = len(set(table.column("log").to_pylist()))
-    if logs > len(cells):
-        words = f"The {len(cells):,} worst of {plural(logs, 'log')}; the table of the run has them all."
-        yield element("p", words)
-    cases = {case for case, _, _ in columns}
+        log_rows.setdefault(spec_key, row)
+    log_count = len(set(table.column("log").to_pylist()))
+    if log_count > len(rows_by_log):
+        sentence = (
+            f"The {len(rows_by_log):,} worst of {plural(log_count, 'log')}; "
+            "the table of the run has them all."
+        )
+        yield element("p", sentence)
+    cases = {case for case, _, _ in specs}
     yield _filter()
-    titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
-    units = [f" [{total.unit}]" if total.unit not in (None, "", "1") else "" for total in by_spec]
-    abouts = [total.about for total in by_spec]
-    label = [_sortable(LABEL, "")] if is_judged else []
+    titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in specs]
+    units = [f" [{total.unit}]" if total.unit not in (None, "", "1") else "" for total in spec_totals]
+    requirements = [total.about for total in spec_totals]
+    label_headings = [_sortable(LABEL, "")] if is_judged else []
     head = [
         _sortable("log", ""),
-        *label,
-        *map(_sortable, map(add, titles, units), ["number"] * len(titles), abouts),
+        *label_headings,
+        *map(_sortable, map(add, titles, units), ["number"] * len(titles), requirements),
     ]
     body = []
-    for name, of_log in cells.items():
-        row_cells = [_cell(of_log.get(column)) for column in columns]
-        report = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
+    for name, rows_by_spec in rows_by_log.items():
+        row_cells = [_cell(rows_by_spec.get(spec_key)) for spec_key in specs]
+        report = next(((case, name) for case, _, _ in specs if (case, name) in reports), ("", name))
         if is_judged:
-            row_cells.insert(0, _label_cell(next(iter(of_log.values()))))
+            row_cells.insert(0, _label_cell(next(iter(rows_by_spec.values()))))
         body.append(element("tr", element("td", _log_link(report, reports)), *row_cells))
     yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
 
 
 def _filter() -> Html:
     """Return the filters of the matrix, and buttons that step through failing rows."""
-    words = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
-    box = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
-    steps = [
+    search_field = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
+    checkbox = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
+    buttons = [
         element("button", f"{word} failing", type="button", **{"class": "step", "data-step": step})
         for word, step in (("Previous", "-1"), ("Next", "1"))
     ]
-    left = element("span", "", id="left", role="status")
-    return element("p", "Marked results fail. ", words, box, *steps, left, id="filter")
+    count_text = element("span", "", id="left", role="status")
+    return element("p", "Marked results fail. ", search_field, checkbox, *buttons, count_text, id="filter")
 
 
 def _agrees(row: Values) -> bool:
@@ -280,37 +295,39 @@ def _agrees(row: Values) -> bool:
 def _label_cell(row: Values) -> Html:
     if row[LABEL] is None:
         return element("td", "")
-    kind = "is-satisfied" if row[LABEL] == "success" else "is-violated"
-    words = row[LABEL] if _agrees(row) else f"{row[LABEL]}, {row[AGREEMENT].replace('_', ' ')}"
-    return element("td", words, **{"class": kind if _agrees(row) else f"{kind} fails"})
+    css_class = "is-satisfied" if row[LABEL] == "success" else "is-violated"
+    label_text = row[LABEL] if _agrees(row) else f"{row[LABEL]}, {row[AGREEMENT].replace('_', ' ')}"
+    return element("td", label_text, **{"class": css_class if _agrees(row) else f"{css_class} fails"})
 
 
 def _cell(row: Values | None) -> Html:
     if row is None:
         # JavaScript reads 1e400 as infinity, which sorts last
         return element("td", "", **{"class": "number", "data-value": "1e400"})
-    number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
-    kind = f"number is-{verdict}{' fails' if fails else ''}"
-    was = row.get(BASELINE_ROBUSTNESS)
-    before = f" (was {was:.4g})" if fails and was is not None and was != number else ""
+    robustness, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
+    classes = f"number is-{verdict}{' fails' if fails else ''}"
+    baseline = row.get(BASELINE_ROBUSTNESS)
+    note = f" (was {baseline:.4g})" if fails and baseline is not None and baseline != robustness else ""
     if row["verdict"] is None:
         return element(
-            "td", f"{verdict}{before}", title=row["failure"] or "", **{"class": kind, "data-value": "-1e400"}
+            "td", f"{verdict}{note}", title=row["failure"] or "", **{"class": classes, "data-value": "-1e400"}
         )
-    words = verdict if number is None or verdict in ("untested", "doubtful") else f"{number:.4g}"
+    words = verdict if robustness is None or verdict in ("untested", "doubtful") else f"{robustness:.4g}"
     # finite, so that errors and empty cells sort outside
-    value = "0" if number is None else f"{max(-1e300, min(1e300, number)):.17g}"
-    why = f": {row['failure'].rstrip('.')}" if fails else ""
-    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}."
-    tip = " ".join(
+    value = "0" if robustness is None else f"{max(-1e300, min(1e300, robustness)):.17g}"
+    failure_text = f": {row['failure'].rstrip('.')}" if fails else ""
+    tooltip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{failure_text}."
+    tooltip = " ".join(
         [
-            tip,
+            tooltip,
             *filter(None, [row["reason"]]),
-            *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in why),
+            *(sentence for sentence in row["untested"] or () if sentence.rstrip(".") not in failure_text),
         ]
     )
-    words = f"{words}{damage_word(row)}{before}"
-    return element("td", with_signs(words), title=with_signs(tip), **{"class": kind, "data-value": value})
+    words = f"{words}{damage_word(row)}{note}"
+    return element(
+        "td", with_signs(words), title=with_signs(tooltip), **{"class": classes, "data-value": value}
+    )
 
 
 def _sortable(title: str, kind: str, about: str = "") -> Html:

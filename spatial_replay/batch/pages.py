@@ -56,48 +56,50 @@ def write_pages(
         raise UsageError(f"{folder} is a file; give --html the name of a folder") from None
     except OSError as error:
         raise output_error(folder, error) from error
-    missing = {
+    missing_pages = {
         path: (_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
     }
-    with progress("reports", len(missing)) as advance:
-        for _ in workers.results(_write_page, missing.values()) if missing else ():
+    with progress("reports", len(missing_pages)) as advance:
+        for _ in workers.results(_write_page, missing_pages.values()) if missing_pages else ():
             advance(1)
-    order = dict.fromkeys((row["case"], row["log"]) for row in worst_rows(result.table, len(result.table)))
-    pages = {key: pages[key] for key in order if key in pages and pages[key].exists()}
+    worst_first = dict.fromkeys(
+        (row["case"], row["log"]) for row in worst_rows(result.table, len(result.table))
+    )
+    pages = {key: pages[key] for key in worst_first if key in pages and pages[key].exists()}
     _link_pages(pages)
-    links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
+    addresses = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
     curves: dict[str, list[Curve]] = {}
     for (case, log), path in pages.items():
-        curves.setdefault(case, []).extend(read_curves(path, log, links[case, log]))
+        curves.setdefault(case, []).extend(read_curves(path, log, addresses[case, log]))
     with replacing(folder / INDEX) as stream:
-        stream.write(overview_page(result.table, name, links, curves))
+        stream.write(overview_page(result.table, name, addresses, curves))
     return pages
 
 
 def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
     """Write links to the page over all logs and to the neighbouring pages into each page about a log."""
     neighbours = [(log, path.name) for (_, log), path in pages.items()]
-    for place, path in enumerate(pages.values()):
+    for index, path in enumerate(pages.values()):
         links = [element("a", "All logs", href=f"../{INDEX}")]
-        links.append(element("span", f"{place + 1} of {len(pages)} that fail"))
-        for words, step in (("Previous", place - 1), ("Next", place + 1)):
-            if 0 <= step < len(pages):
-                log, address = neighbours[step]
-                relation = "prev" if step < place else "next"
+        links.append(element("span", f"{index + 1} of {len(pages)} that fail"))
+        for words, neighbour_index in (("Previous", index - 1), ("Next", index + 1)):
+            if 0 <= neighbour_index < len(pages):
+                log, address = neighbours[neighbour_index]
+                relation = "prev" if neighbour_index < index else "next"
                 links.append(element("a", f"{words}: ", text(log), href=quote(address), rel=relation))
         nav = element("nav", *links, **{"class": "neighbours", "aria-label": "Logs that fail"})
-        content, begin = path.read_bytes(), (nav + HEADER).encode()
+        content, new_header = path.read_bytes(), (nav + HEADER).encode()
         # in a replacement of `re`, backslashes are escapes, and names of logs may contain them
-        linked = _HEAD.sub(begin.replace(b"\\", rb"\\"), content, count=1)
-        if linked != content:
+        new_content = _HEAD.sub(new_header.replace(b"\\", rb"\\"), content, count=1)
+        if new_content != content:
             with replacing(path) as stream:
-                stream.write(linked)
+                stream.write(new_content)
 
 
 def _failing(result: BatchResult) -> dict[tuple[str, str], list[RowRequest]]:
     """Return the requests of each log with a failing verdict, by case and log."""
-    names = ("case", "log", "failure", "error")
-    rows = zip(*(result.table.column(name).to_pylist() for name in names), strict=True)
+    columns = ("case", "log", "failure", "error")
+    rows = zip(*(result.table.column(name).to_pylist() for name in columns), strict=True)
     requests_by_log: dict[tuple[str, str], list[RowRequest]] = {
         (case, log): [] for case, log, failure, error in rows if failure and not error
     }

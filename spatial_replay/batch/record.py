@@ -59,8 +59,8 @@ class RunRecord:
         """Return the task with which the run evaluated a log, given the log's name in the table."""
         path = log if is_address(log) else str(Path(self.folder) / log)
         texts = tuple(SpecificationText(*text) for text in self.cases[case]["files"].values())
-        values = self.cases[case]["conditions"]
-        return Task(path, texts, Conditions(**{name: _frozen(value) for name, value in values.items()}))
+        conditions = self.cases[case]["conditions"]
+        return Task(path, texts, Conditions(**{name: _frozen(value) for name, value in conditions.items()}))
 
 
 def _frozen(value: Any) -> Any:
@@ -80,11 +80,11 @@ def with_explanations(table: pa.Table, explanations: Mapping[int, Explanation]) 
     """Return a table with explanations in the rows at their places."""
     import pyarrow as pa
 
-    for number, name in enumerate(EXPLANATION if explanations else ()):
+    for column_number, name in enumerate(EXPLANATION if explanations else ()):
         values = table.column(name).to_pylist()
-        for place, explanation in explanations.items():
-            values[place] = explanation[number]
-        index = table.schema.get_field_index(name)
-        field = table.schema.field(index)
-        table = table.set_column(index, field, pa.array(values, field.type))
+        for row_index, explanation in explanations.items():
+            values[row_index] = explanation[column_number]
+        column_index = table.schema.get_field_index(name)
+        field = table.schema.field(column_index)
+        table = table.set_column(column_index, field, pa.array(values, field.type))
     return table

@@ -168,7 +168,7 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
         For each of `task.specs` one row per result and per object of a template, in the order of the text. If
         the log has an error, each row holds it. Only an interruption is raised.
     """
-    begin = time.perf_counter()
+    begin_s = time.perf_counter()
     try:
         files = parsed_specifications(task.specs, task.conditions)
         source, options = opened_task(task, files)
@@ -178,7 +178,7 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
         rows = _rows_of_log(task, files, replay.trees, replayed, explained)
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
-    return _rows_with_time(rows, time.perf_counter() - begin)
+    return _rows_with_time(rows, time.perf_counter() - begin_s)
 
 
 def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
@@ -198,7 +198,7 @@ def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
         return [rows_from_task(task) for task in tasks]
     rows_by_task: dict[Task, TaskRows] = {}
     sources: dict[Task, tuple[Source, ReplayOptions]] = {}
-    begin = time.perf_counter()
+    begin_s = time.perf_counter()
     for task in tasks:
         try:
             source, options = opened_task(task, files)
@@ -209,25 +209,25 @@ def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
         sources[task] = source, options
     if not sources or not can_join(files, next(iter(sources.values()))[1]):
         return [rows_by_task[task] if task in rows_by_task else rows_from_task(task) for task in tasks]
-    joint = None
-    logs: dict[Task, ShortLog] = {}
+    joint_replay = None
+    short_logs: dict[Task, ShortLog] = {}
     whole_sources = read_together([source for source, _ in sources.values()])
     for (task, (_, options)), source in zip(sources.items(), whole_sources, strict=True):
         try:
-            joint = joint or JointReplay(source, files, options)
-            log = joint.read(source) if joint.fits(source) else None
+            joint_replay = joint_replay or JointReplay(source, files, options)
+            log = joint_replay.read(source) if joint_replay.fits(source) else None
         except Exception as error:
             rows_by_task[task] = error_rows(task, *error_from_exception(error))
             continue
         if log is None:
             rows_by_task[task] = rows_from_task(task)
             continue
-        logs[task] = log
-        if joint.is_enough(logs.values()):
-            rows_by_task |= _rows_of_short_logs(joint, files, logs, begin)
-            logs, begin = {}, time.perf_counter()
-    if joint is not None and logs:
-        rows_by_task |= _rows_of_short_logs(joint, files, logs, begin)
+        short_logs[task] = log
+        if joint_replay.is_enough(short_logs.values()):
+            rows_by_task |= _rows_of_short_logs(joint_replay, files, short_logs, begin_s)
+            short_logs, begin_s = {}, time.perf_counter()
+    if joint_replay is not None and short_logs:
+        rows_by_task |= _rows_of_short_logs(joint_replay, files, short_logs, begin_s)
     return [rows_by_task[task] for task in tasks]
 
 
@@ -240,12 +240,12 @@ def _rows_of_short_logs(
         for task, replayed in zip(logs, joint.replay([*logs.values()]), strict=True):
             rows_by_task[task] = _rows_of_log(task, files, joint.trees, replayed, ())
     except Exception:  # the rest is evaluated log by log, so that the error stays in the rows of its log
-        rest = [task for task in logs if task not in rows_by_task]
+        other_tasks = [task for task in logs if task not in rows_by_task]
     else:
-        rest = []
-    seconds = (time.perf_counter() - begin_s) / len(logs)
-    rows_by_task = {task: _rows_with_time(rows, seconds) for task, rows in rows_by_task.items()}
-    return rows_by_task | {task: rows_from_task(task) for task in rest}
+        other_tasks = []
+    seconds_per_log = (time.perf_counter() - begin_s) / len(logs)
+    rows_by_task = {task: _rows_with_time(rows, seconds_per_log) for task, rows in rows_by_task.items()}
+    return rows_by_task | {task: rows_from_task(task) for task in other_tasks}
 
 
 def _rows_with_time(rows: TaskRows, seconds: float) -> TaskRows:
@@ -261,9 +261,9 @@ def _refuse_unfit(task: Task, source: Source) -> None:
     """Raise UnfitLogError if a log lacks what its suite requires."""
     if not task.conditions.requires:
         return
-    lacks = list(fitness_of(task.log, source).lacks(json.loads(task.conditions.requires)))
-    if lacks:
-        raise UnfitLogError(f"{source.name} is unfit to be judged: {'; '.join(lacks)}")
+    shortfalls = list(fitness_of(task.log, source).lacks(json.loads(task.conditions.requires)))
+    if shortfalls:
+        raise UnfitLogError(f"{source.name} is unfit to be judged: {'; '.join(shortfalls)}")
 
 
 def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, ReplayOptions]:
@@ -304,9 +304,9 @@ def parsed_specifications(
 def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
     """Return the message and the kind of an error."""
     kind: ErrorKind = "machine"
-    for kinds, whose in _KINDS:
-        if isinstance(error, kinds):
-            kind = whose
+    for error_types, error_kind in _KINDS:
+        if isinstance(error, error_types):
+            kind = error_kind
     if isinstance(error, SpatialReplayError):
         return str(error), kind
     if isinstance(error, MemoryError):
@@ -321,16 +321,16 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
 
     A specification that cannot be parsed has one row, with an empty name.
     """
-    failed = ResultRow(error=_cut(message), error_kind=kind, source=log_file(task.log).name)
+    error_row = ResultRow(error=_cut(message), error_kind=kind, source=log_file(task.log).name)
     rows: list[tuple[ResultRow, ...]] = []
     for text in task.specs:
         try:
             (file,) = parsed_specifications((text,), replace(task.conditions, constants=()))
         except SpatialReplayError:
-            rows.append((failed,))
+            rows.append((error_row,))
         else:
             lines = spec_lines(file)
-            rows.append(tuple(_about(failed, spec, lines) for spec in file.results))
+            rows.append(tuple(_about(error_row, spec, lines) for spec in file.results))
     return tuple(rows)
 
 
@@ -348,7 +348,7 @@ def _rows_of_log(
     replayed: Replayed,
     explained: Collection[ResultName] | None,
 ) -> TaskRows:
-    log = ResultRow(
+    log_row = ResultRow(
         samples=replayed.samples,
         zero_ns=replayed.first_ns,
         start_ns=replayed.start_ns,
@@ -361,49 +361,51 @@ def _rows_of_log(
         source=encodable(log_file(task.log).name),
     )
     return tuple(
-        _rows_of_file(log, trees, replayed, file, index, explained) for index, file in enumerate(files)
+        _rows_of_file(log_row, trees, replayed, file, index, explained) for index, file in enumerate(files)
     )
 
 
 def _rows_of_file(
-    log: ResultRow,
+    log_row: ResultRow,
     trees: Sequence[ReportedTree],
     replayed: Replayed,
     file: Specification,
-    index: int,
+    file_index: int,
     explained: Collection[ResultName] | None,
 ) -> tuple[ResultRow, ...]:
     lines = spec_lines(file)
-    pairs = zip(trees, replayed.results, strict=True)
+    tree_results = zip(trees, replayed.results, strict=True)
     # a replay renames specs whose name another file has, too; a row has the name in its own file
     results = [
         result if result.name == result.spec.name else replace(result, name=result.spec.name)
-        for tree, result in pairs
-        if tree.file == index
+        for tree, result in tree_results
+        if tree.file == file_index
     ]
     parts = {part.text: part for part in replayed.vacuous}
-    rows = [_row(log, result, replayed.first_ns, lines) for result in results]
+    rows = [_row(log_row, result, replayed.first_ns, lines) for result in results]
     rows = [
         _with_explanation(row, result, replayed.first_ns)
-        if explained is None or (index, row.spec, row.object) in explained
+        if explained is None or (file_index, row.spec, row.object) in explained
         else row
         for row, result in zip(rows, results, strict=True)
     ]
-    evaluated = {result.name for result in results}
-    idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
-    rows += [_idle_row(_about(log, spec, lines), parts[f"{spec.name}({spec.parameter})"]) for spec in idle]
+    result_names = {result.name for result in results}
+    idle = [spec for spec in file.results if spec.name not in result_names and spec.parameter is not None]
+    rows += [
+        _idle_row(_about(log_row, spec, lines), parts[f"{spec.name}({spec.parameter})"]) for spec in idle
+    ]
     return tuple(rows)
 
 
-def _missing(name: Diagnostic) -> str:
+def _missing(diagnostic: Diagnostic) -> str:
     """Return a sentence on a missing name, with the nearest name but not all names of the log."""
-    nearest, mark, _ = name.hint.partition("'?")
-    return f"{name.message}; {nearest}{mark}" if mark else name.message
+    nearest_name, mark, _ = diagnostic.hint.partition("'?")
+    return f"{diagnostic.message}; {nearest_name}{mark}" if mark else diagnostic.message
 
 
-def _row(log: ResultRow, result: SpecResult, first_ns: int, lines: Mapping[str, int]) -> ResultRow:
+def _row(log_row: ResultRow, result: SpecResult, first_ns: int, lines: Mapping[str, int]) -> ResultRow:
     return _about(
-        log,
+        log_row,
         result.spec,
         lines,
         **{name: getattr(result, name) for name in (*RESULT_COLUMNS, "unit", "tested") if name != "name"},
@@ -419,27 +421,27 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, lines: Mapping[str, 
 
 def _with_explanation(row: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
     witness = result.worst
-    deciding = None if witness is None else witness.deciding
+    deciding_atom = None if witness is None else witness.deciding
     return replace(
         row,
-        atom=None if deciding is None else _cut(deciding.text),
+        atom=None if deciding_atom is None else _cut(deciding_atom.text),
         atom_time_ns=None if witness is None else witness.time_ns,
-        atom_objects=() if deciding is None else tuple(deciding.objects),
+        atom_objects=() if deciding_atom is None else tuple(deciding_atom.objects),
         reason=_cut(result.reason(first_ns)),
         explanation=_some(result.sentences(first_ns)),
     )
 
 
-def _idle_row(about: ResultRow, part: UntestedPart) -> ResultRow:
+def _idle_row(row: ResultRow, part: UntestedPart) -> ResultRow:
     """Return the row of a template without matching objects: satisfied, and tested by nothing."""
     message = _cut(part.message)
-    endless = float("inf")
+    infinity = float("inf")
     return replace(
-        about,
+        row,
         verdict=Verdict.SATISFIED,
-        robustness=endless,
-        lower=endless,
-        upper=endless,
+        robustness=infinity,
+        lower=infinity,
+        upper=infinity,
         explanation=(message,),
         tested="nothing",
         untested=(message,),

@@ -148,8 +148,8 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
         except UsageError as error:
             yield str(error)
         if parameter not in parameters:
-            names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
-            yield f"no template has a parameter {parameter!r}; templates here: {names}"
+            template_names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
+            yield f"no template has a parameter {parameter!r}; templates here: {template_names}"
     for spec in templates:
         if spec.parameter not in choices:
             yield (
@@ -192,14 +192,14 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
     logs_by_path: dict[str, FoundLog] = {}
     faults = []
     for pattern in patterns:
-        place = f"{pattern.place}: " if pattern.place else ""
+        prefix = f"{pattern.place}: " if pattern.place else ""
         try:
             logs = list(_logs_of(pattern.text, folder))
         except UsageError as error:
-            faults.append(f"{place}{error}")
+            faults.append(f"{prefix}{error}")
             continue
         if not logs:
-            faults.append(f"{place}{_nothing(pattern.text, folder)}")
+            faults.append(f"{prefix}{_nothing(pattern.text, folder)}")
         logs_by_path.update((log.path, log) for log in logs if log.path not in logs_by_path)
         if len(logs_by_path) > _MOST_LOGS:
             raise UsageError(f"{pattern.text}: more than {plural(_MOST_LOGS, 'log')}; split the batch")
@@ -243,12 +243,12 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
         yield FoundLog(str(log_file(address)), address)
         return
     addresses = matching_addresses(address)
-    bags = {
+    bag_folders = {
         address.removesuffix(BAG_METADATA) for address in addresses if address.endswith(f"/{BAG_METADATA}")
     }
     for address in addresses:
         folder = address[: address.rfind("/") + 1]
-        if folder in bags:
+        if folder in bag_folders:
             # a ROS 2 bag is one log, at the place of its metadata file in the listing
             if address == folder + BAG_METADATA:
                 yield FoundLog(folder, folder)
@@ -261,24 +261,22 @@ def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
 
     A damaged data set is one log, and its row reports the error, so that a batch skips no log silently.
     """
-    whole = _log_at(path, folder)
+    log = _log_at(path, folder)
     try:
         data_set = open_data_set(path)
     except LogError:
-        return [whole]
+        return [log]
     except SpatialReplayError:
         return []
     episodes = () if data_set is None else data_set.episodes
-    return [
-        FoundLog(f"{whole.name}#{episode.number}", f"{whole.path}#{episode.number}") for episode in episodes
-    ]
+    return [FoundLog(f"{log.name}#{episode.number}", f"{log.path}#{episode.number}") for episode in episodes]
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
     """Yield the logs in a folder: bags, episodes, files with the ending of a log, unreadable folders."""
-    closed: list[OSError] = []
-    for parent, folders, names in os.walk(path, onerror=closed.append):
-        if BAG_METADATA in names:
+    errors: list[OSError] = []
+    for parent, folders, file_names in os.walk(path, onerror=errors.append):
+        if BAG_METADATA in file_names:
             yield _log_at(Path(parent), folder)
             folders.clear()
             continue
@@ -289,20 +287,20 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
         # `os.walk` visits the remaining folders in this order
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         parent_log = _log_at(Path(parent), folder)
-        for name in sorted(names):
+        for name in sorted(file_names):
             if name.lower().endswith(LOG_ENDINGS) and not name.startswith("."):
                 # joined as text, because building `Path` objects would take most of the time
-                path_name = name if parent_log.name == "." else f"{parent_log.name}/{name}"
-                yield FoundLog(encodable(path_name), f"{parent_log.path}/{name}")
+                log_name = name if parent_log.name == "." else f"{parent_log.name}/{name}"
+                yield FoundLog(encodable(log_name), f"{parent_log.path}/{name}")
             elif name.lower().endswith(DATA_SET_ENDINGS) and not name.startswith("."):
                 yield from _episodes_in(Path(parent) / name, folder)
     # the row of an unreadable folder reports the error, so that a batch skips no log silently
-    yield from (_log_at(Path(error.filename), folder) for error in closed)
+    yield from (_log_at(Path(error.filename), folder) for error in errors)
 
 
 def _log_at(path: Path, folder: Path) -> FoundLog:
-    name = path.relative_to(folder) if path.is_relative_to(folder) else path
-    return FoundLog(encodable(name.as_posix()), str(path))
+    relative_path = path.relative_to(folder) if path.is_relative_to(folder) else path
+    return FoundLog(encodable(relative_path.as_posix()), str(path))
 
 
 def _nothing(text: str, folder: Path) -> str:
@@ -351,9 +349,9 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
                     faults.add(line)
             else:
                 if len(logs) < case.at_least_logs:
-                    place, count = case.place("at_least_logs"), plural(len(logs), "log")
+                    place, count_text = case.place("at_least_logs"), plural(len(logs), "log")
                     faults.add(
-                        f"{place}{count}, and at_least_logs is {case.at_least_logs}; check the patterns"
+                        f"{place}{count_text}, and at_least_logs is {case.at_least_logs}; check the patterns"
                     )
             cases.append(PreparedCase(case, tuple(logs), _files(case, suite.folder, texts, faults)))
     faults.check()
@@ -373,26 +371,26 @@ class _Faults:
 
     def check(self) -> None:
         """Raise all faults, if there are any."""
-        name = "" if self.suite.path is None else self.suite.path.name
-        lines = [*(f"{name}:{line}: {fault}" for line, fault in self.suite.faults), *self.lines]
-        if self.diagnoses and not lines:
+        suite_name = "" if self.suite.path is None else self.suite.path.name
+        fault_lines = [*(f"{suite_name}:{line}: {fault}" for line, fault in self.suite.faults), *self.lines]
+        if self.diagnoses and not fault_lines:
             raise SpecificationError(list(self.diagnoses.values()))
-        if lines:
-            lines = [*sorted(lines, key=self._line), *map(_in_one_line, self.diagnoses.values())]
-            raise UsageError("\n".join(first_lines(lines, MOST_FAULTS)))
+        if fault_lines:
+            fault_lines = [*sorted(fault_lines, key=self._line), *map(_in_one_line, self.diagnoses.values())]
+            raise UsageError("\n".join(first_lines(fault_lines, MOST_FAULTS)))
 
     def _line(self, fault: str) -> float:
         """Return the line of a fault in the suite; infinity for faults of other files, which come last."""
-        name, _, rest = fault.partition(":")
-        number = rest.partition(":")[0]
-        is_own = self.suite.path is not None and name == self.suite.path.name and number.isdecimal()
-        return int(number) if is_own else float("inf")
+        file_name, _, position = fault.partition(":")
+        line_text = position.partition(":")[0]
+        is_own = self.suite.path is not None and file_name == self.suite.path.name and line_text.isdecimal()
+        return int(line_text) if is_own else float("inf")
 
 
 def _in_one_line(diagnosis: Diagnosis) -> str:
     """Return an error of a specification in one line, without the quoted source and its caret."""
-    head, hint = str(diagnosis).split("\n")[0], getattr(diagnosis, "hint", "")
-    return f"{head}; {hint}" if hint else head
+    first_line, hint = str(diagnosis).split("\n")[0], getattr(diagnosis, "hint", "")
+    return f"{first_line}; {hint}" if hint else first_line
 
 
 def _files(
@@ -418,16 +416,16 @@ def _files(
     if not case.is_whole or len(case_texts) < len(case.specs):
         return ()
     try:
-        parsed = parsed_specifications(case_texts, case.conditions)
+        files = parsed_specifications(case_texts, case.conditions)
     except SpecificationError as error:
         faults.diagnoses.update((str(diagnosis), diagnosis) for diagnosis in error.diagnoses)
         return ()
     except UsageError as error:
         faults.add(f"{case.place('constants')}{error}")
         return ()
-    for fault in choice_faults(case, parsed):
+    for fault in choice_faults(case, files):
         faults.add(f"{case.place('each')}{fault}")
-    return tuple(spec_file(*file, folder) for file in zip(case.specs, case_texts, parsed, strict=True))
+    return tuple(spec_file(*file, folder) for file in zip(case.specs, case_texts, files, strict=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -511,41 +509,47 @@ def run_batch(
         paths = list(dict.fromkeys(log.path for case in cases for log in case.logs))
         identities, states = identify(paths, known_identities, workers, progress)
         requests = _requests(cases, identities)
-        by_state = {
+        identities_by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
         # before the evaluation, so that a killed batch need not hash the logs again
-        folder.write_identities(by_state)
-        lasting = {
+        folder.write_identities(identities_by_state)
+        storable_keys = {
             request.key for request in requests if request.key is not None and not request.file.has_plugins
         }
-        stored, damaged = folder.rows(lasting)
-        tasks = _tasks(requests, set(stored.column("key").to_pylist()))
-        unstored: dict[str, Sequence[ResultRow]] = {}
+        stored_rows, damage_remarks = folder.rows(storable_keys)
+        tasks = _tasks(requests, set(stored_rows.column("key").to_pylist()))
+        unstored_rows: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
             for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
-                now = states_of([task.log for task in group])
+                states_now = states_of([task.log for task in group])
                 for task, rows_of_log in zip(group, rows_of_group, strict=True):
                     # rows of a log that has changed are not stored; remote readers check versions
-                    is_same = now[task.log] == states[task.log]
+                    is_unchanged = states_now[task.log] == states[task.log]
                     for key, rows in zip(tasks[task], rows_of_log, strict=True):
                         # an error may be temporary, so its rows are not stored
-                        if is_same and key in lasting and all(row.error is None for row in rows):
+                        if is_unchanged and key in storable_keys and all(row.error is None for row in rows):
                             new_rows.add(key, rows)
                         else:
-                            unstored[key] = rows
+                            unstored_rows[key] = rows
                 advance(len(group))
-        table = _table(requests, [stored, *new_rows.tables], unstored, fail_on)
+        table = _table(requests, [stored_rows, *new_rows.tables], unstored_rows, fail_on)
         explanations = folder.read_explanations()
-        names = zip(*(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True)
-        places = {place: explanations[name] for place, name in enumerate(names) if name in explanations}
-        table = _record_of(requests).store_in(with_explanations(table, places))
+        result_names = zip(
+            *(table.column(name).to_pylist() for name in ("key", "spec", "object")), strict=True
+        )
+        explanations_by_place = {
+            place: explanations[result_name]
+            for place, result_name in enumerate(result_names)
+            if result_name in explanations
+        }
+        table = _record_of(requests).store_in(with_explanations(table, explanations_by_place))
         folder.write_run(table)
     # an unreadable log has no key, but its evaluation was tried
-    evaluated = {task.log for task in tasks} | {
+    evaluated_logs = {task.log for task in tasks} | {
         request.log.path for request in requests if request.key is None
     }
-    return BatchResult(table, len(paths), len(evaluated), tuple(requests), (*remarks, *damaged))
+    return BatchResult(table, len(paths), len(evaluated_logs), tuple(requests), (*remarks, *damage_remarks))
 
 
 _GROUP_S: Final = 0.5
@@ -560,15 +564,15 @@ def _evaluated_groups(
     workers: Workers, tasks: Sequence[Task]
 ) -> Iterator[tuple[Sequence[Task], Sequence[TaskRows]]]:
     """Yield groups of tasks with their rows. Logs of a worker that died are evaluated again, one by one."""
-    groups = _Groups(tasks)
-    again: list[tuple[Task, ...]] = []
-    for several in (groups, again):
-        for group, rows in workers.results(rows_from_tasks, several) if several else ():
+    sized_groups = _Groups(tasks)
+    single_tasks: list[tuple[Task, ...]] = []
+    for task_groups in (sized_groups, single_tasks):
+        for group, rows in workers.results(rows_from_tasks, task_groups) if task_groups else ():
             if not isinstance(rows, WorkerLost):
-                groups.note(rows)
+                sized_groups.note(rows)
                 yield group, rows
             elif len(group) > 1:
-                again += [(task,) for task in group]
+                single_tasks += [(task,) for task in group]
             else:
                 yield group, [error_rows(group[0], str(rows), "machine")]
 
@@ -577,36 +581,36 @@ class _Groups:
     """Tasks in groups, sized by the evaluation time of earlier logs."""
 
     def __init__(self, tasks: Sequence[Task]) -> None:
-        self._tasks, self._size = tasks, 1
+        self._tasks, self._group_size = tasks, 1
 
     def __iter__(self) -> Iterator[tuple[Task, ...]]:
-        begin = 0
-        while begin < len(self._tasks):
-            end = begin + self._size
-            yield tuple(self._tasks[begin:end])
-            begin = end
+        start = 0
+        while start < len(self._tasks):
+            end = start + self._group_size
+            yield tuple(self._tasks[start:end])
+            start = end
 
     def note(self, rows: Iterable[TaskRows]) -> None:
         """Adapt the size of the next group to the time per log of a finished group."""
-        seconds = [
+        durations_s = [
             rows_of_log[0][0].seconds
             for rows_of_log in rows
             if rows_of_log[0] and rows_of_log[0][0].error is None
         ]
-        if seconds:
-            size = int(_GROUP_S / max(sum(seconds) / len(seconds), 1e-6))
-            self._size = max(1, min(size, _GROWTH * len(seconds), _MOST_IN_GROUP))
+        if durations_s:
+            size = int(_GROUP_S / max(sum(durations_s) / len(durations_s), 1e-6))
+            self._group_size = max(1, min(size, _GROWTH * len(durations_s), _MOST_IN_GROUP))
 
 
 def _requests(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[RowRequest]:
     requests = []
-    for prepared in cases:
-        case = prepared.case
-        conditions = _key_of(case.conditions)
-        for log in prepared.logs:
+    for prepared_case in cases:
+        case = prepared_case.case
+        condition_values = _key_of(case.conditions)
+        for log in prepared_case.logs:
             identity = identities[log.path]
-            for file in prepared.files:
-                key = _key(identity, conditions, file.hash)
+            for file in prepared_case.files:
+                key = _key(identity, condition_values, file.hash)
                 requests.append(RowRequest(case, log, file, None if identity is None else key))
     return requests
 
@@ -618,8 +622,8 @@ def row_key(identity: str, conditions: Conditions, meaning: str) -> str:
 
 def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
     # another version of the program may give other results
-    parts = [FORMAT, __version__, identity, conditions, meaning]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:HASH_DIGITS]
+    key_values = [FORMAT, __version__, identity, conditions, meaning]
+    return hashlib.sha256(json.dumps(key_values).encode()).hexdigest()[:HASH_DIGITS]
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
@@ -638,44 +642,44 @@ def _key_of(conditions: Conditions) -> list[Any]:
     ]
 
 
-def _tasks(requests: Sequence[RowRequest], stored: set[str]) -> dict[Task, tuple[str, ...]]:
+def _tasks(requests: Sequence[RowRequest], stored_keys: set[str]) -> dict[Task, tuple[str, ...]]:
     """Return one task per log and conditions with missing rows, and the keys of these rows."""
-    groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
-    keys = set(stored)
+    files_by_task: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
+    known_keys = set(stored_keys)
     for request in requests:
-        if request.key is not None and request.key not in keys:
-            keys.add(request.key)
-            groups[request.log.path, request.case.conditions][request.key] = request.file
+        if request.key is not None and request.key not in known_keys:
+            known_keys.add(request.key)
+            files_by_task[request.log.path, request.case.conditions][request.key] = request.file
     return {
         Task(path, tuple(file.text for file in files.values()), conditions): tuple(files)
-        for (path, conditions), files in groups.items()
+        for (path, conditions), files in files_by_task.items()
     }
 
 
 def _table(
     requests: Sequence[RowRequest],
-    stored: Sequence[pa.Table],
-    unstored: Mapping[str, Sequence[ResultRow]],
+    stored_tables: Sequence[pa.Table],
+    unstored_rows: Mapping[str, Sequence[ResultRow]],
     fail_on: frozenset[str],
 ) -> pa.Table:
     """Return the table of a run: the rows of all requests."""
     import pyarrow as pa
 
-    unreadable = {
+    unreadable_rows = {
         f"{request.log.path}\0{request.file.hash}": _unreadable(request)
         for request in requests
         if request.key is None
     }
-    rows = pa.concat_tables([*stored, table_of({**unstored, **unreadable})])
-    places: dict[str, list[int]] = defaultdict(list)
-    for place, key in enumerate(rows.column("key").to_pylist()):
-        places[key].append(place)
-    indices, row_requests = [], []
+    all_rows = pa.concat_tables([*stored_tables, table_of({**unstored_rows, **unreadable_rows})])
+    rows_by_key: dict[str, list[int]] = defaultdict(list)
+    for row, key in enumerate(all_rows.column("key").to_pylist()):
+        rows_by_key[key].append(row)
+    row_indices, row_requests = [], []
     for request in requests:
-        for place in places[request.key or f"{request.log.path}\0{request.file.hash}"]:
-            indices.append(place)
+        for row in rows_by_key[request.key or f"{request.log.path}\0{request.file.hash}"]:
+            row_indices.append(row)
             row_requests.append(request)
-    request_rows = rows.take(pa.array(indices, pa.int64()))
+    request_rows = all_rows.take(pa.array(row_indices, pa.int64()))
     return _judge_rows(_restore_file_names(request_rows, row_requests), row_requests, fail_on)
 
 
@@ -702,17 +706,19 @@ def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Ta
     """Return rows whose texts name the requested file, not another file of the same content."""
     import pyarrow as pa
 
-    sources = rows.column(SOURCE).to_pylist()
-    names = [encodable(log_file(request.log.path).name) for request in requests]
-    renamed = [
-        place for place, (old, new) in enumerate(zip(sources, names, strict=True)) if old not in (None, new)
+    stored_names = rows.column(SOURCE).to_pylist()
+    requested_names = [encodable(log_file(request.log.path).name) for request in requests]
+    changed_rows = [
+        row
+        for row, (old, new) in enumerate(zip(stored_names, requested_names, strict=True))
+        if old not in (None, new)
     ]
-    if not renamed:
+    if not changed_rows:
         return rows
     for column in ("faults", "remarks", "missing", "error"):
         texts = rows.column(column).to_pylist()
-        for place in renamed:
-            texts[place] = _rename_file(texts[place], sources[place], names[place])
+        for row in changed_rows:
+            texts[row] = _rename_file(texts[row], stored_names[row], requested_names[row])
         field = rows.schema.field(column)
         rows = rows.set_column(rows.schema.get_field_index(column), field, pa.array(texts, field.type))
     return rows
@@ -740,9 +746,9 @@ def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozens
     """Return the table of a run: rows with their requests and failures."""
     import pyarrow as pa
 
-    names = rows.column("spec").to_pylist()
+    specs = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
-    judged = rows.select(_JUDGED).to_pylist()
+    judged_values = rows.select(_JUDGED).to_pylist()
     # by identity, because the hash of a `SpecFile` covers its whole text
     lines = {id(request.file): dict(request.file.lines) for request in requests}
     meanings = {id(request.file): dict(request.file.meanings) for request in requests}
@@ -750,20 +756,20 @@ def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozens
     columns |= {
         "verdict": [
             request.case.expectation.verdict_of(row["verdict"], _lower(row))
-            for row, request in zip(judged, requests, strict=True)
+            for row, request in zip(judged_values, requests, strict=True)
         ],
         "case": [request.case.name for request in requests],
         "log": [request.log.name for request in requests],
         "file": [request.file.name for request in requests],
         "meaning": [
-            meanings[id(request.file)].get(name) for request, name in zip(requests, names, strict=True)
+            meanings[id(request.file)].get(name) for request, name in zip(requests, specs, strict=True)
         ],
         "expected": [request.case.expectation.text for request in requests],
         "failure": [
             _failure(row, request.case.expectation, fail_on)
-            for row, request in zip(judged, requests, strict=True)
+            for row, request in zip(judged_values, requests, strict=True)
         ],
-        "line": [lines[id(request.file)].get(name, 1) for request, name in zip(requests, names, strict=True)],
+        "line": [lines[id(request.file)].get(name, 1) for request, name in zip(requests, specs, strict=True)],
         "requirement": [
             requirement or ", ".join(request.case.requirements) or None
             for requirement, request in requirements

@@ -97,8 +97,8 @@ def robustness_of(row: Values) -> str:
     """Return the robustness of a row with its interval; "" for an error."""
     if row["verdict"] is None:
         return ""
-    names = "robustness", "lower", "upper"
-    robustness, lower, upper = (math.nan if row[name] is None else row[name] for name in names)
+    columns = "robustness", "lower", "upper"
+    robustness, lower, upper = (math.nan if row[name] is None else row[name] for name in columns)
     return interval_text(robustness, lower, upper, row["unit"] or "")
 
 
@@ -117,26 +117,26 @@ def damage_word(row: Values) -> str:
 
 def summary_text(table: pa.Table) -> str:
     """Return a line that counts the results of a table by verdict, and the expected ones among them."""
-    passed, total, damaged = Counter[str](), Counter[str](), 0
-    names = ("verdict", "error", "failure", "faults")
-    for values in zip(*(table.column(name).to_pylist() for name in names), strict=True):
-        row = dict(zip(names, values, strict=True))
-        word = verdict_word(row)
-        total[word] += 1
-        passed[word] += row["failure"] is None
-        damaged += bool(damage_word(row))
-    parts = [
-        _count_text(f"{total[name]:,} {name}", total[name], passed[name])
+    passes, counts, damaged_count = Counter[str](), Counter[str](), 0
+    columns = ("verdict", "error", "failure", "faults")
+    for values in zip(*(table.column(name).to_pylist() for name in columns), strict=True):
+        row = dict(zip(columns, values, strict=True))
+        verdict = verdict_word(row)
+        counts[verdict] += 1
+        passes[verdict] += row["failure"] is None
+        damaged_count += bool(damage_word(row))
+    count_texts = [
+        _count_text(f"{counts[name]:,} {name}", counts[name], passes[name])
         if name not in ("satisfied", *_WORDS)
-        else f"{total[name]:,} {_WORDS.get(name, name)}"
-        + (f" ({bad:,} failed)" if name == "satisfied" and (bad := total[name] - passed[name]) else "")
+        else f"{counts[name]:,} {_WORDS.get(name, name)}"
+        + (f" ({failed:,} failed)" if name == "satisfied" and (failed := counts[name] - passes[name]) else "")
         for name in VERDICTS
-        if total[name]
+        if counts[name]
     ]
-    parts += [plural(total["error"], "error")] if total["error"] else []
-    parts += [f"{total['gone']:,} gone"] if total["gone"] else []
-    parts += [f"{damaged:,} of damaged logs"] if damaged else []
-    return f"{plural(len(table), 'result')}: {', '.join(parts) or 'none'}"
+    count_texts += [plural(counts["error"], "error")] if counts["error"] else []
+    count_texts += [f"{counts['gone']:,} gone"] if counts["gone"] else []
+    count_texts += [f"{damaged_count:,} of damaged logs"] if damaged_count else []
+    return f"{plural(len(table), 'result')}: {', '.join(count_texts) or 'none'}"
 
 
 def _count_text(text: str, total: int, passed: int) -> str:
@@ -151,40 +151,40 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    verdict, number = table.column("verdict"), table.column("robustness")
+    verdicts, robustness = table.column("verdict"), table.column("robustness")
     columns = {name: table.column(name) for name in _GROUPS[by]}
     for word, beginning in _WORDS.items():
-        is_meant = pc.fill_null(pc.starts_with(table.column("failure"), beginning), False)
-        verdict = pc.if_else(is_meant, word, verdict)
-    counted = {name: pc.equal(verdict, name) for name in VERDICTS}
-    counted |= {
+        has_word = pc.fill_null(pc.starts_with(table.column("failure"), beginning), False)
+        verdicts = pc.if_else(has_word, word, verdicts)
+    flags = {name: pc.equal(verdicts, name) for name in VERDICTS}
+    flags |= {
         "errors": pc.is_valid(table.column("error")),
         "failures": pc.is_valid(table.column("failure")),
     }
     if WORSE in table.column_names:
         worse, edited = table.column(WORSE), table.column(EDITED)
-        counted["worse"] = pc.and_not(worse, edited)
-        counted["worse_edited"] = pc.and_(worse, edited)
+        flags["worse"] = pc.and_not(worse, edited)
+        flags["worse_edited"] = pc.and_(worse, edited)
         columns["edited"] = edited
-    columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
-    columns["least"] = number
-    sums = [(f"n_{name}", "sum") for name in counted]
-    about = ("requirement", "title", "unit") if by == "spec" else ()
-    columns |= {name: table.column(name) for name in about}
+    columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in flags.items()}
+    columns["least"] = robustness
+    aggregations = [(f"n_{name}", "sum") for name in flags]
+    spec_columns = ("requirement", "title", "unit") if by == "spec" else ()
+    columns |= {name: table.column(name) for name in spec_columns}
     # the first value is the current one: rows of gone results come last, with values of the baseline
-    sums += [(name, "first") for name in about]
-    sums += [("edited", "max")] if "edited" in columns else []
+    aggregations += [(name, "first") for name in spec_columns]
+    aggregations += [("edited", "max")] if "edited" in columns else []
     # with several threads, pyarrow's TableGroupBy does not keep the order of the rows
-    grouped = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
+    groups = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
     return [
         Total(
             {name: row[name] for name in _GROUPS[by]},
-            **{name: row[f"n_{name}_sum"] for name in counted},
+            **{name: row[f"n_{name}_sum"] for name in flags},
             least=row["least_min"],
             is_edited=bool(row.get("edited_max")),
-            **{name: row[f"{name}_first"] for name in about},
+            **{name: row[f"{name}_first"] for name in spec_columns},
         )
-        for row in grouped.aggregate([*sums, ("least", "min")]).to_pylist()
+        for row in groups.aggregate([*aggregations, ("least", "min")]).to_pylist()
     ]
 
 
@@ -217,27 +217,29 @@ RUN: Final = re.compile(r"#\d+(?=[./])")
 
 def flaky_results(table: pa.Table) -> list[FlakyResult]:
     """Return the flaky results of repeated runs. Names of such logs differ only in a number after "#"."""
-    failures: dict[Key, list[bool]] = defaultdict(list)
+    failures_by_result: dict[Key, list[bool]] = defaultdict(list)
     for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
         case, log, file, spec, object_name = key
-        name = RUN.sub("", log)
-        if name != log:
-            failures[case, name, file, spec, object_name].append(failure is not None)
+        log_name = RUN.sub("", log)
+        if log_name != log:
+            failures_by_result[case, log_name, file, spec, object_name].append(failure is not None)
     return [
         FlakyResult(*key, sum(failed), len(failed))
-        for key, failed in failures.items()
+        for key, failed in failures_by_result.items()
         if 0 < sum(failed) < len(failed)
     ]
 
 
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
     """Return the columns of counts by heading. Columns of rare words are left out if all counts are 0."""
-    names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
+    attributes = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
     if any(row.worse is not None for row in rows):
-        names |= {"worse": "worse", "edited": "worse_edited"}
-    counts = {head: [getattr(row, name) or 0 for row in rows] for head, name in names.items()}
+        attributes |= {"worse": "worse", "edited": "worse_edited"}
+    columns = {heading: [getattr(row, name) or 0 for row in rows] for heading, name in attributes.items()}
     return {
-        head: numbers for head, numbers in counts.items() if head not in (*_WORDS, "edited") or any(numbers)
+        heading: counts
+        for heading, counts in columns.items()
+        if heading not in (*_WORDS, "edited") or any(counts)
     }
 
 
@@ -252,11 +254,11 @@ def worst_rows(table: pa.Table, count: int) -> list[Values]:
     units = pc.fill_null(table.column("unit"), "")
     ranked_rows: list[tuple[tuple[bool, int, int], Values]] = []
     for unit in units.unique():
-        places = Counter[tuple[bool, int]]()
+        row_counts = Counter[tuple[bool, int]]()
         for row in _worst_of_unit(table.filter(pc.equal(units, unit)), count):
             rank = (row["failure"] is None, RANKS[row["verdict"]])
-            ranked_rows.append(((*rank, places[rank]), row))
-            places[rank] += 1
+            ranked_rows.append(((*rank, row_counts[rank]), row))
+            row_counts[rank] += 1
     return [row for _, row in sorted(ranked_rows, key=itemgetter(0))[:count]]
 
 
@@ -264,16 +266,16 @@ def _worst_of_unit(table: pa.Table, count: int) -> list[Values]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    verdict = table.column("verdict")
-    rank = pc.index_in(verdict, pa.array(list(RANKS), pa.string()))
+    verdicts = table.column("verdict")
+    ranks = pc.index_in(verdicts, pa.array(list(RANKS), pa.string()))
     passes = pc.cast(pc.is_null(table.column("failure")), pa.int8())
     # rows of equal robustness keep their order
-    order = pa.table(
-        {"passes": passes, "rank": rank, "number": table.column("robustness"), "place": range(len(table))}
+    sort_table = pa.table(
+        {"passes": passes, "rank": ranks, "number": table.column("robustness"), "place": range(len(table))}
     )
-    keys = [(name, "ascending") for name in order.column_names]
-    worst = table.take(pc.sort_indices(order, sort_keys=keys).slice(0, count))
-    return cast("list[Values]", worst.to_pylist())
+    sort_columns = [(name, "ascending") for name in sort_table.column_names]
+    worst_table = table.take(pc.sort_indices(sort_table, sort_keys=sort_columns).slice(0, count))
+    return cast("list[Values]", worst_table.to_pylist())
 
 
 def rows_where(table: pa.Table, condition: str) -> pa.Table:
@@ -291,14 +293,14 @@ def rows_where(table: pa.Table, condition: str) -> pa.Table:
     if len(condition) > _LONGEST_CONDITION:
         raise UsageError(f"--where is longer than {_LONGEST_CONDITION:,} characters")
     try:
-        parsed = ast.parse(condition.strip(), mode="eval").body
+        syntax_tree = ast.parse(condition.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         if _SINGLE_EQUALS.search(condition):
-            doubled = _SINGLE_EQUALS.sub("==", condition)[:200]
-            raise UsageError(f"--where compares with ==; write {doubled!r}") from None
+            corrected = _SINGLE_EQUALS.sub("==", condition)[:200]
+            raise UsageError(f"--where compares with ==; write {corrected!r}") from None
         raise UsageError(_no_condition(condition)) from None
     try:
-        return table.filter(_Condition(table.column_names, condition, ds.field).of(parsed))
+        return table.filter(_Condition(table.column_names, condition, ds.field).of(syntax_tree))
     except pa.ArrowException as error:
         reason = str(error).splitlines()[0]
         raise UsageError(f"--where {condition!r} compares different kinds of values: {reason}") from None
@@ -362,9 +364,9 @@ class _Condition:
     def of(self, node: ast.expr) -> Any:
         """Return the Arrow expression of a condition."""
         match node:
-            case ast.BoolOp(op=op, values=[first, *rest]):
-                joined = self.of(first)
-                for operand in rest:
+            case ast.BoolOp(op=op, values=[first_operand, *other_operands]):
+                joined = self.of(first_operand)
+                for operand in other_operands:
                     joined = (
                         joined & self.of(operand) if isinstance(op, ast.And) else joined | self.of(operand)
                     )
@@ -372,11 +374,11 @@ class _Condition:
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return ~self.of(operand)
             case ast.Compare(
-                left=ast.Constant(value=str(part)), ops=[ast.In()], comparators=[ast.Name() as name]
+                left=ast.Constant(value=str(substring)), ops=[ast.In()], comparators=[ast.Name() as name]
             ):
                 import pyarrow.compute as pc
 
-                return pc.match_substring(self._column(name), part)
+                return pc.match_substring(self._column(name), substring)
             case ast.Compare(left=ast.Name() as name, ops=[op], comparators=[value]) if (
                 type(op) in _COMPARISONS
             ):
@@ -473,14 +475,14 @@ class Tolerance:
         units_of_results = sorted({unit for unit in units if unit and unit != "1"})
         if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):
             return
-        place = f"is in {', '.join(units_of_results)}" if units_of_results else "has no unit"
+        unit_text = f"is in {', '.join(units_of_results)}" if units_of_results else "has no unit"
         amount = f"{self.amount:g}{units_of_results[0] if units_of_results else ''}"
         remedy = (
             f"write at least {amount}"
             if self.share
             else f"write {amount}, or {self.amount:g}% for a part of it"
         )
-        raise UsageError(f"--tolerance {self.amount:g}{self.unit}: robustness {place}; {remedy}")
+        raise UsageError(f"--tolerance {self.amount:g}{self.unit}: robustness {unit_text}; {remedy}")
 
     def allows(self, before: float | None, now: float | None, unit: str = "") -> bool:
         """Return whether a loss of robustness is within the tolerance.
@@ -557,9 +559,9 @@ def compare(
     """
     units = dict(zip(keys_of(table), table.column("unit").to_pylist(), strict=True))
     tolerance.check(units.values())
-    edited = set(edited_specs(table, baseline))
+    edited_names = set(edited_specs(table, baseline))
     differences = [
-        replace(difference, is_edited=(difference.case, difference.file, difference.spec) in edited)
+        replace(difference, is_edited=(difference.case, difference.file, difference.spec) in edited_names)
         for difference in _differences(_by_key(table), _by_key(baseline), tolerance, units)
         if with_all or difference.change not in ("more", "new")
     ]
@@ -572,12 +574,12 @@ def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, st
     """Return case, file and name of each spec whose meaning differs from the baseline."""
 
     def meanings(rows: pa.Table) -> dict[tuple[str, str, str], str | None]:
-        names, hashes = ("case", "file", "spec"), rows.column("meaning").to_pylist()
-        keys = zip(*(rows.column(name).to_pylist() for name in names), strict=True)
+        columns, hashes = ("case", "file", "spec"), rows.column("meaning").to_pylist()
+        keys = zip(*(rows.column(name).to_pylist() for name in columns), strict=True)
         return dict(zip(keys, hashes, strict=True))
 
-    before = meanings(baseline)
-    return [spec for spec, meaning in meanings(table).items() if before.get(spec, meaning) != meaning]
+    old_hashes = meanings(baseline)
+    return [spec for spec, meaning in meanings(table).items() if old_hashes.get(spec, meaning) != meaning]
 
 
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
@@ -591,36 +593,38 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
     """
     import pyarrow as pa
 
-    before, keys = _by_key(baseline), keys_of(table)
-    worse: dict[Key, list[str]] = defaultdict(list)
-    edited = set(edited_specs(table, baseline))
-    present, gone = set(keys), []
+    baseline_results, keys = _by_key(baseline), keys_of(table)
+    worse_texts: dict[Key, list[str]] = defaultdict(list)
+    edited_names = set(edited_specs(table, baseline))
+    present_keys, gone_results = set(keys), []
     for difference in differences:
         if difference.change == "gone":
-            gone.append(difference)
+            gone_results.append(difference)
         elif difference.fails:
             # one row with an error stands for all objects of a template
-            key = difference.key if difference.key in present else (*difference.key[:-1], None)
+            key = difference.key if difference.key in present_keys else (*difference.key[:-1], None)
             beginning = EDITED_SINCE if difference.is_edited else WORSE_THAN
-            worse[key].append(f"{beginning}: {difference.failure}")
+            worse_texts[key].append(f"{beginning}: {difference.failure}")
     failures = [
-        "; ".join(filter(None, [failure, *worse.get(key, ())])) or None
+        "; ".join(filter(None, [failure, *worse_texts.get(key, ())])) or None
         for key, failure in zip(keys, table.column("failure").to_pylist(), strict=True)
     ]
-    place = table.schema.get_field_index("failure")
-    table = table.set_column(place, table.schema.field(place), pa.array(failures, pa.string()))
-    was = [before.get(key, (None, None)) for key in keys]
-    for name, kind, values in (
-        (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in was]),
-        (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in was]),
-        (WORSE, pa.bool_(), [key in worse for key in keys]),
-        (EDITED, pa.bool_(), [(case, file, spec) in edited for case, _, file, spec, _ in keys]),
+    index = table.schema.get_field_index("failure")
+    table = table.set_column(index, table.schema.field(index), pa.array(failures, pa.string()))
+    earlier_results = [baseline_results.get(key, (None, None)) for key in keys]
+    for name, column_type, values in (
+        (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in earlier_results]),
+        (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in earlier_results]),
+        (WORSE, pa.bool_(), [key in worse_texts for key in keys]),
+        (EDITED, pa.bool_(), [(case, file, spec) in edited_names for case, _, file, spec, _ in keys]),
     ):
-        table = table.append_column(name, pa.array(values, kind))
-    places = {key: place for place, key in enumerate(keys_of(baseline))} if gone else {}
-    rows = baseline.take(pa.array([places[result.key] for result in gone], pa.int64())).to_pylist()
-    missing = [_gone_row(row, result) for row, result in zip(rows, gone, strict=True)]
-    return pa.concat_tables([table, pa.Table.from_pylist(missing, table.schema)])
+        table = table.append_column(name, pa.array(values, column_type))
+    indices = {key: index for index, key in enumerate(keys_of(baseline))} if gone_results else {}
+    baseline_rows = baseline.take(
+        pa.array([indices[result.key] for result in gone_results], pa.int64())
+    ).to_pylist()
+    gone_rows = [_gone_row(row, result) for row, result in zip(baseline_rows, gone_results, strict=True)]
+    return pa.concat_tables([table, pa.Table.from_pylist(gone_rows, table.schema)])
 
 
 _LISTS: Final = (
@@ -640,9 +644,9 @@ _LISTS: Final = (
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     """Return the row of a gone result, given its row in the baseline."""
     copied_columns = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
-    nothing: dict[str, Any] = {name: [] for name in _LISTS}
+    empty_lists: dict[str, Any] = {name: [] for name in _LISTS}
     return {
-        **nothing,
+        **empty_lists,
         **{name: row.get(name) for name in copied_columns},
         "failure": f"{difference.failure} in the baseline",
         "reason": "",
@@ -660,44 +664,51 @@ def keys_of(table: pa.Table) -> list[Key]:
 
 
 def _by_key(table: pa.Table) -> dict[Key, tuple[str | None, float | None]]:
-    values = zip(table.column("verdict").to_pylist(), table.column("robustness").to_pylist(), strict=True)
-    return dict(zip(keys_of(table), values, strict=True))
+    results = zip(table.column("verdict").to_pylist(), table.column("robustness").to_pylist(), strict=True)
+    return dict(zip(keys_of(table), results, strict=True))
 
 
 def _differences(
-    now: dict[Key, tuple[str | None, float | None]],
-    before: dict[Key, tuple[str | None, float | None]],
+    current_results: dict[Key, tuple[str | None, float | None]],
+    earlier_results: dict[Key, tuple[str | None, float | None]],
     tolerance: Tolerance,
     units: Mapping[Key, str | None],
 ) -> Iterator[Difference]:
-    present = {key[:-1] for key in now}
-    for key, (old, old_number) in before.items():
+    spec_keys = {key[:-1] for key in current_results}
+    for key, (old_verdict, old_number) in earlier_results.items():
         # one row with an error stands for all objects of a template
-        result_now = now.get(key) or now.get((*key[:-1], None))
-        if result_now is None and old is None and key[:-1] in present:
+        current_result = current_results.get(key) or current_results.get((*key[:-1], None))
+        if current_result is None and old_verdict is None and key[:-1] in spec_keys:
             # the baseline had one row with an error for all objects, which have results now
             continue
-        if result_now is None:
+        if current_result is None:
             yield Difference(
-                "gone", *key, before=old, now=None, before_robustness=old_number, robustness=None
+                "gone", *key, before=old_verdict, now=None, before_robustness=old_number, robustness=None
             )
             continue
-        new, number = result_now
+        new_verdict, new_number = current_result
         change: Change | None = None
-        if new != old:
-            change = "verdict" if _ORDER[new] > _ORDER[old] else "better"
-        elif not tolerance.allows(old_number, number, units.get(key) or ""):
+        if new_verdict != old_verdict:
+            change = "verdict" if _ORDER[new_verdict] > _ORDER[old_verdict] else "better"
+        elif not tolerance.allows(old_number, new_number, units.get(key) or ""):
             change = "worse"
-        elif not tolerance.allows(number, old_number, units.get(key) or ""):
+        elif not tolerance.allows(new_number, old_number, units.get(key) or ""):
             change = "more"
         if change is not None:
             yield Difference(
-                change, *key, before=old, now=new, before_robustness=old_number, robustness=number
+                change,
+                *key,
+                before=old_verdict,
+                now=new_verdict,
+                before_robustness=old_number,
+                robustness=new_number,
             )
-    for key, (new, number) in now.items():
+    for key, (new_verdict, new_number) in current_results.items():
         # one row with an error for all objects of a template is no new result
-        if key not in before and not (new is None and key[-1] is None):
-            yield Difference("new", *key, before=None, now=new, before_robustness=None, robustness=number)
+        if key not in earlier_results and not (new_verdict is None and key[-1] is None):
+            yield Difference(
+                "new", *key, before=None, now=new_verdict, before_robustness=None, robustness=new_number
+            )
 
 
 def _least_first(number: float | None) -> float:
@@ -717,13 +728,13 @@ MOST_FLAKY: Final = 20
 
 def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
     """Return the headings of the number columns, and one row per total: three names, then the numbers."""
-    columns = counts_of(rows)
-    cells = []
-    for place, total in enumerate(rows):
+    counts_by_heading = counts_of(rows)
+    cell_rows = []
+    for index, total in enumerate(rows):
         spec = total.group["spec"] or total.group["file"]
         names = [total.group["case"], f"{spec} ({EDITED_SINCE})" if total.is_edited else spec, total.about]
-        counts = [f"{numbers[place]:,}" for numbers in columns.values()]
-        cells.append(
+        counts = [f"{numbers_of_totals[index]:,}" for numbers_of_totals in counts_by_heading.values()]
+        cell_rows.append(
             [*names, *counts, "" if total.least is None else with_unit(total.least, total.unit or "")]
         )
-    return [*columns, "least robustness"], cells
+    return [*counts_by_heading, "least robustness"], cell_rows

@@ -166,9 +166,9 @@ _DIGEST_BYTES: Final = 32
 def columns() -> pa.Schema:
     """Return the columns of stored rows: a key, and the fields of `ResultRow`."""
     pa = _pyarrow()
-    kinds = {"int": pa.int64(), "float": pa.float64(), "tuple[str, ...]": pa.list_(pa.string())}
+    arrow_types = {"int": pa.int64(), "float": pa.float64(), "tuple[str, ...]": pa.list_(pa.string())}
     types = {
-        column.name: kinds.get(str(column.type).removesuffix(" | None"), pa.string())
+        column.name: arrow_types.get(str(column.type).removesuffix(" | None"), pa.string())
         for column in fields(ResultRow)
     }
     return _schema([pa.field("key", pa.string(), nullable=False), *{**types, "line": pa.int32()}.items()])
@@ -177,35 +177,35 @@ def columns() -> pa.Schema:
 def run_columns() -> pa.Schema:
     """Return the columns of the table of a run: stored rows with their requests."""
     pa = _pyarrow()
-    text = pa.string()
-    run_columns = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
+    text_type = pa.string()
+    run_columns = [(name, text_type) for name in ("case", "log", "file", "meaning", "expected", "failure")]
     return _schema([*run_columns, *(column for column in columns() if column.name != SOURCE)])
 
 
 def _schema(columns: Sequence[Any]) -> pa.Schema:
     """Return a schema whose integers stay integers in pandas, also in columns with nulls."""
     schema = _pyarrow().schema(columns)
-    integers = [
+    integer_columns = [
         {"name": column.name, "field_name": column.name, "numpy_type": "Int64", "metadata": None}
         | {"pandas_type": "int64"}
         for column in schema
         if str(column.type) == "int64"
     ]
-    pandas = {"index_columns": [], "column_indexes": [], "columns": integers}
-    return schema.with_metadata({"pandas": json.dumps(pandas)})
+    pandas_metadata = {"index_columns": [], "column_indexes": [], "columns": integer_columns}
+    return schema.with_metadata({"pandas": json.dumps(pandas_metadata)})
 
 
 def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
     """Return rows by key as a table. Unknown numbers are null."""
     pa, schema = _pyarrow(), columns()
-    key, *values = schema
-    all_rows = [row for several in rows.values() for row in several]
-    arrays = [pa.array([key for key, several in rows.items() for _ in several], key.type)]
+    key, *value_columns = schema
+    all_rows = [row for rows_of_key in rows.values() for row in rows_of_key]
+    arrays = [pa.array([key for key, rows_of_key in rows.items() for _ in rows_of_key], key.type)]
     # column by column: three times as fast as row by row
     arrays += [
         # null instead of NaN, which DuckDB and polars sort above every number
         pa.array([getattr(row, column.name) for row in all_rows], column.type, from_pandas=True)
-        for column in values
+        for column in value_columns
     ]
     return pa.Table.from_arrays(arrays, schema=schema)
 
@@ -221,8 +221,8 @@ def _encode_table(table: pa.Table) -> bytes:
     # one combined chunk is written in a quarter of the time of many small ones
     parquet.write_table(table.combine_chunks(), stream, compression="zstd")
     data = stream.getvalue()
-    footer = _footer(data)
-    return data[:footer] + hashlib.sha256(data).digest() + data[footer:]
+    footer_start = _footer(data)
+    return data[:footer_start] + hashlib.sha256(data).digest() + data[footer_start:]
 
 
 def _decode_table(data: bytes) -> pa.Table:
@@ -233,14 +233,14 @@ def _decode_table(data: bytes) -> pa.Table:
     """
     from pyarrow import parquet
 
-    footer = _footer(data)
-    begin = max(0, footer - _DIGEST_BYTES)
-    digest, content = data[begin:footer], data[:begin] + data[footer:]
+    footer_start = _footer(data)
+    digest_start = max(0, footer_start - _DIGEST_BYTES)
+    digest, content = data[digest_start:footer_start], data[:digest_start] + data[footer_start:]
     if hashlib.sha256(content).digest() != digest:
         raise ValueError("it is damaged: its digest does not fit")
     # not `read_table`, which takes twice as long
-    with parquet.ParquetFile(_pyarrow().BufferReader(content)) as opened:
-        return opened.read(use_threads=False)
+    with parquet.ParquetFile(_pyarrow().BufferReader(content)) as parquet_file:
+        return parquet_file.read(use_threads=False)
 
 
 def _footer(data: bytes) -> int:
@@ -255,7 +255,7 @@ class NewRows:
         self._files = files
         self.tables: list[pa.Table] = []
         """Written rows."""
-        self._waiting: dict[str, Sequence[ResultRow]] = {}
+        self._waiting_rows: dict[str, Sequence[ResultRow]] = {}
         self._written_s = 0.0
 
     def add(self, key: str, rows: Sequence[ResultRow]) -> None:
@@ -264,17 +264,17 @@ class NewRows:
         Raises:
             OutputError: rows cannot be written.
         """
-        self._waiting[key] = rows
-        if len(self._waiting) >= _MOST_TOGETHER or time.monotonic() - self._written_s >= _LONGEST_WAIT_S:
+        self._waiting_rows[key] = rows
+        if len(self._waiting_rows) >= _MOST_TOGETHER or time.monotonic() - self._written_s >= _LONGEST_WAIT_S:
             self.write()
 
     def write(self) -> None:
         """Write the waiting rows, with the errors of `add`."""
-        if self._waiting:
-            table = table_of(self._waiting)
+        if self._waiting_rows:
+            table = table_of(self._waiting_rows)
             _write_rows(self._files, table)
             self.tables.append(table)
-        self._waiting.clear()
+        self._waiting_rows.clear()
         self._written_s = time.monotonic()
 
 
@@ -351,9 +351,9 @@ class ResultsFolder:
         Raises:
             OutputError: a file cannot be removed or written.
         """
-        tables, remarks, taken_keys, small = [columns().empty_table()], [], set[str](), {}
-        names = self._files.names(_ROWS)
-        for name, data in zip(names, self._files.read(names), strict=True):
+        tables, remarks, known_keys, small_tables = [columns().empty_table()], [], set[str](), {}
+        file_names = self._files.names(_ROWS)
+        for name, data in zip(file_names, self._files.read(file_names), strict=True):
             try:
                 table = self._table(name, data)
             except LogError as error:
@@ -362,13 +362,13 @@ class ResultsFolder:
                 continue
             keys = table.column("key").to_pylist()
             # two batches may have written the same rows into a bucket, which has no lock
-            new_keys = set(keys) - taken_keys
-            taken_keys |= new_keys
+            new_keys = set(keys) - known_keys
+            known_keys |= new_keys
             if len(new_keys) < _MOST_TOGETHER:
-                small[name] = table.filter([key in new_keys for key in keys])
+                small_tables[name] = table.filter([key in new_keys for key in keys])
             tables.append(table.filter([key in new_keys and key in lasting for key in keys]))
-        if len(small) > _MOST_SMALL:
-            self._join(small)
+        if len(small_tables) > _MOST_SMALL:
+            self._join(small_tables)
         return _pyarrow().concat_tables(tables), remarks
 
     def _join(self, tables: Mapping[str, pa.Table]) -> None:
@@ -415,7 +415,8 @@ class ResultsFolder:
             pairs = sorted(identities.items())
             names = ("state", "identity")
             columns = {
-                name: pa.array([pair[n] for pair in pairs], pa.string()) for n, name in enumerate(names)
+                name: pa.array([pair[index] for pair in pairs], pa.string())
+                for index, name in enumerate(names)
             }
             self._files.write(_IDENTITIES, _encode_table(pa.table(columns)))
 
@@ -451,8 +452,8 @@ class ResultsFolder:
             table = self._read(LAST_RUN)
         except (MissingFileError, LogError):
             return {}
-        is_known = pc.and_(pc.is_valid(table["explanation"]), pc.is_valid(table["verdict"]))
-        rows = table.filter(is_known).select(["key", "spec", "object", *EXPLANATION]).to_pylist()
+        has_explanation = pc.and_(pc.is_valid(table["explanation"]), pc.is_valid(table["verdict"]))
+        rows = table.filter(has_explanation).select(["key", "spec", "object", *EXPLANATION]).to_pylist()
         return {
             (row["key"], row["spec"], row["object"]): tuple(row[name] for name in EXPLANATION) for row in rows
         }

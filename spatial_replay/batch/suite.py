@@ -143,15 +143,15 @@ class Expectation:
     @property
     def text(self) -> str:
         """The expectation in words."""
-        unknown = " or unknown" if self.allow_unknown else ""
+        unknown_text = " or unknown" if self.allow_unknown else ""
         if self.at_least is not None:
-            return f"robustness of at least {self.at_least:.6g}{unknown}"
-        return f"{self.verdict}{unknown}"
+            return f"robustness of at least {self.at_least:.6g}{unknown_text}"
+        return f"{self.verdict}{unknown_text}"
 
     def verdict_of(self, verdict: str | None, lower: float) -> str | None:
         """Return the verdict of a result. A violation within the tolerance counts as satisfied."""
-        is_wanted = self.verdict is Verdict.SATISFIED and self.at_least is None and self.tolerance > 0.0
-        if is_wanted and verdict == Verdict.VIOLATED and lower >= -self.tolerance:
+        has_tolerance = self.verdict is Verdict.SATISFIED and self.at_least is None and self.tolerance > 0.0
+        if has_tolerance and verdict == Verdict.VIOLATED and lower >= -self.tolerance:
             return str(Verdict.SATISFIED)
         return verdict
 
@@ -304,21 +304,21 @@ def load_suite(path: str | PathLike[str]) -> Suite:
 
 def _cases(document: Document, faults: Mapping[Place, str], path: Path) -> Iterator[Case]:
     """Yield the cases of a suite, without faulty values."""
-    value = document.value if isinstance(document.value, dict) else {}
-    entries = value.get("cases")
-    wrong = {place[:end] for place in faults for end in range(1, len(place) + 1)}
-    for number, entry in enumerate(entries if isinstance(entries, list) else ()):
+    suite_values = document.value if isinstance(document.value, dict) else {}
+    entries = suite_values.get("cases")
+    faulty_places = {place[:end] for place in faults for end in range(1, len(place) + 1)}
+    for index, entry in enumerate(entries if isinstance(entries, list) else ()):
         if isinstance(entry, dict):
-            at: Place = ("cases", number)
-            places: dict[str, Place] = {key: (key,) for key in value if key != "cases"}
-            places |= {key: (*at, key) for key in entry}
-            yield _case({**value, **entry}, {"": at, **places}, wrong, document, path)
+            case_place: Place = ("cases", index)
+            places: dict[str, Place] = {key: (key,) for key in suite_values if key != "cases"}
+            places |= {key: (*case_place, key) for key in entry}
+            yield _case({**suite_values, **entry}, {"": case_place, **places}, faulty_places, document, path)
 
 
 def _case(
     entry: Mapping[str, Any],
     places: Mapping[str, Place],
-    wrong: AbstractSet[Place],
+    faults: AbstractSet[Place],
     document: Document,
     path: Path,
 ) -> Case:
@@ -329,19 +329,19 @@ def _case(
         wrong: places of faults, and all places that contain them.
     """
     folder = path.parent
-    lines = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
+    line_texts = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
 
     def texts_of(key: str) -> Iterator[tuple[Place, str]]:
         for number, value in enumerate(_as_list(entry.get(key))):
             place = (*places[key], number)
-            if isinstance(value, str) and place not in wrong:
+            if isinstance(value, str) and place not in faults:
                 yield place, value
 
     logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in texts_of("logs")]
     specs = dict.fromkeys(spec for _, spec in texts_of("specs"))
-    is_whole = bool(specs) and not any(places.get(key) in wrong for key in ("specs", "each", "constants"))
+    is_whole = bool(specs) and not any(places.get(key) in faults for key in ("specs", "each", "constants"))
     name = str(entry.get("name", ""))
-    entry = {key: value for key, value in entry.items() if places.get(key) not in wrong}
+    entry = {key: value for key, value in entry.items() if places.get(key) not in faults}
     mapping = entry.get("mapping")
     # YAML reads a time such as 5 as a number
     start, end = entry.get("from"), entry.get("to")
@@ -371,7 +371,7 @@ def _case(
         ),
         requirements=tuple(_as_list(entry.get("requirements"))),
         at_least_logs=entry.get("at_least_logs", 1),
-        places=tuple(lines.items()),
+        places=tuple(line_texts.items()),
         is_whole=is_whole,
     )
 
@@ -382,20 +382,23 @@ def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
         return
     yield from _wrong_values(value, (), folder)
     cases = value.get("cases")
-    first: dict[str, int] = {}
-    for number, entry in enumerate(cases if isinstance(cases, list) else ()):
+    first_indices: dict[str, int] = {}
+    for index, entry in enumerate(cases if isinstance(cases, list) else ()):
         if not isinstance(entry, dict):
             continue
-        yield from _wrong_values(entry, ("cases", number), folder)
+        yield from _wrong_values(entry, ("cases", index), folder)
         name = entry.get("name")
-        if isinstance(name, str) and first.setdefault(name, number) != number:
-            yield ("cases", number, "name"), f"there is a case {name[:60]!r} already; give it another name"
+        if isinstance(name, str) and first_indices.setdefault(name, index) != index:
+            yield ("cases", index, "name"), f"there is a case {name[:60]!r} already; give it another name"
         if "specs" not in entry and "specs" not in value:
-            yield ("cases", number), "it has no specs; give it some, or the whole suite"
-        both = {**value, **entry}
-        if both.get("expect", "satisfied") != "satisfied" and "at_least" in both:
-            what = f"at_least is a least robustness, and {both['expect']} results are expected; remove one"
-            yield ("cases", number, "at_least"), what
+            yield ("cases", index), "it has no specs; give it some, or the whole suite"
+        case_values = {**value, **entry}
+        if case_values.get("expect", "satisfied") != "satisfied" and "at_least" in case_values:
+            message = (
+                f"at_least is a least robustness, and {case_values['expect']} results are expected; "
+                "remove one"
+            )
+            yield ("cases", index, "at_least"), message
 
 
 def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Iterator[tuple[Place, str]]:
@@ -407,13 +410,14 @@ def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Itera
             except UsageError as error:
                 yield (*place, key), str(error)
     specs = entry.get("specs")
-    named = [((*place, "mapping"), entry.get("mapping"))]
-    named += [
-        ((*place, "specs", n), spec) for n, spec in enumerate(specs if isinstance(specs, list) else [specs])
+    files = [((*place, "mapping"), entry.get("mapping"))]
+    files += [
+        ((*place, "specs", index), spec)
+        for index, spec in enumerate(specs if isinstance(specs, list) else [specs])
     ]
-    for where, name in named:
+    for file_place, name in files:
         if isinstance(name, str) and name and not is_address(name) and not _is_file(folder / name):
-            yield where, f"there is no file {name[:200]!r}; paths are relative to the suite's file"
+            yield file_place, f"there is no file {name[:200]!r}; paths are relative to the suite's file"
 
 
 def _file(name: str, folder: Path) -> Path | str:

@@ -79,19 +79,19 @@ class LocalProcesses:
         self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
     ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
         """See `Workers.results`."""
-        rest = iter(tasks)
+        remaining_tasks = iter(tasks)
         while True:
             suspects: list[_Task] = []
             with _pool(self._count, suspects) as pool:
-                yield from _results(pool, work, rest, self._count * _AHEAD, suspects)
+                yield from _results(pool, work, remaining_tasks, self._count * _AHEAD, suspects)
             if not suspects:
                 return
             # one of these tasks killed its process, but it is unknown which one: each runs alone
             for task in suspects:
-                again: list[_Task] = []
-                with _pool(1, again) as pool:
-                    yield from _results(pool, work, iter([task]), 1, again)
-                if again:
+                lost_tasks: list[_Task] = []
+                with _pool(1, lost_tasks) as pool:
+                    yield from _results(pool, work, iter([task]), 1, lost_tasks)
+                if lost_tasks:
                     yield task, WorkerLost(f"its process ended while it was evaluated by itself{_MEMORY}")
 
 
@@ -102,31 +102,31 @@ def _results(
     pool: Executor,
     work: Callable[[_Task], _Result],
     tasks: Iterator[_Task],
-    ahead: int,
+    most_pending: int,
     suspects: list[_Task],
 ) -> Iterator[tuple[_Task, _Result]]:
     """Yield results until the tasks end or the pool breaks; `suspects` gets its unfinished tasks."""
-    waiting: dict[Future[_Result], _Task] = {}
-    is_whole = True
+    tasks_by_future: dict[Future[_Result], _Task] = {}
+    is_usable = True
     while True:
         # a broken pool gets no further tasks
-        for task in islice(tasks, ahead - len(waiting) if is_whole else 0):
+        for task in islice(tasks, most_pending - len(tasks_by_future) if is_usable else 0):
             try:
                 # an interrupted `submit` could leave a process that `_pool` does not find
                 with uninterrupted():
-                    waiting[pool.submit(work, task)] = task
+                    tasks_by_future[pool.submit(work, task)] = task
             except BrokenProcessPool:
-                is_whole = False
+                is_usable = False
                 suspects.append(task)
                 break
-        if not waiting:
+        if not tasks_by_future:
             return
-        for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-            task = waiting.pop(future)
+        for future in wait(tasks_by_future, return_when=FIRST_COMPLETED).done:
+            task = tasks_by_future.pop(future)
             try:
                 result = future.result()
             except BrokenProcessPool:
-                is_whole = False
+                is_usable = False
                 suspects.append(task)
                 continue
             yield task, result
@@ -136,25 +136,25 @@ def _results(
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
     """Start processes, and end them at once if the block raises or adds suspects."""
     context = forking_context([_PRELOADED])
-    others = set(multiprocessing.active_children())
-    ours, theirs = multiprocessing.Pipe(duplex=False)
+    other_processes = set(multiprocessing.active_children())
+    receiver, sender = multiprocessing.Pipe(duplex=False)
     try:
-        with ProcessPoolExecutor(count, context, _begin_worker, (ours,)) as pool:
+        with ProcessPoolExecutor(count, context, _begin_worker, (receiver,)) as pool:
             try:
                 yield pool
             except BaseException:
-                theirs.close()
+                sender.close()
                 pool.shutdown(wait=False, cancel_futures=True)
                 # a process that is still starting would fail when this one removes its resources
-                for process in set(multiprocessing.active_children()) - others:
+                for process in set(multiprocessing.active_children()) - other_processes:
                     process.kill()
                 raise
             if suspects:
                 # otherwise the executor waits for a process that was starting when another one died
-                theirs.close()
+                sender.close()
     finally:
-        theirs.close()
-        ours.close()
+        sender.close()
+        receiver.close()
 
 
 def _begin_worker(connection: Connection) -> None:
@@ -202,15 +202,15 @@ class DaskCluster:
             UsageError: no scheduler answers.
             ClusterError: the scheduler stopped answering.
         """
-        rest = iter(tasks)
-        waiting: dict[Future[_Result], _Task] = {}
+        remaining_tasks = iter(tasks)
+        tasks_by_future: dict[Future[_Result], _Task] = {}
         is_reported = False
         with self._connection() as client:
             # by default, Dask would give equal calls one shared result
             pool = client.get_executor(pure=False)
             try:
-                while self._hand_out(client, pool, work, rest, waiting):
-                    finished = wait(waiting, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED).done
+                while self._hand_out(client, pool, work, remaining_tasks, tasks_by_future):
+                    finished = wait(tasks_by_future, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED).done
                     if not finished and not is_reported and not client.nthreads():
                         self._report(
                             f"--dask {self._address}: the scheduler has no workers, so nothing is evaluated; "
@@ -218,11 +218,11 @@ class DaskCluster:
                         )
                         is_reported = True
                     for future in finished:
-                        task = waiting.pop(future)
+                        task = tasks_by_future.pop(future)
                         yield task, self._result(future)
             finally:
                 # the executor would wait for these tasks, and the scheduler may be gone
-                for future in waiting:
+                for future in tasks_by_future:
                     future.cancel()
 
     def _hand_out(
@@ -231,17 +231,17 @@ class DaskCluster:
         pool: Executor,
         work: Callable[[_Task], _Result],
         tasks: Iterator[_Task],
-        waiting: dict[Future[_Result], _Task],
+        tasks_by_future: dict[Future[_Result], _Task],
     ) -> bool:
         """Submit enough tasks to keep all workers busy. Return whether any task is pending."""
         try:
-            ahead = _AHEAD * max(1, sum(client.nthreads().values())) - len(waiting)
-            for task in islice(tasks, max(0, ahead)):
-                waiting[pool.submit(work, task)] = task
+            free_slots = _AHEAD * max(1, sum(client.nthreads().values())) - len(tasks_by_future)
+            for task in islice(tasks, max(0, free_slots)):
+                tasks_by_future[pool.submit(work, task)] = task
         except (OSError, RuntimeError, ValueError) as error:
             # distributed raises errors of several types for a closed connection
             raise self._scheduler_loss() from error
-        return bool(waiting)
+        return bool(tasks_by_future)
 
     def _result(self, future: Future[Any]) -> Any:
         """Return the result of a task, or `WorkerLost`. Errors of its work are passed on."""
@@ -289,11 +289,11 @@ class DaskCluster:
 def _silent(*loggers: str) -> Iterator[None]:
     """Silence loggers that write tracebacks of errors which this module raises itself."""
     named_loggers = [logging.getLogger(name) for name in loggers]
-    before = [logger.disabled for logger in named_loggers]
+    disabled_before = [logger.disabled for logger in named_loggers]
     try:
         for logger in named_loggers:
             logger.disabled = True
         yield
     finally:
-        for logger, was in zip(named_loggers, before, strict=True):
-            logger.disabled = was
+        for logger, was_disabled in zip(named_loggers, disabled_before, strict=True):
+            logger.disabled = was_disabled
