@@ -1,4 +1,4 @@
-"""Robustness curves for the page over all logs: one drawing per spec, one curve per log with a page."""
+"""Robustness curves of the page over all logs: a drawing for each spec, with a curve for each failing log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spatial_replay.report.panels import unpack_array, with_signs
 from spatial_replay.text import number_text, with_unit
 
 MOST_CURVES: Final = 60
-"""Curves per drawing; the worst are kept."""
+"""Maximum number of curves in a drawing, which shows the worst."""
 _MOST_POINTS: Final = 120
 _WIDTH: Final = 480.0
 _HEIGHT: Final = 120.0
@@ -31,13 +31,13 @@ _NUMBERS: Final = re.compile(
 
 
 class Curve(NamedTuple):
-    """The robustness of one result of a log, for the prefix up to each sample.
+    """The robustness of one result over the prefixes of a log.
 
     Attributes:
         title: name of the log, with the object of a template.
         address: address of the page about the log.
         spec: name of the result.
-        times, values: (N,) each; NaN where the robustness is unknown.
+        times, values: (N,) each: end of each prefix, seconds, and its robustness; NaN if unknown.
     """
 
     title: str
@@ -65,7 +65,7 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
         sample_indices = np.unique(np.linspace(0, samples - 1, min(samples, _MOST_POINTS)).astype(np.int64))
         if not samples:
             continue
-        # the series of the root holds the robustness of the prefix up to each sample
+        # the root node's series has the robustness of the prefix up to each sample
         robustness = unpack_array(result["series"], array_bytes)[:samples].astype(np.float64)
         title = f"{log}: {result['object']}" if result["object"] else log
         yield Curve(
@@ -79,7 +79,7 @@ def read_curves(page: Path, log: str, address: str) -> Iterator[Curve]:
 
 
 def draw_curves(curves: Sequence[Curve], unit: str) -> Html:
-    """Return the curves of a spec as SVG. The worst is on top, and each curve links to its page."""
+    """Return the curves of a spec as SVG. The worst curve is on top, and each curve links to its page."""
     finite_curves = [curve for curve in curves if np.isfinite(curve.values).any()]
     # SVG draws later elements on top
     worst_last = sorted(finite_curves, key=lambda curve: -_final(curve))[-MOST_CURVES:]
@@ -124,7 +124,7 @@ def _final(curve: Curve) -> float:
 
 
 def _lines(curve: Curve, end_s: float, high: float, span: float) -> Iterator[Html]:
-    """Yield the tooltip of a curve, a wide invisible line to point at, and the line itself."""
+    """Yield a curve's tooltip, a wide invisible line for the pointer, and the visible line."""
     yield element("title", f"{curve.title}, {curve.verdict}")
     commands, is_open = list[str](), False
     for time_s, value in zip(curve.times, curve.values, strict=True):

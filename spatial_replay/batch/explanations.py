@@ -1,4 +1,4 @@
-"""Explanations of results, computed from their logs when they are shown."""
+"""Explanations of results. They are computed from the logs when a command shows them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Row(NamedTuple):
-    """A row of the table of a run, with its place."""
+    """A row of a run's table, with its index `place`."""
 
     place: int
     case: str
@@ -39,7 +39,7 @@ class ExplanationTask(NamedTuple):
     """Results of one log to explain.
 
     Attributes:
-        keys: key of the rows of each specification file; None for a file without rows to explain.
+        keys: row key of each specification file; None for a file without results to explain.
         results: results to explain.
     """
 
@@ -51,9 +51,9 @@ class ExplanationTask(NamedTuple):
 def explain_rows(
     table: pa.Table, places: Iterable[int], workers: Workers, progress: Progress = no_progress
 ) -> tuple[pa.Table, list[str]]:
-    """Explain the rows of a run's table at some places. Return the table, and remarks on unexplained rows.
+    """Explain the rows `places` of a run's table. Return the table, and remarks on unexplained rows.
 
-    Explained rows are unchanged. A remark names each log that is missing or has changed.
+    Rows with an explanation are unchanged. A remark names each missing or changed log.
     """
     import pyarrow as pa
 
@@ -83,7 +83,7 @@ def explain_rows(
 
 
 def _task(record: RunRecord, rows: Sequence[Row]) -> ExplanationTask:
-    """Return the task that explains rows of one log."""
+    """Return the task for the explanation of one log's rows."""
     case, keys = rows[0].case, {row.file: row.key for row in rows}
     result_names = frozenset(record.result_name(case, row.file, row.spec, row.object) for row in rows)
     return ExplanationTask(
@@ -92,7 +92,7 @@ def _task(record: RunRecord, rows: Sequence[Row]) -> ExplanationTask:
 
 
 def explanations_of(request: ExplanationTask) -> dict[ResultName, Explanation] | str:
-    """Return the explanations of a log's results, or the reason why there are none."""
+    """Return the explanations of a log's results, or a reason if they cannot be computed."""
     task = request.task
     identity = identities_of((task.log,))[task.log]
     if identity is None:
@@ -120,14 +120,14 @@ def _explanation(row: ResultRow) -> Explanation:
 
 
 def failing_places(table: pa.Table, count: int | None = None) -> list[int]:
-    """Return the places of the failing rows among the worst `count` rows, or among all."""
+    """Return the indices of the failing rows among the worst `count` rows, or among all rows."""
     places = range(len(table)) if count is None else worst_places(table, count)
     failures = table.column("failure").to_pylist()
     return [place for place in places if failures[place] is not None]
 
 
 def worst_places(table: pa.Table, count: int) -> list[int]:
-    """Return the places of the worst rows, see `worst_rows`."""
+    """Return the indices of the worst rows, see `worst_rows`."""
     import pyarrow as pa
 
     numbered_table = table.append_column("place", pa.array(range(len(table)), pa.int64()))
@@ -142,7 +142,7 @@ def explain_batch(
     results: str | os.PathLike[str] | None = None,
     progress: Progress = no_progress,
 ) -> BatchResult:
-    """Explain the rows of a batch at some places, and return its result.
+    """Explain the rows `places` of a batch, and return the batch with the explanations.
 
     Args:
         results: folder of results that also stores the explanations.

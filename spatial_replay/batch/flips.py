@@ -21,7 +21,7 @@ KINDS: Final[tuple[Kind, ...]] = ("flipped", "less", "more", "gone", "new")
 _LISTED: Final[Mapping[Kind, int]] = MappingProxyType(
     {"flipped": 20, "less": 10, "more": 5, "gone": 5, "new": 5}
 )
-"""Results that texts list, by kind of change. JSON has all results."""
+"""Maximum number of results in the text output, by kind of change. JSON has all results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,9 @@ class ResultChange:
     """One result that differs between two runs.
 
     Attributes:
-        difference: verdicts and numbers of both runs; "untested" for a verdict that nothing tested.
-        unit: unit of both numbers, or "".
-        reason: a sentence on the deciding atom of the worse verdict, or its error.
+        difference: verdicts and robustness of both runs; the verdict of an untested result is "untested".
+        unit: unit of the robustness, or "".
+        reason: sentence on the deciding atom of the worse verdict, or its error.
     """
 
     difference: Difference
@@ -48,7 +48,7 @@ class ResultChange:
 
     @property
     def text(self) -> str:
-        """The verdicts of both runs with their numbers; only one if the other run lacks the result."""
+        """The verdicts with their robustness. A gone or new result has the verdict of one run."""
         result = self.difference
         before_text, now_text = (
             "error" if verdict is None else f"{verdict} ({self._number(number)})"
@@ -79,9 +79,9 @@ class RunDiff:
     """Two runs side by side.
 
     Attributes:
-        logs, results: numbers of logs and results in the two runs together.
-        changes: results that differ: flipped ones first, the worst first within each kind.
-        specs: number of results of each spec, by case, file and name.
+        logs, results: numbers of logs and results in both runs together.
+        changes: different results: first the flipped results, and within each kind the worst first.
+        specs: number of results by case, file and spec.
     """
 
     logs: int
@@ -95,7 +95,7 @@ class RunDiff:
         return tuple(change for change in self.changes if change.kind == "flipped")
 
     def lines(self, *kinds: Kind) -> Iterator[str]:
-        """Yield lines on the first results of some kinds, with reasons."""
+        """Yield lines on the worst results of each requested kind, with reasons."""
         for kind in kinds:
             changes = [change for change in self.changes if change.kind == kind]
             if changes:
@@ -109,7 +109,7 @@ class RunDiff:
                 yield f"  … and {len(changes) - _LISTED[kind]:,} more"
 
     def table(self) -> Iterator[str]:
-        """Yield the lines of a table that counts the changes of each spec."""
+        """Yield the lines of a table with the number of changes of each spec."""
         yield f"{plural(self.logs, 'log')}, {plural(self.results, 'result')}"
         counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
         edited_specs = set()
@@ -152,16 +152,16 @@ def diff_runs(
 ) -> RunDiff:
     """Compare the tables of two runs, result by result.
 
-    Results are matched by case, log, specification file, spec and object. If each run has exactly one file
-    that the other run lacks, these two files are matched.
+    Results are matched by case, log, specification file, spec and object. If exactly one file of each run is
+    missing in the other run, these two files are matched.
 
     Args:
         tolerance: accepted loss of robustness.
         names: names of the two runs, for errors.
-        explain: function that explains the rows of a table at some places.
+        explain: function that explains rows of a table, given the table and the rows' indices.
 
     Raises:
-        UsageError: the runs have no result in common, or the tolerance lacks the unit of the results.
+        UsageError: the runs have no common result, or the tolerance lacks the unit of the results.
     """
     unexplained = before, now
     before, now = _replace_untested_verdicts(_match_file_name(before, now)), _replace_untested_verdicts(now)
@@ -193,7 +193,7 @@ def diff_runs(
 
 
 def _with_reasons(table: pa.Table, explained: pa.Table) -> pa.Table:
-    """Return a table with the reasons of another table that has the same rows."""
+    """Return a table with the reasons in `explained`, a table with the same rows."""
     index = table.schema.get_field_index("reason")
     return table.set_column(index, table.schema.field(index), explained.column("reason"))
 
@@ -208,7 +208,7 @@ def _example(table: pa.Table) -> str:
 
 
 def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
-    """Rename the only file that another table lacks to the only file that this table lacks."""
+    """Rename the only file that is missing in `other` to the only file that is missing in `table`."""
     import pyarrow as pa
 
     files, other_files = (set(rows.column("file").to_pylist()) for rows in (table, other))
@@ -221,7 +221,7 @@ def _match_file_name(table: pa.Table, other: pa.Table) -> pa.Table:
 
 
 def _replace_untested_verdicts(table: pa.Table) -> pa.Table:
-    """Return a table with the verdict "untested" where nothing tested the spec."""
+    """Return a table whose untested results have the verdict "untested"."""
     import pyarrow.compute as pc
 
     is_untested = pc.fill_null(pc.equal(table.column("tested"), "nothing"), False)

@@ -1,4 +1,4 @@
-"""Fork server that imports all modules once, before it forks workers."""
+"""Fork server that imports all modules once, and then forks workers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from multiprocessing.context import ForkServerContext
 def forking_context(modules: Sequence[str]) -> ForkServerContext:
     """Start the fork server with SIGINT blocked, and return its context.
 
-    Workers inherit the blocked signal. Ctrl-C reaches all processes of a terminal, and only the parent
+    Workers inherit the blocked signal: Ctrl-C reaches all processes of a terminal, and only the parent
     handles it.
 
     Args:
-        modules: modules that the server imports, unless it runs already.
+        modules: modules that the server imports. A running server imports no further modules.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*modules])

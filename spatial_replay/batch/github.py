@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 
 _ANNOTATIONS: Final = 10
-"""Annotations of one severity that GitHub shows per step."""
+"""Maximum number of annotations of one severity that GitHub shows per step."""
 _MOST_COMPARED: Final = 10_000
-"""Worst rows that are searched for failures of different kinds."""
+"""Maximum number of worst rows among which failures of different kinds are searched."""
 
 
 def is_github() -> bool:
@@ -60,8 +60,9 @@ def annotation(
 def repository_path(file: str | Path) -> str:
     """Return the path of a file relative to its repository.
 
-    The repository is the folder of the GitHub job, else the nearest parent of the current folder with a
-    `.git`, else the current folder. Files elsewhere keep their absolute path, and addresses are unchanged.
+    The path starts at the folder of the GitHub job, or at the nearest folder with a `.git` from the current
+    folder upwards. Without a `.git`, it starts at the current folder. A file elsewhere keeps its absolute
+    path, and an address is unchanged.
     """
     if is_address(file):
         return str(file)
@@ -71,7 +72,7 @@ def repository_path(file: str | Path) -> str:
         (folder for folder in (current, *current.parents) if (folder / ".git").exists()), current
     )
     for base in (Path(job_folder) if job_folder else repository, repository):
-        # as written first, because a link in the repository may lead outside
+        # the path before its links are resolved, because a link in the repository may lead outside
         for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
             if candidate.is_relative_to(root):
                 return candidate.relative_to(root).as_posix()
@@ -79,9 +80,9 @@ def repository_path(file: str | Path) -> str:
 
 
 def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
-    """Yield an annotation for each of the worst rows that fail, at the line of its spec.
+    """Yield an annotation for each of the worst failing rows, at the line of its spec.
 
-    Further rows of the same spec and verdict follow after all others.
+    The first row of each spec and verdict precedes all second rows.
 
     Args:
         folder: base of the paths of specifications.
@@ -153,7 +154,7 @@ def _line(cells: list[str]) -> str:
 
 
 def _markdown_cell(sentence: str) -> str:
-    """Return a sentence for a cell of a Markdown table: formulas as code, everything else escaped."""
+    """Return a sentence for a cell of a Markdown table. Formulas are code, and other text is escaped."""
     pieces = []
     for index, piece in enumerate(sentence_parts(sentence)):
         if index % 2:
@@ -172,7 +173,7 @@ _PIPE: Final = "\\|"
 
 
 def _data(text: str) -> str:
-    """Escape the message of a workflow command, in which a line break would begin another command."""
+    """Escape the message of a workflow command. A line break would end the command."""
     # the escapes of https://github.com/actions/toolkit, packages/core/src/command.ts
     return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 

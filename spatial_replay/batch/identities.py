@@ -1,4 +1,4 @@
-"""Hashes of logs. Equal logs share their results, and unchanged logs are not hashed again."""
+"""Hashes of logs. Logs with equal bytes share their results. Unchanged logs are not hashed again."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _TOGETHER: Final = 16
 def identify(
     paths: Sequence[str], known: Mapping[str, str], workers: Workers, progress: Progress
 ) -> tuple[dict[str, str | None], dict[str, str | None]]:
-    """Return the identity of each log, and the states of their files.
+    """Return the identity and the state of each log, by path.
 
-    An identity is a hash of the log's bytes, or the version of a remote log; None if the log cannot be read.
-    A log is hashed again only if the state of a file changes: its path, device, inode, size or times.
+    An identity is a hash of the log's bytes, or the version of a remote log. An unreadable log has None. A
+    log is hashed again only if its state changes: the path, device, inode, size or times of a file.
 
     Args:
         known: identities by state.
@@ -39,7 +39,7 @@ def identify(
     groups = [
         tuple(unknown_paths[start : start + _TOGETHER]) for start in range(0, len(unknown_paths), _TOGETHER)
     ]
-    # one group is read sooner than a process starts
+    # reading one group takes less time than the start of a process
     executor = ThisProcess() if len(groups) == 1 else workers
     identity_by_path: dict[str, str | None] = {}
     with progress("logs read", len(unknown_paths)) as advance:
@@ -53,9 +53,9 @@ def identify(
 
 
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
-    """Return the identity of each log; None if it cannot be read."""
+    """Return the identity of each log; None for an unreadable log."""
     if not any(map(is_address, paths)):
-        # local files are read in this thread, so that a signal interrupts the reading
+        # a signal interrupts the reading of local files only in this thread
         files = _LogFiles()
         return {path: _identity(path, files) for path in paths}
     return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))
@@ -69,23 +69,23 @@ def _identity(path: str, files: _LogFiles | None = None) -> str | None:
 
 
 class _LogFiles:
-    """Files of logs. Each data set is opened once, and each file is looked up once."""
+    """Files of logs. Each data set is opened once, and the state of each file is read once."""
 
     def __init__(self) -> None:
         self._data_sets: dict[str, tuple[DataSet | None, list[str]]] = {}
         self._states: dict[str, tuple[str, os.stat_result]] = {}
 
     def of(self, path: str) -> tuple[list[str], int | None]:
-        """Return the files of a log and its episode number; None if the log is no episode.
+        """Return the files of a log, and its episode number; None if the log is no episode.
 
-        The files of an episode hold its numbers and its metadata.
+        The files of an episode are its data and the metadata of the data set.
         """
         address = data_set_address(path)
         if address is not None:
             data_set, shared_files = self._data_set(address[0])
             if data_set is not None:
                 return [*shared_files, *map(str, data_set.files_of(address[1]))], address[1]
-        # on texts: building `Path` objects takes longer than the system call
+        # `os.path`, because creating `Path` objects takes longer than the system call
         if not os.path.isdir(path):  # noqa: PTH112
             return [path], None
         return sorted(str(file) for file in Path(path).iterdir() if file.is_file()), None
@@ -107,7 +107,7 @@ class _LogFiles:
 def states_of(paths: Sequence[str]) -> dict[str, str | None]:
     """Return a hash of the file states of each log: path, device, inode, size and times.
 
-    The hash is equal while the files are unchanged. An address and unreadable files have None.
+    The hash of unchanged files is equal. Addresses and unreadable files have None.
     """
     files = _LogFiles()
     return {path: None if is_address(path) else _state(path, files) for path in paths}
@@ -119,7 +119,7 @@ def _state(path: str, files: _LogFiles) -> str | None:
         states = [files.state(name) for name in file_names]
     except (OSError, ValueError, SpatialReplayError):
         return None
-    # with the time of change (ctime), because tools such as rsync restore the modification time
+    # the time of change (ctime) is included, because tools such as rsync restore the modification time
     state_json = json.dumps(
         [
             *([] if episode_number is None else [episode_number]),
@@ -150,7 +150,11 @@ def _hash_of_log(path: str, files: _LogFiles) -> str:
 
 @lru_cache(maxsize=64)
 def _cached_hash(file: str, state_ns: int) -> str:
-    """Return the hash of a file that many episodes share. The modification time is part of the cache key."""
+    """Return the hash of a file that many episodes share.
+
+    Args:
+        state_ns: modification time of the file: a changed file has another cache entry.
+    """
     return _hash_of(Path(file))
 
 
@@ -168,7 +172,7 @@ def _version_at(address: str) -> str:
 
 
 def _version_of(file: RemoteFile) -> tuple[int, str]:
-    """Return the size of a remote file, and its strong ETag; without one, the digest of its bytes."""
+    """Return the size of a remote file, and its strong ETag or, without one, a digest of its bytes."""
     version = file.current_version()
     if version.is_exact:
         return version.size, str(version.tag)

@@ -41,8 +41,8 @@ def write_junit(
 ) -> None:
     """Write the table of a run as a JUnit report.
 
-    A report above the limit gets shorter texts. If it is still too large, passing test cases are left out,
-    and each test suite counts them.
+    A report above the limit has shorter texts. If these are too large, the report has only the number of
+    passing test cases in each test suite.
 
     Args:
         name: name of the suite.
@@ -128,7 +128,7 @@ def _case(
     yield f'<testcase classname={_quote(class_name)} name={_quote(name)} time="{row["seconds"]:.3f}">\n'
     tested_lines = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
     if row["failure"] is not None:
-        # in JUnit, an error concerns the test, and a failure its subject
+        # in JUnit, an error is a fault of the test, and a failure is a fault of its subject
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or _unmet(row)
         texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
@@ -145,7 +145,7 @@ def _case(
 
 
 def _unmet(row: Values) -> str:
-    """Return the kind of a failure, in words that all results of the kind share."""
+    """Return the kind of a failure; equal kinds have equal words."""
     failure = row["failure"]
     kinds = {UNTESTED: "untested"}
     kinds |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
@@ -163,12 +163,12 @@ def _counts(rows: Any) -> tuple[int, int]:
 
 
 def _time(rows: Any) -> str:
-    """Return the total time of rows, seconds. Rows of one log share one time."""
+    """Return the total time of rows, seconds. The time of each log counts once."""
     return f"{sum({(row['case'], row['log']): row['seconds'] for row in rows}.values()):.3f}"
 
 
 def _text(text: str) -> str:
-    """Return a text that XML can hold."""
+    """Return a text with escapes for XML, and without control characters."""
     return escape("\n".join(printable(line, len(line)) for line in text.split("\n")))
 
 

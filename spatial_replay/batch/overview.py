@@ -45,9 +45,9 @@ LABEL: Final = "label"
 AGREEMENT: Final = "agreement"
 """Columns of judged episodes: the label, "success" or "failure", and its agreement with the verdict."""
 _MOST_LOGS: Final = 2_000
-"""Rows of the matrix; a page with more is slow to open."""
+"""Maximum number of rows of the matrix. Larger pages open slowly."""
 _MOST_SPECS: Final = 60
-"""Largest number of columns of the matrix, and of distributions."""
+"""Maximum number of the matrix's columns, and of histograms."""
 _BINS: Final = 24
 _WIDTH: Final = 480.0
 _HEIGHT: Final = 60.0
@@ -60,7 +60,7 @@ def overview_page(
     reports: Mapping[tuple[str, str], str],
     curves: Mapping[str, Sequence[Curve]] = MappingProxyType({}),
 ) -> bytes:
-    """Return the page, in UTF-8; equal tables give equal bytes.
+    """Return the page in UTF-8. Equal tables give equal bytes.
 
     Args:
         table: table of a run.
@@ -106,7 +106,7 @@ def _panels(
 
 
 def _panel(title: str, *content: Html) -> Html:
-    # focusable, so that keys can scroll a panel that is wider than the page (WCAG 2.1.1)
+    # a focusable panel that is wider than the page can be scrolled by keys (WCAG 2.1.1)
     attributes = {"class": "panel", "aria-label": title, "tabindex": "0"}
     return element("section", element("h2", title), *content, **attributes)
 
@@ -148,7 +148,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
 
 
 def _result_cell(row: Values) -> Iterator[Html]:
-    """Yield the name of a result, and below it the requirement."""
+    """Yield the name of a result, and its requirement."""
     yield text(result_name(row["spec"] or row["file"], row["object"]))
     if about := requirement_of(row):
         yield element("div", text(about), **{"class": "requirement"})
@@ -187,13 +187,13 @@ def _plots(
 
 
 def _histogram(numbers: Floats, unit: str) -> Html:
-    """Return a histogram as SVG. An edge of its bins is 0, where the verdict changes."""
+    """Return a histogram as SVG. 0 is an edge of its bins, because the verdict changes there."""
     low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
     if low == high:
         high = low + 1.0
     bin_width = (high - low) / _BINS
     negative_bins = math.ceil(-low / bin_width) if low < 0.0 else 0
-    # one bin more than `_BINS`, because 0 is an edge
+    # `_BINS` + 1 bins, because 0 is an edge
     edges = (np.arange(_BINS + 2) - negative_bins) * bin_width
     counts, _ = np.histogram(numbers, edges)
     largest_count, bar_width = max(1, int(counts.max())), _WIDTH / len(counts)
@@ -207,7 +207,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
             "width": bar_width - 1.0,
             "height": height,
         }
-        # only the tooltip of a bar gives its count: bars have no text
+        # bars have no text: the count is in the tooltip
         tooltip = element("title", with_signs(f"{count:,} from {edges[index]:.4g} to {edges[index + 1]:.4g}"))
         attributes = {label: f"{value:.2f}" for label, value in box.items()}
         bars.append(element("rect", tooltip, **attributes, **{"class": css_class}))
@@ -231,7 +231,7 @@ def _histogram(numbers: Floats, unit: str) -> Html:
 def _matrix(
     table: pa.Table, spec_totals: Sequence[Total], reports: Mapping[tuple[str, str], str]
 ) -> Iterator[Html]:
-    """Yield a row for each log, the worst first, and a column for each spec."""
+    """Yield the table of results: a row for each log, the worst first, and a column for each spec."""
     specs = [(total.group["case"], total.group["file"], total.group["spec"]) for total in spec_totals]
     rows_by_log: dict[str, dict[tuple[str, str, str], Values]] = {}
     rows = worst_rows(table, len(table))
@@ -245,7 +245,7 @@ def _matrix(
             if len(rows_by_log) >= _MOST_LOGS:
                 continue
             log_rows = rows_by_log[row["log"]] = {}
-        # rows are sorted, so the first one of a template is the worst object
+        # rows are sorted: the first row of a template has the worst object
         log_rows.setdefault(spec_key, row)
     log_count = len(set(table.column("log").to_pylist()))
     if log_count > len(rows_by_log):
@@ -276,7 +276,7 @@ def _matrix(
 
 
 def _filter() -> Html:
-    """Return the filters of the matrix, and buttons that step through failing rows."""
+    """Return the filters of the matrix, and buttons for the previous and next failing row."""
     search_field = element("input", type="search", placeholder="name", **{"aria-label": "Name of a log"})
     checkbox = element("label", element("input", type="checkbox", id="only-failing"), " only failing")
     buttons = [
@@ -288,7 +288,7 @@ def _filter() -> Html:
 
 
 def _agrees(row: Values) -> bool:
-    """Return whether the label of a row agrees with the verdict, or is not compared with it."""
+    """Return whether the label of a row does not contradict the verdict."""
     return row[AGREEMENT] not in ("only_theirs", "only_ours")
 
 
@@ -336,7 +336,7 @@ def _sortable(title: str, kind: str, about: str = "") -> Html:
 
 
 def _tip(about: str) -> dict[str, str]:
-    """Return the attribute of a tooltip with the requirement; nothing for an empty text."""
+    """Return the attribute of a tooltip with the requirement. An empty text has no attribute."""
     return {"title": about} if about else {}
 
 
@@ -345,7 +345,11 @@ def _number(tag: str, words: str) -> Html:
 
 
 def _log_link(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
-    """Return the name of a log, given as (case, log), linked to its page if there is one."""
+    """Return the name of a log, with a link to its page if there is one.
+
+    Args:
+        log: case and name of the log.
+    """
     return element("a", text(log[1]), href=quote(reports[log])) if log in reports else text(log[1])
 
 

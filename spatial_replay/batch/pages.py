@@ -1,4 +1,4 @@
-"""Pages of a batch: one over all logs, and a report of each log that fails."""
+"""Pages of a batch: a page over all logs, and a report for each failing log."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _FOLDER: Final = "reports"
 _LONGEST: Final = 80
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 _HEAD: Final = re.compile(rb'(?:<nav class="neighbours".*?</nav>)?' + re.escape(HEADER.encode()), re.DOTALL)
-"""The begin of a report's header, and the links of an earlier batch before it."""
+"""Beginning of a report's header, with the links of an earlier batch if there are any."""
 
 
 def write_pages(
     result: BatchResult, folder: Path, name: str, workers: Workers, *, progress: Progress = no_progress
 ) -> dict[tuple[str, str], Path]:
-    """Write the page over all logs, and one about each log with a verdict that fails.
+    """Write the page over all logs, and a page about each log with a failing verdict.
 
-    Pages of an earlier run about the same log and specifications are kept, with new links to other pages. The
-    worst log comes first.
+    A page of an earlier run about the same log and specifications stays; only its links are new. The worst
+    log comes first.
 
     Args:
-        folder: folder of the pages, created if needed; the page over all logs is its `index.html`.
+        folder: folder of the pages, created if needed. The page over all logs is its `index.html`.
         name: name of the suite.
         progress: shows the number of written pages.
 
     Returns:
-        The pages, by case and log.
+        The paths of the pages about logs, by case and log.
 
     Raises:
         UsageError: the folder is a file.
@@ -77,7 +77,7 @@ def write_pages(
 
 
 def _link_pages(pages: Mapping[tuple[str, str], Path]) -> None:
-    """Write links to the page over all logs and to the neighbouring pages into each page about a log."""
+    """Add links to each page about a log: to the page over all logs, and to the neighbouring pages."""
     neighbours = [(log, path.name) for (_, log), path in pages.items()]
     for index, path in enumerate(pages.values()):
         links = [element("a", "All logs", href=f"../{INDEX}")]
@@ -106,7 +106,7 @@ def _failing(result: BatchResult) -> dict[tuple[str, str], list[RowRequest]]:
     for request in result.requests:
         if (request.case.name, request.log.name) in requests_by_log:
             requests_by_log[request.case.name, request.log.name].append(request)
-    # a result that is gone may have no log any more
+    # the log of a gone result may be gone, too
     return {key: requests for key, requests in requests_by_log.items() if requests}
 
 
@@ -118,12 +118,12 @@ def _task(requests: list[RowRequest]) -> Task:
 def _file_name(log: str, requests: list[RowRequest]) -> str:
     """Return a file name with the log's name and a hash of the page's inputs."""
     digest = hashlib.sha256("".join(request.key or "" for request in requests).encode()).hexdigest()[:12]
-    # the end of a long name is kept, because it distinguishes logs
+    # the end of a long name stays, because it distinguishes logs
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 
 def _write_page(page: tuple[Task, Path]) -> None:
-    """Write one page about a log; none if the log cannot be read any more."""
+    """Write a page about a log. A log that is unreadable by now has no page."""
     task, path = page
     try:
         files = parsed_specifications(task.specs, task.conditions)

@@ -1,4 +1,4 @@
-"""Conditions of a run, stored with its table so that results can be explained later."""
+"""Conditions of a run. The table of the run has them, for later explanations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RunRecord:
 
     Attributes:
         folder: base of the names of logs.
-        cases: conditions and texts of the specification files of each case, by name.
+        cases: conditions and specification texts of each case, by the name of the case.
     """
 
     folder: str
@@ -38,7 +38,7 @@ class RunRecord:
 
     @classmethod
     def of(cls, table: pa.Table) -> RunRecord:
-        """Return the record of a table; a record without cases if the table has none."""
+        """Return the record of a table. A table without a record gives a record without cases."""
         data = (table.schema.metadata or {}).get(_RECORD, b'{"folder": "", "cases": {}}')
         return cls(**json.loads(data))
 
@@ -56,7 +56,11 @@ class RunRecord:
         return self.files(case).index(file), spec, object_name
 
     def task(self, case: str, log: str) -> Task:
-        """Return the task with which the run evaluated a log, given the log's name in the table."""
+        """Return the task of the run that evaluated a log.
+
+        Args:
+            log: name of the log in the table.
+        """
         path = log if is_address(log) else str(Path(self.folder) / log)
         texts = tuple(SpecificationText(*text) for text in self.cases[case]["files"].values())
         conditions = self.cases[case]["conditions"]
@@ -77,7 +81,7 @@ def recorded_conditions(conditions: Conditions) -> dict[str, Any]:
 
 
 def with_explanations(table: pa.Table, explanations: Mapping[int, Explanation]) -> pa.Table:
-    """Return a table with explanations in the rows at their places."""
+    """Return a table with explanations, given by the indices of their rows."""
     import pyarrow as pa
 
     for column_number, name in enumerate(EXPLANATION if explanations else ()):

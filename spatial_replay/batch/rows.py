@@ -1,6 +1,6 @@
-"""Evaluates one log with all its specifications: a task in, rows out.
+"""Evaluates the specifications of a task over its log, and returns rows.
 
-A task is sent to another process, so it holds the texts of its specifications and no open file. The rows of a
+A task is sent to another process: it holds the texts of its specifications, and no open file. The rows of a
 task are plain values, too.
 """
 
@@ -50,12 +50,12 @@ An "unfit" log can be read, but lacks a requirement of the suite.
 """
 
 ResultName: TypeAlias = tuple[int, str, str | None]
-"""A result of a task: the number of its specification file, its spec, and the object of a template."""
+"""Name of a result in a task: the index of the specification file, the spec, and the object of a template."""
 
 _LONGEST: Final = 2_000
 """Length limit of a text in a row, characters."""
 _MOST: Final = 20
-"""Entries of each list in a row. The last entry counts the entries left out."""
+"""Maximum number of entries in a list of a row. The last entry of a cut list counts the others."""
 _KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
     ((UsageError, SpecificationError), "usage"),
     ((LogError, TraceError, GeometryError), "log"),
@@ -68,10 +68,10 @@ class Task:
     """A log to evaluate.
 
     Attributes:
-        log: its path or address.
-        specs: the texts of the specification files.
+        log: path or address of the log.
+        specs: texts of the specification files.
         conditions: options of reading and evaluation. Objects of a parameter without a spec are ignored,
-            because the rows of that spec may be stored already.
+            because the rows of the parameter's spec may be stored already.
     """
 
     log: str
@@ -81,39 +81,39 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class ResultRow:
-    """The result of one spec over one log, or the error in its place.
+    """The result of one spec over one log, or an error.
 
     Attributes:
-        spec: its name.
-        object: the object that a template's parameter stands for, or None.
-        requirement, title: the id and sentence of the spec, or None.
+        spec: name of the spec.
+        object: object of a template's parameter, or None.
+        requirement, title: id and sentence of the spec, or None.
         line: line of the spec in its file, from 1.
-        verdict: None if there is an error.
-        unit: the declared unit of the robustness, or "".
-        robustness, lower, upper: NaN where not determined.
+        verdict: verdict of the spec; None for an error.
+        unit: declared unit of the robustness, or "".
+        robustness, lower, upper: robustness and its interval; NaN if not determined.
         first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
-        atom, atom_time_ns, atom_objects: the deciding atom with its time and objects; the first cause of a
-            violation.
-        reason: a sentence on the deciding atom and, if another atom gives the robustness, on that one; ""
+        atom, atom_time_ns, atom_objects: deciding atom with its time and objects; the atom of the first cause
+            for a violation.
+        reason: sentence on the deciding atom, and on the atom of the robustness if it is another atom; ""
             under the paper's semantics.
-        explanation: the sentences of `explain`, without the time since which a satisfied spec has held.
-            `explanation`, `reason` and `atom…` are None if the result is not explained.
-        tested: see `SpecResult.tested`; None if there is an error.
+        explanation: sentences of `explain`, without the time since which a satisfied spec holds.
+            `explanation`, `reason` and `atom…` are None for an unexplained result.
+        tested: see `SpecResult.tested`; None for an error.
         untested: sentences on the parts whose `tested` is not "full".
         vacuous: sentences on the parts that decided nothing.
         left: sentences on group members that left the log within reach of a threshold and came back.
         doubts: names of the verdict's assumptions that the log contradicts.
         doubtful: a sentence on each of these assumptions.
-        dropped: a sentence on messages that the recorder dropped; None for none.
+        dropped: sentence on messages that the recorder dropped, or None.
         samples: number of evaluated samples.
         zero_ns: zero of the times in sentences about the log.
-        start_ns: time of the first sample evaluated.
+        start_ns: time of the first evaluated sample.
         duration_ns: time from the first to the last evaluated sample.
-        faults, remarks, missing: losses while reading, remarks on the log, and names that it lacks.
+        faults, remarks, missing: losses while reading, remarks on the log, and names that the log lacks.
         seconds: time of reading and evaluating the log with all its specifications.
-        error: the reason why there is no verdict, or None.
+        error: reason for a missing verdict, or None.
         error_kind: see `ErrorKind`; None without an error.
-        source: the name of the file that was read; faults, remarks and errors name it.
+        source: name of the evaluated file in faults, remarks and errors.
     """
 
     spec: str = ""
@@ -165,8 +165,8 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
         explained: results to explain; None for all. Explanations take longer than the evaluation.
 
     Returns:
-        For each of `task.specs` one row per result and per object of a template, in the order of the text. If
-        the log has an error, each row holds it. Only an interruption is raised.
+        For each of `task.specs`, one row per result and per object of a template, in the order of the text.
+        Each row of a log with an error has the error. Only an interruption is raised.
     """
     begin_s = time.perf_counter()
     try:
@@ -191,7 +191,7 @@ def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
 
 
 def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
-    """Return the rows of logs that are evaluated with the same specifications and conditions."""
+    """Return the rows of tasks with the same specifications and conditions."""
     try:
         files = parsed_specifications(tasks[0].specs, tasks[0].conditions)
     except SpatialReplayError:
@@ -234,12 +234,12 @@ def _rows_of_like_tasks(tasks: Sequence[Task]) -> list[TaskRows]:
 def _rows_of_short_logs(
     joint: JointReplay, files: Sequence[Specification], logs: Mapping[Task, ShortLog], begin_s: float
 ) -> dict[Task, TaskRows]:
-    """Return the rows of logs that are evaluated together, with equal shares of the time since `begin_s`."""
+    """Evaluate short logs together. The rows have equal shares of the time since `begin_s`."""
     rows_by_task: dict[Task, TaskRows] = {}
     try:
         for task, replayed in zip(logs, joint.replay([*logs.values()]), strict=True):
             rows_by_task[task] = _rows_of_log(task, files, joint.trees, replayed, ())
-    except Exception:  # the rest is evaluated log by log, so that the error stays in the rows of its log
+    except Exception:  # the other logs are evaluated one by one, and only the faulty log has the error
         other_tasks = [task for task in logs if task not in rows_by_task]
     else:
         other_tasks = []
@@ -253,12 +253,12 @@ def _rows_with_time(rows: TaskRows, seconds: float) -> TaskRows:
 
 
 def rows_with_explanations(task: Task) -> TaskRows:
-    """Return the rows of a log, each with its explanation (see `rows_from_task`)."""
+    """Return the rows of a log with all explanations (see `rows_from_task`)."""
     return rows_from_task(task, None)
 
 
 def _refuse_unfit(task: Task, source: Source) -> None:
-    """Raise UnfitLogError if a log lacks what its suite requires."""
+    """Raise UnfitLogError if a log lacks a requirement of its suite."""
     if not task.conditions.requires:
         return
     shortfalls = list(fitness_of(task.log, source).lacks(json.loads(task.conditions.requires)))
@@ -277,7 +277,7 @@ def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, Rep
     parameters = {spec.parameter for file in files for spec in file.results}
     choices = {name: objects for name, objects in conditions.each if name in parameters}
     window = _window(source, conditions)
-    # samples need the mapped messages only, so no others are read
+    # only mapped messages are read, because samples need no others
     return source, ReplayOptions(window, choices, conditions.semantics, conditions.strict_names, (MAPPED,))
 
 
@@ -317,9 +317,9 @@ def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
 
 
 def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
-    """Return one row with the error for each spec of a task.
+    """Return a row with the error for each spec of a task.
 
-    A specification that cannot be parsed has one row, with an empty name.
+    An unparsable specification has one row with an empty name.
     """
     error_row = ResultRow(error=_cut(message), error_kind=kind, source=log_file(task.log).name)
     rows: list[tuple[ResultRow, ...]] = []
@@ -335,7 +335,7 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
 
 
 def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int], **values: Any) -> ResultRow:
-    """Return a row with values of a spec (name, requirement, title, line) and other values."""
+    """Return a row with the name, requirement, title and line of a spec, and with other values."""
     return replace(
         row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name], **values
     )
@@ -375,7 +375,7 @@ def _rows_of_file(
 ) -> tuple[ResultRow, ...]:
     lines = spec_lines(file)
     tree_results = zip(trees, replayed.results, strict=True)
-    # a replay renames specs whose name another file has, too; a row has the name in its own file
+    # a replay renames specs of several files with the same name; a row has the name in its file
     results = [
         result if result.name == result.spec.name else replace(result, name=result.spec.name)
         for tree, result in tree_results
@@ -398,7 +398,7 @@ def _rows_of_file(
 
 
 def _missing(diagnostic: Diagnostic) -> str:
-    """Return a sentence on a missing name, with the nearest name but not all names of the log."""
+    """Return a sentence on a missing name with the nearest name, and without the other names of the log."""
     nearest_name, mark, _ = diagnostic.hint.partition("'?")
     return f"{diagnostic.message}; {nearest_name}{mark}" if mark else diagnostic.message
 
@@ -456,7 +456,7 @@ def spec_lines(file: Specification) -> dict[str, int]:
 
 
 def _some(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return texts of bounded length and number. The last one counts the texts left out."""
+    """Return texts of bounded length and number. The last text counts the texts that are left out."""
     return tuple(map(_cut, first_lines(texts, _MOST)))
 
 

@@ -75,11 +75,11 @@ class SpecFile:
 
     Attributes:
         name: path relative to the suite's folder.
-        hash: hash of its meaning with ids and titles, independent of layout and comments.
-        meanings: hash of the meaning of each spec, without ids and titles.
-        lines: line of each spec.
+        hash: hash of the file's meaning with ids and titles, independent of layout and comments.
+        meanings: name of each spec, and hash of its meaning without ids and titles.
+        lines: name and line of each spec.
         warnings: warnings of `check`.
-        has_plugins: whether its results depend on plug-in code, which may read any other file.
+        has_plugins: whether results depend on plug-in code, which may read any other file.
     """
 
     name: str
@@ -118,7 +118,7 @@ def meaning_hash(file: Specification) -> str:
 
 
 def _meaning(file: Specification, spec: NamedSpec) -> str:
-    """Return the text of a spec with its regions and groups, and without names of other specs."""
+    """Return the text of a spec with its regions and groups. The specs that it uses are expanded."""
     names = other_names(spec.formula)
     regions = {name: region for name, region in file.regions.items() if name in names}
     groups = {name: group for name, group in file.groups.items() if name in names}
@@ -138,7 +138,7 @@ def _relative_name(file: Path | str, folder: Path) -> str:
 
 
 def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
-    """Yield faults in the objects that a case chooses for the parameters of its templates."""
+    """Yield faults in a case's choices of objects for the parameters of its templates."""
     templates = [spec for file in files for spec in file.results if spec.parameter is not None]
     parameters = {spec.parameter for spec in templates}
     choices = dict(case.conditions.each)
@@ -159,7 +159,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
 
 
 _DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
-"""Folder names, of which each data set in a folder has at least one."""
+"""Folder names; a data set that is a folder contains at least one of them."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 
@@ -177,16 +177,17 @@ class FoundLog(NamedTuple):
 
 
 def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
-    """Return the logs of patterns, each log once: in the order of the patterns, and sorted within each.
+    """Return the logs of patterns, each log once, in the order of the patterns.
 
-    A folder gives all logs in it and below, a ROS 2 bag itself, and a data set its episodes.
-    `s3://bucket/folder/` and patterns of addresses give the logs that the bucket lists.
+    The logs of one pattern are sorted. A folder has the logs in all its subfolders. A ROS 2 bag is one log,
+    and each episode of a data set is a log. A bucket lists the logs of `s3://bucket/folder/` and of patterns
+    of addresses.
 
     Args:
         folder: base of relative paths.
 
     Raises:
-        UsageError: patterns without a log; all are listed, with their places.
+        UsageError: patterns have no log; the message lists all of them, with their places.
         RemoteError: a bucket cannot be listed.
     """
     logs_by_path: dict[str, FoundLog] = {}
@@ -217,7 +218,7 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
         if path.is_dir():
             yield from _logs_in(path, folder)
         elif path.exists():
-            # the row of a path that is no regular file reports the error
+            # the row of another kind of file reports the error
             yield from _episodes_in(path, folder) or [_log_at(path, folder)]
         elif (address := data_set_address(path)) is not None:
             data_set = open_data_set(address[0])
@@ -236,7 +237,7 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
 
 
 def _logs_at(address: str) -> Iterator[FoundLog]:
-    """Yield the log at an address, or the logs of a pattern or folder in a bucket."""
+    """Yield the log at an address, or all logs of a pattern or folder in a bucket."""
     is_folder = address.endswith("/")
     # in the address of a web server, "?" begins a query
     if address.startswith(("http://", "https://")) or not (is_folder or has_magic(address)):
@@ -259,7 +260,7 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
 def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
     """Return the episodes of a data set; none if the path is no data set.
 
-    A damaged data set is one log, and its row reports the error, so that a batch skips no log silently.
+    A damaged data set is one log, whose row reports the error. No log is skipped silently.
     """
     log = _log_at(path, folder)
     try:
@@ -273,7 +274,7 @@ def _episodes_in(path: Path, folder: Path) -> list[FoundLog]:
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
-    """Yield the logs in a folder: bags, episodes, files with the ending of a log, unreadable folders."""
+    """Yield the logs in a folder: bags, episodes and log files. An unreadable folder counts as a log."""
     errors: list[OSError] = []
     for parent, folders, file_names in os.walk(path, onerror=errors.append):
         if BAG_METADATA in file_names:
@@ -294,7 +295,7 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
                 yield FoundLog(encodable(log_name), f"{parent_log.path}/{name}")
             elif name.lower().endswith(DATA_SET_ENDINGS) and not name.startswith("."):
                 yield from _episodes_in(Path(parent) / name, folder)
-    # the row of an unreadable folder reports the error, so that a batch skips no log silently
+    # the row of an unreadable folder reports the error: no log is skipped silently
     yield from (_log_at(Path(error.filename), folder) for error in errors)
 
 
@@ -328,12 +329,12 @@ class PreparedCase:
 
 
 def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCase, ...]:
-    """Find the logs of each case of a suite, and read and check its specifications and mappings.
+    """Find the logs of each case, and check the specifications and mappings of a suite.
 
     Raises:
-        SpecificationError: only specifications have faults; it holds all of their errors.
-        UsageError: the suite has patterns without a log, unusable files, templates without objects, or other
-            faults; all are listed with lines.
+        SpecificationError: only specifications have faults; the error holds all of them.
+        UsageError: the suite has other faults, such as patterns without a log, unusable files, or templates
+            without objects. The message lists all faults with their lines.
         RemoteError: a bucket cannot be listed.
     """
     faults = _Faults(suite)
@@ -370,7 +371,7 @@ class _Faults:
         self.lines[text] = None
 
     def check(self) -> None:
-        """Raise all faults, if there are any."""
+        """Raise one error with all faults, if there are any."""
         suite_name = "" if self.suite.path is None else self.suite.path.name
         fault_lines = [*(f"{suite_name}:{line}: {fault}" for line, fault in self.suite.faults), *self.lines]
         if self.diagnoses and not fault_lines:
@@ -380,7 +381,7 @@ class _Faults:
             raise UsageError("\n".join(first_lines(fault_lines, MOST_FAULTS)))
 
     def _line(self, fault: str) -> float:
-        """Return the line of a fault in the suite; infinity for faults of other files, which come last."""
+        """Return the line of a fault in the suite. Faults of other files have infinity: they come last."""
         file_name, _, position = fault.partition(":")
         line_text = position.partition(":")[0]
         is_own = self.suite.path is not None and file_name == self.suite.path.name and line_text.isdecimal()
@@ -388,7 +389,7 @@ class _Faults:
 
 
 def _in_one_line(diagnosis: Diagnosis) -> str:
-    """Return an error of a specification in one line, without the quoted source and its caret."""
+    """Return the error of a specification in one line, without the source line and its caret."""
     first_line, hint = str(diagnosis).split("\n")[0], getattr(diagnosis, "hint", "")
     return f"{first_line}; {hint}" if hint else first_line
 
@@ -396,7 +397,7 @@ def _in_one_line(diagnosis: Diagnosis) -> str:
 def _files(
     case: Case, folder: Path, texts: dict[Path | str, SpecificationText | None], faults: _Faults
 ) -> tuple[SpecFile, ...]:
-    """Return the specification files of a case; none if one of them has faults."""
+    """Return the specification files of a case. A case with a faulty file has none."""
     for path in case.specs:
         if path in texts:
             continue
@@ -449,9 +450,9 @@ class BatchResult:
     Attributes:
         table: one row for each case, log, spec and object of a template; see `store`.
         logs: number of logs.
-        evaluated: number of logs that this run evaluated; rows of the others were stored.
-        requests: rows that the suite asks for.
-        remarks: sentences on stored files that were damaged and replaced.
+        evaluated: number of logs that this run evaluated. The rows of other logs were stored.
+        requests: requested rows of the suite.
+        remarks: sentences on damaged stored files, which were replaced.
     """
 
     table: pa.Table
@@ -474,8 +475,8 @@ def workers_of(
     """Return the executor of a batch.
 
     Args:
-        jobs: number of processes; 1 is this process.
-        dask: address of a scheduler; its workers have to see the same files.
+        jobs: number of processes; 1 for this process alone.
+        dask: address of a scheduler, whose workers need access to the same files.
         report: receives messages for a waiting user.
     """
     if dask is not None:
@@ -491,7 +492,7 @@ def run_batch(
     fail_on: frozenset[str] = frozenset(),
     progress: Progress = no_progress,
 ) -> BatchResult:
-    """Evaluate the logs without stored rows. Return and store the results of all logs.
+    """Evaluate the logs without stored rows. Store and return the results of all logs.
 
     Args:
         results: folder of results or its address, created if needed.
@@ -499,9 +500,9 @@ def run_batch(
         progress: shows the numbers of hashed and evaluated logs.
 
     Raises:
-        UsageError: the folder holds something else.
-        OutputError: rows cannot be written; earlier rows are kept.
-        ClusterError: the scheduler of a cluster is lost; rows so far are kept.
+        UsageError: the folder has other contents.
+        OutputError: rows cannot be written; earlier rows are stored.
+        ClusterError: the scheduler of a cluster is lost; the rows so far are stored.
     """
     folder = ResultsFolder.create(results)
     with folder.lock():
@@ -512,7 +513,7 @@ def run_batch(
         identities_by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
-        # before the evaluation, so that a killed batch need not hash the logs again
+        # written before the evaluation: a batch after a killed one does not hash the logs again
         folder.write_identities(identities_by_state)
         storable_keys = {
             request.key for request in requests if request.key is not None and not request.file.has_plugins
@@ -524,7 +525,7 @@ def run_batch(
             for group, rows_of_group in _evaluated_groups(workers, list(tasks)) if tasks else ():
                 states_now = states_of([task.log for task in group])
                 for task, rows_of_log in zip(group, rows_of_group, strict=True):
-                    # rows of a log that has changed are not stored; remote readers check versions
+                    # rows of a changed log are not stored; readers of remote logs check the version
                     is_unchanged = states_now[task.log] == states[task.log]
                     for key, rows in zip(tasks[task], rows_of_log, strict=True):
                         # an error may be temporary, so its rows are not stored
@@ -545,7 +546,7 @@ def run_batch(
         }
         table = _record_of(requests).store_in(with_explanations(table, explanations_by_place))
         folder.write_run(table)
-    # an unreadable log has no key, but its evaluation was tried
+    # unreadable logs have no key, but count as evaluated
     evaluated_logs = {task.log for task in tasks} | {
         request.log.path for request in requests if request.key is None
     }
@@ -555,15 +556,15 @@ def run_batch(
 _GROUP_S: Final = 0.5
 """Target time for a group of logs, seconds."""
 _GROWTH: Final = 8
-"""Largest growth of the next group, as a factor: the first group also spends time on loading code."""
+"""Largest factor between the sizes of two groups. The time of the first group includes loading code."""
 _MOST_IN_GROUP: Final = 64
-"""Largest group of logs. A scheduler takes 4 to 6 ms per task, as long as a short log."""
+"""Maximum number of logs in a group. A scheduler takes 4 to 6 ms per task, the time of a short log."""
 
 
 def _evaluated_groups(
     workers: Workers, tasks: Sequence[Task]
 ) -> Iterator[tuple[Sequence[Task], Sequence[TaskRows]]]:
-    """Yield groups of tasks with their rows. Logs of a worker that died are evaluated again, one by one."""
+    """Yield groups of tasks with their rows. The logs of a dead worker are evaluated again, one by one."""
     sized_groups = _Groups(tasks)
     single_tasks: list[tuple[Task, ...]] = []
     for task_groups in (sized_groups, single_tasks):
@@ -591,7 +592,7 @@ class _Groups:
             start = end
 
     def note(self, rows: Iterable[TaskRows]) -> None:
-        """Adapt the size of the next group to the time per log of a finished group."""
+        """Adapt the size of the next group to the mean time per log in a finished group."""
         durations_s = [
             rows_of_log[0][0].seconds
             for rows_of_log in rows
@@ -627,7 +628,7 @@ def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
-    """Return the conditions that rows depend on. Values of constants are part of the meaning instead."""
+    """Return the conditions in the key of a row. Constants are not among them: `SpecFile.hash` has them."""
     mapping = conditions.mapping
     return [
         None if mapping is None else load_mapping(mapping).identity,
@@ -643,7 +644,7 @@ def _key_of(conditions: Conditions) -> list[Any]:
 
 
 def _tasks(requests: Sequence[RowRequest], stored_keys: set[str]) -> dict[Task, tuple[str, ...]]:
-    """Return one task per log and conditions with missing rows, and the keys of these rows."""
+    """Return a task for each log and conditions with missing rows. Values are the keys of these rows."""
     files_by_task: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
     known_keys = set(stored_keys)
     for request in requests:
@@ -662,7 +663,7 @@ def _table(
     unstored_rows: Mapping[str, Sequence[ResultRow]],
     fail_on: frozenset[str],
 ) -> pa.Table:
-    """Return the table of a run: the rows of all requests."""
+    """Return the table of a run, with the rows of all requests."""
     import pyarrow as pa
 
     unreadable_rows = {
@@ -703,7 +704,7 @@ def _folder_of(requests: Sequence[RowRequest]) -> str:
 
 
 def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Table:
-    """Return rows whose texts name the requested file, not another file of the same content."""
+    """Put the name of the requested file into texts that name another file of the same content."""
     import pyarrow as pa
 
     stored_names = rows.column(SOURCE).to_pylist()
@@ -725,14 +726,14 @@ def _restore_file_names(rows: pa.Table, requests: Sequence[RowRequest]) -> pa.Ta
 
 
 def _rename_file(text: str | list[str] | None, old: str, new: str) -> str | list[str] | None:
-    """Replace a file name in texts, only as a whole word: "a.csv" is also a part of "b-a.csv.gz"."""
+    """Replace a file name where it is a whole word: "a.csv" is also a part of "b-a.csv.gz"."""
     if isinstance(text, str):
         return re.sub(rf"(?<![\w./-]){re.escape(old)}(?![\w-]|\.\w)", lambda _: new, text)
     return text and [str(_rename_file(line, old, new)) for line in text]
 
 
 def _unreadable(request: RowRequest) -> tuple[ResultRow, ...]:
-    """Return the rows of a log that could not be hashed."""
+    """Return the error rows of a log that could not be hashed."""
     task = Task(request.log.path, (request.file.text,), request.case.conditions)
     (rows,) = rows_from_task(task)
     if all(row.error is None for row in rows):
@@ -743,13 +744,13 @@ def _unreadable(request: RowRequest) -> tuple[ResultRow, ...]:
 
 
 def _judge_rows(rows: pa.Table, requests: Sequence[RowRequest], fail_on: frozenset[str]) -> pa.Table:
-    """Return the table of a run: rows with their requests and failures."""
+    """Add the columns of a run's table to rows: case, log, file, expectation and failure."""
     import pyarrow as pa
 
     specs = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
     judged_values = rows.select(_JUDGED).to_pylist()
-    # by identity, because the hash of a `SpecFile` covers its whole text
+    # the id is the key, because hashing a `SpecFile` reads its whole text
     lines = {id(request.file): dict(request.file.lines) for request in requests}
     meanings = {id(request.file): dict(request.file.meanings) for request in requests}
     requirements = zip(columns["requirement"].to_pylist(), requests, strict=True)
@@ -784,7 +785,7 @@ _JUDGED += ["faults", "error"]
 
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
-    """Return why a row does not pass, in a few words; None if it passes."""
+    """Return the reason for the failure of a row, in a few words; None if the row passes."""
     if row["verdict"] is None:
         return cast("str | None", row["error"])
     return expectation.failure(cast(Outcome, SimpleNamespace(**{**row, "lower": _lower(row)})), fail_on)

@@ -26,20 +26,20 @@ Values: TypeAlias = dict[str, Any]
 """A row of a table: values by column."""
 
 VERDICTS: Final = ("satisfied", "violated", "unknown", "doubtful", "untested")
-"""Verdicts, and the words for results that fail as doubtful or as tested by nothing."""
+"""Verdicts, and the two words that replace the verdict of doubtful and of untested results."""
 _WORDS: Final = MappingProxyType({"doubtful": DOUBTFUL, "untested": UNTESTED})
-"""Beginnings of failures, by the words that replace the verdict."""
+"""Beginnings of failures, by the word that replaces the verdict."""
 WORSE: Final = "worse_than_baseline"
-"""Column of a table with a baseline: whether a result is worse than in the baseline, or gone."""
+"""Column of a table with a baseline: whether the result is worse than in the baseline, or gone."""
 EDITED: Final = "edited_since_baseline"
-"""Column of a table with a baseline: whether the meaning of the spec has changed since."""
+"""Column of a table with a baseline: whether the spec's meaning has changed since the baseline."""
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
 RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
     {"violated": 0, None: 1, "unknown": 2, "untested": 2, "satisfied": 3}
 )
-"""Ranks of verdicts, the worst first. None is an error or a result that is gone."""
+"""Ranks of verdicts, the worst first. None stands for an error or a gone result."""
 _LONGEST_CONDITION: Final = 1_000
 """Length limit, characters: https://docs.python.org/3/library/ast.html#ast.parse may crash on long texts."""
 
@@ -52,13 +52,12 @@ class Total:
         group: common values of the results, by column.
         satisfied, violated, unknown, doubtful, untested: numbers of results, see `VERDICTS`.
         errors: number of results with an error instead of a verdict.
-        failures: number of results that do not pass.
-        least: least robustness; None if none is determined.
-        worse: number of results of unchanged specs that are worse than in a baseline, or gone; None without a
-            baseline.
-        worse_edited: the same number for specs that were edited since the baseline; None without a baseline.
+        failures: number of failing results.
+        least: least robustness; None if no robustness is determined.
+        worse: number of worse or gone results of unedited specs; None without a baseline.
+        worse_edited: number of worse or gone results of edited specs; None without a baseline.
         is_edited: whether the spec was edited since the baseline.
-        requirement, title, unit: values of the spec; None for a log, and for a spec without them.
+        requirement, title, unit: values of the spec, or None. The totals of a log have None.
     """
 
     group: Values
@@ -84,7 +83,7 @@ class Total:
 
 
 def result_name(spec: str, object_name: str | None) -> str:
-    """Return the name of a result: its spec, with the object of a template."""
+    """Return the name of a result: the spec, and the object of a template."""
     return spec if object_name is None else f"{spec}({object_name})"
 
 
@@ -94,7 +93,7 @@ def requirement_of(row: Values) -> str:
 
 
 def robustness_of(row: Values) -> str:
-    """Return the robustness of a row with its interval; "" for an error."""
+    """Return the robustness of a row and its interval as text; "" for an error."""
     if row["verdict"] is None:
         return ""
     columns = "robustness", "lower", "upper"
@@ -103,7 +102,7 @@ def robustness_of(row: Values) -> str:
 
 
 def verdict_word(row: Values) -> str:
-    """Return the verdict of a row, see `VERDICTS`; "error" or "gone" if it has none."""
+    """Return the verdict of a row, see `VERDICTS`. A row without a verdict has "error" or "gone"."""
     for word, beginning in _WORDS.items():
         if (row["failure"] or "").startswith(beginning):
             return word
@@ -111,12 +110,12 @@ def verdict_word(row: Values) -> str:
 
 
 def damage_word(row: Values) -> str:
-    """Return a suffix for verdicts of damaged logs; "" for other logs."""
+    """Return the suffix for a verdict over a damaged log; "" for other logs."""
     return " (damaged log)" if row["faults"] and row["verdict"] else ""
 
 
 def summary_text(table: pa.Table) -> str:
-    """Return a line that counts the results of a table by verdict, and the expected ones among them."""
+    """Return the numbers of results with each verdict, and the numbers of expected results, in one line."""
     passes, counts, damaged_count = Counter[str](), Counter[str](), 0
     columns = ("verdict", "error", "failure", "faults")
     for values in zip(*(table.column(name).to_pylist() for name in columns), strict=True):
@@ -140,7 +139,7 @@ def summary_text(table: pa.Table) -> str:
 
 
 def _count_text(text: str, total: int, passed: int) -> str:
-    """Return a count of results with the number of expected ones."""
+    """Return a count of results with the number of passing results."""
     if not passed:
         return text
     return f"{text} as expected" if passed == total else f"{text} ({passed:,} as expected)"
@@ -171,7 +170,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     aggregations = [(f"n_{name}", "sum") for name in flags]
     spec_columns = ("requirement", "title", "unit") if by == "spec" else ()
     columns |= {name: table.column(name) for name in spec_columns}
-    # the first value is the current one: rows of gone results come last, with values of the baseline
+    # the first value is the run's: rows of gone results come last, with values of the baseline
     aggregations += [(name, "first") for name in spec_columns]
     aggregations += [("edited", "max")] if "edited" in columns else []
     # with several threads, pyarrow's TableGroupBy does not keep the order of the rows
@@ -193,7 +192,9 @@ class FlakyResult:
     """A result that passes in some runs of one log, and fails in others.
 
     Attributes:
-        log: the log's name without the numbers of its runs.
+        log: name of the log without the number of the run.
+        failed: number of runs in which the result fails.
+        runs: number of all runs.
     """
 
     case: str
@@ -216,7 +217,7 @@ RUN: Final = re.compile(r"#\d+(?=[./])")
 
 
 def flaky_results(table: pa.Table) -> list[FlakyResult]:
-    """Return the flaky results of repeated runs. Names of such logs differ only in a number after "#"."""
+    """Return the flaky results of repeated runs. The logs' names differ only in a number after "#"."""
     failures_by_result: dict[Key, list[bool]] = defaultdict(list)
     for key, failure in zip(keys_of(table), table.column("failure").to_pylist(), strict=True):
         case, log, file, spec, object_name = key
@@ -231,7 +232,7 @@ def flaky_results(table: pa.Table) -> list[FlakyResult]:
 
 
 def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
-    """Return the columns of counts by heading. Columns of rare words are left out if all counts are 0."""
+    """Return the counts of all totals, by heading. Columns of rare words are left out if all counts are 0."""
     attributes = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
     if any(row.worse is not None for row in rows):
         attributes |= {"worse": "worse", "edited": "worse_edited"}
@@ -246,8 +247,8 @@ def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
 def worst_rows(table: pa.Table, count: int) -> list[Values]:
     """Return the worst rows: failures first, then by verdict and robustness.
 
-    Numbers in different units are not compared: the worst row of each unit comes first, then the second of
-    each.
+    Numbers in different units are not compared: the worst row of each unit comes first, then the second row
+    of each unit.
     """
     import pyarrow.compute as pc
 
@@ -285,7 +286,7 @@ def rows_where(table: pa.Table, condition: str) -> pa.Table:
     text (`"door" in log`). `and`, `or`, `not` and parentheses join conditions. `none` is an absent value.
 
     Raises:
-        UsageError: the text is no such condition, or names a column that the table lacks.
+        UsageError: the text is no condition, or names a missing column.
     """
     import pyarrow as pa
     import pyarrow.dataset as ds
@@ -308,11 +309,11 @@ def rows_where(table: pa.Table, condition: str) -> pa.Table:
 
 _SINGLE_EQUALS: Final = re.compile(r"(?<![=!<>])=(?!=)")
 _MOST_VALUES: Final = 5
-"""Values of a column that a message lists."""
+"""Maximum number of a column's values in a message."""
 
 
 def absent_values(table: pa.Table, condition: str) -> Iterator[str]:
-    """Yield a sentence for each text in a condition that no row of its column has.
+    """Yield a sentence for each text in a condition that is not a value of its column.
 
     Args:
         condition: as for `rows_where`.
@@ -355,7 +356,7 @@ _COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = Mappi
 
 @dataclass(frozen=True, slots=True)
 class _Condition:
-    """Turns the syntax tree of a condition into an expression of Arrow; nothing is executed."""
+    """Converts the syntax tree of a condition to an Arrow expression. Python executes nothing of it."""
 
     names: list[str]
     text: str
@@ -425,7 +426,7 @@ Change: TypeAlias = Literal["worse", "verdict", "gone", "better", "more", "new"]
 
 WORSE_THAN: Final = "worse than the baseline"
 EDITED_SINCE: Final = "edited since the baseline"
-"""Beginnings of failures of results that are worse than in a baseline."""
+"""Beginnings of the failures of worse results: of an unedited and of an edited spec."""
 BASELINE_VERDICT: Final = "baseline_verdict"
 BASELINE_ROBUSTNESS: Final = "baseline_robustness"
 _NUMBER: Final = r"((?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?)"
@@ -433,16 +434,16 @@ _UNIT: Final = r"([^\W\d]\S{0,20})?"
 _TOLERANCE: Final = re.compile(rf"{_NUMBER} ?%(?:, *at least {_NUMBER} ?{_UNIT})?|{_NUMBER} ?{_UNIT}")
 _KEY: Final = ("case", "log", "file", "spec", "object")
 _ORDER: Final = {"satisfied": 0, "untested": 1, "unknown": 1, "violated": 2, None: 3}
-"""Verdicts from good to bad; None is an error."""
+"""Ranks of verdicts from good to bad; None is an error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Accepted loss of robustness: the greater one of a share and an amount.
+    """Accepted loss of robustness: a share or an amount, whichever is greater.
 
     Attributes:
-        share: share of the baseline's robustness.
-        amount: in units of robustness.
+        share: share of the baseline's robustness, from 0.
+        amount: loss in units of robustness.
         unit: unit of the amount; "" for results without a unit.
     """
 
@@ -467,10 +468,10 @@ class Tolerance:
         return cls(float(percent or 0.0) / 100.0, float(amount or floor or 0.0), unit or floor_unit or "")
 
     def check(self, units: Iterable[str | None]) -> None:
-        """Check that an absolute amount has a unit of the results.
+        """Check that the unit of an amount is a unit of the results.
 
         Raises:
-            UsageError: the amount lacks a unit that results have, or has a unit that no result has.
+            UsageError: the amount lacks the results' unit, or no result has the amount's unit.
         """
         units_of_results = sorted({unit for unit in units if unit and unit != "1"})
         if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):
@@ -485,10 +486,10 @@ class Tolerance:
         raise UsageError(f"--tolerance {self.amount:g}{self.unit}: robustness {unit_text}; {remedy}")
 
     def allows(self, before: float | None, now: float | None, unit: str = "") -> bool:
-        """Return whether a loss of robustness is within the tolerance.
+        """Return whether the loss of robustness since the baseline is within the tolerance.
 
         Args:
-            unit: unit of both numbers; an amount in another unit allows nothing.
+            unit: unit of both numbers. An amount in another unit allows no loss.
         """
         if before is None or now is None:
             return before is None
@@ -503,11 +504,11 @@ class Difference:
     """One result that differs from the baseline.
 
     Attributes:
-        change: "worse" or "more" for robustness that changes by more than the tolerance. "verdict" or
-            "better" for a worse or better verdict. "gone" or "new" for a result of only one table.
+        change: "worse" or "more" for a change of robustness beyond the tolerance. "verdict" or "better" for a
+            worse or better verdict. "gone" or "new" for a result of only one table.
         case, log, file, spec, object: key of the result.
         before, now: verdicts; None for an error or a missing result.
-        before_robustness, robustness: None where not determined.
+        before_robustness, robustness: robustness of the two results; None if not determined.
         is_edited: whether the spec was edited since the baseline.
     """
 
@@ -547,7 +548,7 @@ class Difference:
 def compare(
     table: pa.Table, baseline: pa.Table, tolerance: Tolerance, *, with_all: bool = False
 ) -> list[Difference]:
-    """Return the differences of a run from a baseline, the worst first.
+    """Return the differences between a run and a baseline, the worst first.
 
     Results are matched by case, log, specification file, spec and object.
 
@@ -571,7 +572,7 @@ def compare(
 
 
 def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, str]]:
-    """Return case, file and name of each spec whose meaning differs from the baseline."""
+    """Return the case, file and name of each spec whose meaning has changed since the baseline."""
 
     def meanings(rows: pa.Table) -> dict[tuple[str, str, str], str | None]:
         columns, hashes = ("case", "file", "spec"), rows.column("meaning").to_pylist()
@@ -583,7 +584,7 @@ def edited_specs(table: pa.Table, baseline: pa.Table) -> list[tuple[str, str, st
 
 
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
-    """Return the table of a run in which worse results fail, and gone results have a row.
+    """Return the table of a run with a baseline: worse results fail, and gone results have rows.
 
     The columns `baseline_verdict` and `baseline_robustness` hold the earlier results. `worse_than_baseline`
     marks worse and gone results. `edited_since_baseline` marks specs whose meaning has changed.
@@ -601,7 +602,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         if difference.change == "gone":
             gone_results.append(difference)
         elif difference.fails:
-            # one row with an error stands for all objects of a template
+            # all objects of a template share one row with an error
             key = difference.key if difference.key in present_keys else (*difference.key[:-1], None)
             beginning = EDITED_SINCE if difference.is_edited else WORSE_THAN
             worse_texts[key].append(f"{beginning}: {difference.failure}")
@@ -638,11 +639,11 @@ _LISTS: Final = (
     "remarks",
     "missing",
 )
-"""Columns that hold lists of texts."""
+"""Columns with lists of texts."""
 
 
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
-    """Return the row of a gone result, given its row in the baseline."""
+    """Return the row of a gone result, from its row in the baseline."""
     copied_columns = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
     empty_lists: dict[str, Any] = {name: [] for name in _LISTS}
     return {
@@ -676,10 +677,10 @@ def _differences(
 ) -> Iterator[Difference]:
     spec_keys = {key[:-1] for key in current_results}
     for key, (old_verdict, old_number) in earlier_results.items():
-        # one row with an error stands for all objects of a template
+        # all objects of a template share one row with an error
         current_result = current_results.get(key) or current_results.get((*key[:-1], None))
         if current_result is None and old_verdict is None and key[:-1] in spec_keys:
-            # the baseline had one row with an error for all objects, which have results now
+            # an error that all objects shared in the baseline; the objects have results now
             continue
         if current_result is None:
             yield Difference(
@@ -704,7 +705,7 @@ def _differences(
                 robustness=new_number,
             )
     for key, (new_verdict, new_number) in current_results.items():
-        # one row with an error for all objects of a template is no new result
+        # an error that all objects of a template share is no new result
         if key not in earlier_results and not (new_verdict is None and key[-1] is None):
             yield Difference(
                 "new", *key, before=None, now=new_verdict, before_robustness=None, robustness=new_number
@@ -723,11 +724,11 @@ def _describe_verdict(verdict: str | None, number: float | None) -> str:
 
 MOST_WORST: Final = 10
 MOST_FLAKY: Final = 20
-"""Numbers of worst rows and of flaky results that a report lists."""
+"""Maximum numbers of worst rows and of flaky results in a report."""
 
 
 def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
-    """Return the headings of the number columns, and one row per total: three names, then the numbers."""
+    """Return the headings of the number columns, and a row for each total: three names and its numbers."""
     counts_by_heading = counts_of(rows)
     cell_rows = []
     for index, total in enumerate(rows):

@@ -28,7 +28,7 @@ _PARTIAL: Final = ".partial"
 
 
 class LocalFolder:
-    """A folder on this machine. Files are written under temporary names first, so no file is partial."""
+    """A folder on this machine. Each file has a temporary name until it is complete."""
 
     is_on_this_machine: Final = True
 
@@ -52,14 +52,14 @@ class LocalFolder:
         return next(self._files(self.path), None) is not None
 
     def names(self, below: str = "") -> list[str]:
-        """Return the sorted names of all files in the folder, or in a folder below."""
+        """Return the sorted names of all files in the folder, or in its subfolder `below`."""
         return sorted(file.removeprefix(f"{self.path}/") for file in self._files(self.path / below))
 
     def read(self, names: Sequence[str]) -> Iterator[bytes]:
-        """Read files, and yield the content of each in their order.
+        """Read files, and yield their contents in the same order.
 
         Raises:
-            MissingFileError, LogError: a file is missing, or cannot be read.
+            MissingFileError, LogError: a file is missing or unreadable.
         """
         for name in names:
             try:
@@ -71,7 +71,7 @@ class LocalFolder:
             yield data
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and create its folders.
+        """Write a file, and create its folders if needed.
 
         Raises:
             OutputError: the file cannot be written.
@@ -98,7 +98,7 @@ class LocalFolder:
 
     @staticmethod
     def _files(folder: Path) -> Iterator[str]:
-        """Yield the paths of all files in a folder and below, without partial ones."""
+        """Yield the paths of all files in a folder and its subfolders, without partial files."""
         for parent, _, names in os.walk(folder):
             yield from (f"{parent}/{name}" for name in names if not name.endswith(_PARTIAL))
 
@@ -107,7 +107,7 @@ class LocalFolder:
         """Lock the folder against other commands, and remove partial files of killed commands.
 
         Raises:
-            UsageError: another command is writing here.
+            UsageError: another command is writing to the folder.
         """
         with (self.path / name).open("rb") as stream:
             try:
@@ -122,13 +122,13 @@ class LocalFolder:
 
 
 class BucketFolder(RemoteFolder):
-    """A folder in a bucket. Many machines write to it, so it has no lock and no states of local files."""
+    """A folder in a bucket. Many machines may write to it: it has no lock and no states of local files."""
 
     is_on_this_machine: Final = False
 
     @contextmanager
     def lock(self, name: str) -> Iterator[None]:
-        """Lock nothing, because a killed batch could not release a lock in a bucket."""
+        """Do nothing. A killed batch could not release a lock in a bucket."""
         yield
 
 
@@ -136,30 +136,30 @@ ResultFiles: TypeAlias = LocalFolder | BucketFolder
 
 
 def result_files(folder: str | PathLike[str]) -> ResultFiles:
-    """Return the folder of a path or an address.
+    """Return the local folder of a path, or the bucket's folder of an address.
 
     Raises:
-        UsageError: the argument is neither a folder nor an address of one, or obstore is not installed.
+        UsageError: the path is a file, the address is no folder, or obstore is not installed.
     """
     return BucketFolder(fspath(folder)) if is_address(folder) else LocalFolder(Path(folder))
 
 
 FORMAT: Final = 4
-"""Version of the layout; rows of another version are never read."""
+"""Version of the layout. Rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
 SOURCE: Final = "source"
 """Column with the name of the evaluated file. Logs of equal content share their rows."""
 EXPLANATION: Final = ("atom", "atom_time_ns", "atom_objects", "reason", "explanation")
-"""Columns of the explanation; null until a result is explained."""
+"""Columns of the explanation. The columns of an unexplained result are null."""
 _FORMAT_FILE: Final = "format.json"
 _IDENTITIES: Final = "identities.parquet"
 _ROWS: Final = "rows"
 _MOST_TOGETHER: Final = 500
-"""Keys per file of rows. The rows of a file wait in memory until it is written."""
+"""Maximum number of keys per file of rows. The rows of a file stay in memory until it is written."""
 _LONGEST_WAIT_S: Final = 0.5
-"""Time between two files of rows, seconds. A killed batch loses the results of this time."""
+"""Longest time between two files of rows, seconds. A killed batch loses the results of this time."""
 _MOST_SMALL: Final = 50
-"""Number of small files of rows above which they are joined."""
+"""Maximum number of small files of rows. More files are joined."""
 _DIGEST_BYTES: Final = 32
 
 
@@ -175,7 +175,7 @@ def columns() -> pa.Schema:
 
 
 def run_columns() -> pa.Schema:
-    """Return the columns of the table of a run: stored rows with their requests."""
+    """Return the columns of a run's table: the columns of stored rows and of their requests."""
     pa = _pyarrow()
     text_type = pa.string()
     run_columns = [(name, text_type) for name in ("case", "log", "file", "meaning", "expected", "failure")]
@@ -183,7 +183,7 @@ def run_columns() -> pa.Schema:
 
 
 def _schema(columns: Sequence[Any]) -> pa.Schema:
-    """Return a schema whose integers stay integers in pandas, also in columns with nulls."""
+    """Return a schema with integers that stay integers in pandas, even in columns with nulls."""
     schema = _pyarrow().schema(columns)
     integer_columns = [
         {"name": column.name, "field_name": column.name, "numpy_type": "Int64", "metadata": None}
@@ -196,7 +196,7 @@ def _schema(columns: Sequence[Any]) -> pa.Schema:
 
 
 def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
-    """Return rows by key as a table. Unknown numbers are null."""
+    """Return the rows of keys as a table. Unknown numbers are null."""
     pa, schema = _pyarrow(), columns()
     key, *value_columns = schema
     all_rows = [row for rows_of_key in rows.values() for row in rows_of_key]
@@ -211,9 +211,9 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
 
 
 def _encode_table(table: pa.Table) -> bytes:
-    """Return a table as Parquet with a SHA-256 digest of its other bytes before the footer.
+    """Return a table as a Parquet file with a SHA-256 digest of all other bytes before the footer.
 
-    Parquet readers skip bytes that no column refers to.
+    Parquet readers skip the digest, because no column refers to it.
     """
     from pyarrow import parquet
 
@@ -244,7 +244,7 @@ def _decode_table(data: bytes) -> pa.Table:
 
 
 def _footer(data: bytes) -> int:
-    """Return the offset of a Parquet footer, whose length and `PAR1` end the file, 4 bytes each."""
+    """Return the offset of a Parquet footer. Its length and `PAR1`, 4 bytes each, are the end of the file."""
     return max(0, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
 
 
@@ -269,7 +269,7 @@ class NewRows:
             self.write()
 
     def write(self) -> None:
-        """Write the waiting rows, with the errors of `add`."""
+        """Write the rows in memory, with the errors of `add`."""
         if self._waiting_rows:
             table = table_of(self._waiting_rows)
             _write_rows(self._files, table)
@@ -298,7 +298,7 @@ class ResultsFolder:
         """Open a folder of results for a batch, and create it if needed.
 
         Raises:
-            UsageError: the folder holds something else, or results of another version.
+            UsageError: the folder has other contents, or results of another version.
             OutputError: the folder cannot be written.
             MissingFileError, RemoteError: a bucket cannot be read.
         """
@@ -344,9 +344,9 @@ class ResultsFolder:
         return self._files.lock(_FORMAT_FILE)
 
     def rows(self, lasting: set[str]) -> tuple[pa.Table, list[str]]:
-        """Return the stored rows of `lasting` keys, grouped by key, and a remark on each damaged file.
+        """Return the stored rows with keys in `lasting`, grouped by key, and a remark on each damaged file.
 
-        Damaged files are removed, and small files are joined. Call it inside `lock`.
+        Damaged files are removed, and small files are joined. The caller holds the `lock`.
 
         Raises:
             OutputError: a file cannot be removed or written.
@@ -372,13 +372,17 @@ class ResultsFolder:
         return _pyarrow().concat_tables(tables), remarks
 
     def _join(self, tables: Mapping[str, pa.Table]) -> None:
-        """Replace several files of rows by one, given their tables by name."""
+        """Replace several files of rows by one file.
+
+        Args:
+            tables: tables of the files, by name.
+        """
         name = _write_rows(self._files, _pyarrow().concat_tables(tables.values()))
         self._files.remove(sorted(set(tables) - {name}))
 
     @contextmanager
     def new_rows(self) -> Iterator[NewRows]:
-        """Return a writer of rows. The last rows are written when the block ends, even after an interruption.
+        """Return a writer of rows. At the end of the block, even after an interruption, it writes all rows.
 
         Raises:
             OutputError: rows cannot be written.
@@ -390,9 +394,9 @@ class ResultsFolder:
             rows.write()
 
     def identities(self) -> tuple[dict[str, str], list[str]]:
-        """Return the stored identities of logs by state, and a remark if their file is damaged.
+        """Return the stored identities of logs by state, and a remark on a damaged file of identities.
 
-        A bucket stores none, because a path means different files on different machines.
+        A bucket has no identities, because a path means different files on different machines.
         """
         if not self._files.is_on_this_machine:
             return {}, []
@@ -421,7 +425,7 @@ class ResultsFolder:
             self._files.write(_IDENTITIES, _encode_table(pa.table(columns)))
 
     def write_run(self, table: pa.Table) -> None:
-        """Write the table of a run, whole or not at all.
+        """Write the table of a run. After an error, the earlier table is unchanged.
 
         Raises:
             OutputError: the table cannot be written.
@@ -445,7 +449,7 @@ class ResultsFolder:
             raise LogError(f"{error}; run the batch again to replace it") from None
 
     def read_explanations(self) -> dict[tuple[str, str, str | None], tuple[Any, ...]]:
-        """Return the explanations in the last run by key, spec and object, see `EXPLANATION`."""
+        """Return the last run's explanations by key, spec and object, see `EXPLANATION`."""
         import pyarrow.compute as pc
 
         try:

@@ -1,7 +1,7 @@
 """Suites: logs with their specifications and the expected results.
 
-A suite comes from a YAML file or a command line. A suite names logs by patterns, folders and addresses;
-`run.find_logs` finds the logs.
+A suite is read from a YAML file, or built from a command line. A suite names logs by patterns, folders and
+addresses, and `run.find_logs` finds the logs.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ class Conditions:
     """Options of reading logs and of evaluating specifications.
 
     Attributes:
-        mapping: the mapping file or its address, or None.
+        mapping: path or address of the mapping file, or None.
         reading: further keyword arguments of `open_source`.
-        start, end: the window, as times in text; None for the ends of the log.
-        every: every `every`th sample is evaluated.
-        each: for each parameter of a template its objects: "all", "class:NAME" or a name.
+        start, end: window of evaluation, as texts; None for the ends of the log.
+        every: step between evaluated samples: 1 for all samples.
+        each: parameters of templates and their objects: "all", "class:NAME" or a name.
         semantics: "ltlf" or "paper".
-        strict_names: whether names that a log never has are errors.
-        constants: values that replace those in the specifications.
-        requires: requirements on a log, as JSON; "" for none.
+        strict_names: whether names that are missing in a log are errors.
+        constants: names and values of changed constants.
+        requires: requirements on a log, as JSON; "" without requirements.
     """
 
     mapping: Path | str | None = None
@@ -74,7 +74,7 @@ class Conditions:
         """Return conditions from tables.
 
         Args:
-            reading: keyword arguments of `open_source`, the mapping among them.
+            reading: keyword arguments of `open_source`, with the mapping.
             others: further attributes.
         """
         options = dict(reading)
@@ -100,7 +100,7 @@ DAMAGED: Final = "the log is damaged"
 
 
 class Outcome(Protocol):
-    """The values of a result that decide whether it passes; see `ResultRow`."""
+    """The values of a result that decide between pass and failure; see `ResultRow`."""
 
     @property
     def verdict(self) -> str | None: ...
@@ -127,9 +127,9 @@ class Expectation:
     """Expectations of a case for every result.
 
     Attributes:
-        verdict: the verdict that passes.
-        at_least: least robustness that passes, independent of the verdict; None without a limit.
-        tolerance: allowance below the limit, for rounding.
+        verdict: expected verdict.
+        at_least: least expected robustness, instead of a verdict; None without a limit.
+        tolerance: accepted loss below the limit, for rounding.
         allow_unknown: whether an unknown verdict passes, too.
         allow: kinds of inconclusive results that pass: "vacuous", "dropped" and "doubtful".
     """
@@ -149,14 +149,14 @@ class Expectation:
         return f"{self.verdict}{unknown_text}"
 
     def verdict_of(self, verdict: str | None, lower: float) -> str | None:
-        """Return the verdict of a result. A violation within the tolerance counts as satisfied."""
+        """Return the verdict of a result. A violation within the tolerance becomes "satisfied"."""
         has_tolerance = self.verdict is Verdict.SATISFIED and self.at_least is None and self.tolerance > 0.0
         if has_tolerance and verdict == Verdict.VIOLATED and lower >= -self.tolerance:
             return str(Verdict.SATISFIED)
         return verdict
 
     def failure(self, outcome: Outcome, fail_on: AbstractSet[str] = frozenset()) -> str | None:
-        """Return why a result with a verdict does not pass, in a few words; None if it passes.
+        """Return the reason for the failure of a result with a verdict; None if the result passes.
 
         Args:
             fail_on: kinds of results that fail even if the case allows them, see `FAILING_KINDS`.
@@ -200,10 +200,10 @@ DEFAULT_EXPECTATION: Final = Expectation()
 
 @dataclass(frozen=True, slots=True)
 class LogPattern:
-    """Logs as a suite names them: a file, a folder, a pattern or an address.
+    """A file, a folder, a pattern or an address of logs in a suite.
 
     Attributes:
-        place: file and line of the text, for errors; "" on a command line.
+        place: file and line of the text, for errors; "" for a command line.
     """
 
     text: str
@@ -215,13 +215,13 @@ class Case:
     """Logs that are evaluated with the same specifications under the same conditions.
 
     Attributes:
-        name: unique in its suite.
+        name: name of the case, unique in its suite.
         logs: patterns of logs, relative to the suite's folder.
-        specs: the specification files, or their addresses.
-        requirements: ids of the case's requirements; the id of a spec has priority.
-        at_least_logs: least number of logs that the patterns have to find.
-        places: file and line of each key, for errors; none on a command line.
-        is_whole: whether specs, constants and objects of parameters are complete; faulty values are left out.
+        specs: paths or addresses of the specification files.
+        requirements: ids of the case's requirements, for specs without an id.
+        at_least_logs: least number of logs; fewer logs are a fault.
+        places: file and line of each key, for errors; empty for a command line.
+        is_whole: whether specs, constants and objects of parameters have no faulty value, which is left out.
     """
 
     name: str
@@ -235,7 +235,7 @@ class Case:
     is_whole: bool = True
 
     def place(self, key: str) -> str:
-        """Return the beginning of an error, with the place of a key; "" for a case from a command line."""
+        """Return the beginning of an error: the place of a key and the case; "" for a command line."""
         places = dict(self.places)
         return f"{places.get(key, places[''])}: case {self.name[:60]!r}: " if places else ""
 
@@ -247,9 +247,9 @@ class Suite:
     Attributes:
         name: name in reports: the stem of the suite's file.
         folder: base of relative log paths.
-        cases: at least one; their names differ.
-        path: the suite's file, or None.
-        faults: lines and messages of faults in the file; `prepare` raises them together with others.
+        cases: one case or more, with different names.
+        path: path of the suite's file; None for a command line.
+        faults: lines and messages of faults in the file; `prepare` raises them with all other faults.
     """
 
     name: str
@@ -259,7 +259,7 @@ class Suite:
     faults: tuple[tuple[int, str], ...] = ()
 
     def allowing(self, kinds: AbstractSet[str]) -> Suite:
-        """Return the suite with further kinds of inconclusive results that pass in every case."""
+        """Return the suite with further allowed kinds of inconclusive results in every case."""
         cases = [
             replace(case, expectation=replace(case.expectation, allow=case.expectation.allow | kinds))
             for case in self.cases
@@ -273,7 +273,7 @@ class Suite:
         specs: Sequence[Path | str],
         conditions: Conditions = DEFAULT_CONDITIONS,
     ) -> Suite:
-        """Return a suite of one case, named "logs", with paths relative to the current folder."""
+        """Return a suite with one case, named "logs". Paths are relative to the current folder."""
         patterns = tuple(LogPattern(log) for log in logs)
         return cls("batch", Path(), (Case("logs", patterns, tuple(specs), conditions),))
 
@@ -282,7 +282,7 @@ def load_suite(path: str | PathLike[str]) -> Suite:
     """Load a suite file (YAML; `schemas/suite.schema.json`).
 
     Keys next to `cases` are the defaults of all cases. Paths are relative to the file. Faults of the file are
-    in `Suite.faults`, and `prepare` raises them together with others.
+    in `Suite.faults`, and `prepare` raises them with all other faults.
 
     Raises:
         MissingFileError: there is no such file.
@@ -326,7 +326,7 @@ def _case(
 
     Args:
         places: places of the case (key "") and of its keys.
-        wrong: places of faults, and all places that contain them.
+        faults: places of faults, and all places that contain a fault.
     """
     folder = path.parent
     line_texts = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
@@ -377,7 +377,7 @@ def _case(
 
 
 def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
-    """Yield the faults that a schema cannot express, of a value of any type."""
+    """Yield the faults in a suite that a schema cannot express. The value may have any type."""
     if not isinstance(value, dict):
         return
     yield from _wrong_values(value, (), folder)
@@ -421,7 +421,7 @@ def _wrong_values(entry: Mapping[str, Any], place: Place, folder: Path) -> Itera
 
 
 def _file(name: str, folder: Path) -> Path | str:
-    """Return the path of a file of a suite, or its address."""
+    """Return the path of a file in a suite; an address is unchanged."""
     return name if is_address(name) else folder / name
 
 
@@ -437,5 +437,5 @@ def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
 
 
 def _as_list(value: Any) -> Sequence[Any]:
-    """Return the values of a key that has one text or a list; nothing for other types."""
+    """Return the values of a key with one text or a list. Other types have no values."""
     return [value] if isinstance(value, str) else value if isinstance(value, list) else ()

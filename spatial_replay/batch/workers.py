@@ -1,8 +1,8 @@
 """Processes that work on many tasks: on this machine, or on a Dask cluster.
 
-Executors take a function and tasks, and yield results as they arrive. If a worker on this machine dies, the
-tasks of its pool run once more, one by one. A task whose worker dies again has the result `WorkerLost`.
-Scheduling is left to `concurrent.futures` and Dask.
+An executor applies a function to tasks, and yields the results as they arrive. If a worker on this machine
+dies, the tasks of its pool run once more, one by one. A task whose worker dies again has the result
+`WorkerLost`. `concurrent.futures` and Dask schedule the tasks.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Progress: TypeAlias = Callable[[str, int | None], AbstractContextManager[Callabl
 """Progress factory: (label, total) → context manager that yields `advance(steps)`."""
 
 _AHEAD: Final = 2
-"""Tasks handed out per process, so that no process waits for its next task."""
+"""Submitted tasks per process, so that no process waits for its next task."""
 _PRELOADED: Final = "spatial_replay.batch.run"
 """Module that the fork server imports once for all workers."""
 _PATIENCE_S: Final = 10
-"""Time without a finished task after which missing workers of a cluster are reported, seconds."""
+"""Delay of the report that a cluster has no workers, seconds without a finished task."""
 _ANSWER_S: Final = 15
 """Timeout for the scheduler of a cluster, seconds."""
 
@@ -55,7 +55,7 @@ class Workers(Protocol):
     def results(
         self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]
     ) -> Iterator[tuple[_Task, _Result | WorkerLost]]:
-        """Yield each task with its result, in any order. Errors of `work` are passed on."""
+        """Yield each task with its result, in any order. Errors of `work` are raised."""
 
 
 class ThisProcess:
@@ -70,7 +70,7 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Works in several processes on this machine, which end with this process, even if it is killed."""
+    """Works in several processes on this machine. They end with this process, even if it is killed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -86,7 +86,7 @@ class LocalProcesses:
                 yield from _results(pool, work, remaining_tasks, self._count * _AHEAD, suspects)
             if not suspects:
                 return
-            # one of these tasks killed its process, but it is unknown which one: each runs alone
+            # one of these tasks killed its process; each runs alone, to find that task
             for task in suspects:
                 lost_tasks: list[_Task] = []
                 with _pool(1, lost_tasks) as pool:
@@ -105,7 +105,12 @@ def _results(
     most_pending: int,
     suspects: list[_Task],
 ) -> Iterator[tuple[_Task, _Result]]:
-    """Yield results until the tasks end or the pool breaks; `suspects` gets its unfinished tasks."""
+    """Yield results until the tasks end or the pool breaks.
+
+    Args:
+        most_pending: maximum number of submitted tasks.
+        suspects: receives the unfinished tasks of a broken pool.
+    """
     tasks_by_future: dict[Future[_Result], _Task] = {}
     is_usable = True
     while True:
@@ -145,12 +150,12 @@ def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
             except BaseException:
                 sender.close()
                 pool.shutdown(wait=False, cancel_futures=True)
-                # a process that is still starting would fail when this one removes its resources
+                # a starting process would fail when this process removes its resources
                 for process in set(multiprocessing.active_children()) - other_processes:
                     process.kill()
                 raise
             if suspects:
-                # otherwise the executor waits for a process that was starting when another one died
+                # otherwise the executor waits for a process that was starting when another process died
                 sender.close()
     finally:
         sender.close()
@@ -159,7 +164,7 @@ def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
 
 def _begin_worker(connection: Connection) -> None:
     """Make this process end when the other end of the connection is closed."""
-    # a fork server that was started elsewhere may not block Ctrl-C
+    # a fork server from another module may not block Ctrl-C
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
 
@@ -174,15 +179,15 @@ def _end_with(connection: Connection) -> None:
 class DaskCluster:
     """Works on a Dask cluster, through the executor of its client.
 
-    The scheduler decides how often the task of a dead worker runs again. Each use has its own client, because
-    a closed client cannot be reopened.
+    The scheduler decides how often the task of a dead worker runs again. Each use has a new client, because a
+    closed client cannot be reopened.
     """
 
     def __init__(self, address: str, report: Callable[[str], None] = lambda text: None) -> None:
         """Check that the scheduler answers.
 
         Args:
-            address: such as "tcp://scheduler:8786".
+            address: address of the scheduler, such as "tcp://scheduler:8786".
             report: receives messages for a waiting user.
 
         Raises:
@@ -244,7 +249,7 @@ class DaskCluster:
         return bool(tasks_by_future)
 
     def _result(self, future: Future[Any]) -> Any:
-        """Return the result of a task, or `WorkerLost`. Errors of its work are passed on."""
+        """Return the result of a task, or `WorkerLost`. Errors of its work are raised."""
         from distributed import KilledWorker
 
         try:
@@ -262,11 +267,11 @@ class DaskCluster:
 
     @contextmanager
     def _connection(self) -> Iterator[Any]:
-        """Connect a client, which is closed even if the cluster is gone."""
+        """Connect a client, and close it at the end, even if the cluster is gone."""
         with importing("clusters need Dask", extra="cluster"):
             import distributed
         client_type = cast(Any, distributed).Client
-        # built in two steps: a client that cannot connect is closed here, not when Python exits
+        # created in two steps, to close a client without a connection here, and not when Python exits
         client = client_type.__new__(client_type)
         try:
             client.__init__(self._address, timeout=_ANSWER_S, set_as_default=False)
@@ -287,7 +292,7 @@ class DaskCluster:
 
 @contextmanager
 def _silent(*loggers: str) -> Iterator[None]:
-    """Silence loggers that write tracebacks of errors which this module raises itself."""
+    """Silence loggers with tracebacks of errors that this module raises itself."""
     named_loggers = [logging.getLogger(name) for name in loggers]
     disabled_before = [logger.disabled for logger in named_loggers]
     try:
