@@ -103,12 +103,12 @@ def replay_log(
     if keep is None and output is None:
         # without an output, only the messages of samples are read
         keep = (MAPPED,)
-    constants, how = _evaluation(options)
+    constants, settings = _evaluation(options)
     source = _source(log, options)
     return run_replay(
         source,
         _files(specifications, source, constants),
-        replace(how, keep=None if keep is None else tuple(keep), arrow=arrow),
+        replace(settings, keep=None if keep is None else tuple(keep), arrow=arrow),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),
@@ -131,11 +131,13 @@ def write_report(
 
     The other arguments and errors are those of `replay_log`.
     """
-    constants, how = _evaluation(options)
+    constants, settings = _evaluation(options)
     inputs = _inputs(log, specifications, options)
     refuse_output(Path(output), inputs)
     source = _source(log, options)
-    return write_page(source, _files(specifications, source, constants), Path(output), how, inputs=inputs)
+    return write_page(
+        source, _files(specifications, source, constants), Path(output), settings, inputs=inputs
+    )
 
 
 def diff_specifications(
@@ -162,12 +164,12 @@ def diff_specifications(
         SpecificationError: a specification has errors.
         LogError: the log cannot be read.
     """
-    constants, how = _evaluation(options)
+    constants, settings = _evaluation(options)
     source = _source(log, options)
     old_file, new_file = (_files(file, source, constants)[0] for file in (old, new))
-    diff = diff_over_source(source, old_file, new_file, how)
+    diff = diff_over_source(source, old_file, new_file, settings)
     if output is not None:
-        sides = (source, [old_file], how), (source, [new_file], how)
+        sides = (source, [old_file], settings), (source, [new_file], settings)
         write_comparison(diff, sides, Path(output), inputs=_inputs(log, [old, new], options))
     return diff
 
@@ -196,15 +198,15 @@ def diff_logs(
         SpecificationError: a specification has errors.
         LogError: a log cannot be read.
     """
-    constants, how = _evaluation(options)
+    constants, settings = _evaluation(options)
     sources = _source(a, options), _source(b, options)
     sources_with_texts = [source for source in sources if recorded_texts(source)]
     files: list[Specification] = []
     if specifications is not None or sources_with_texts:
         files = _files(specifications, (sources_with_texts or [sources[0]])[0], constants)
-    diff = diff_sources(sources, files, (how, how), align=align)
+    diff = diff_sources(sources, files, (settings, settings), align=align)
     if output is not None:
-        sides = (sources[0], files, how), (sources[1], files, how)
+        sides = (sources[0], files, settings), (sources[1], files, settings)
         inputs = [path for log in (a, b) for path in _inputs(log, specifications, options)]
         write_comparison(diff, sides, Path(output), inputs=inputs)
     return diff
@@ -236,14 +238,14 @@ def clip_log(
         LogError: the log cannot be read.
         OutputError: the clip cannot be written.
     """
-    constants, how = _evaluation(options)
+    constants, settings = _evaluation(options)
     source = _source(log, options)
     keep = None if topics is None else tuple([topics] if isinstance(topics, str) else topics)
     return cut_clip(
         source,
         _files(specifications, source, constants),
         Path(output),
-        replace(how, keep=keep),
+        replace(settings, keep=keep),
         around_ns=around_ns,
         of=[of] if isinstance(of, str) else of,
         inputs=_inputs(log, specifications, options),
@@ -254,9 +256,9 @@ def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, 
     """Remove the options of evaluation from all options, and return them."""
     refuse_unknown(options, (*Evaluating.__annotations__, "specifications", "output"))
     window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
-    choice, constants = options.pop("each", None), options.pop("constants", None)
+    objects, constants = options.pop("each", None), options.pop("constants", None)
     semantics, strict_names = options.pop("semantics", "ltlf"), options.pop("strict_names", False)
-    return constants, ReplayOptions(window, dict(choice or {}), semantics, strict_names)
+    return constants, ReplayOptions(window, dict(objects or {}), semantics, strict_names)
 
 
 def tune(
@@ -388,20 +390,20 @@ def evaluate_logs(
     from spatial_replay.batch.suite import Conditions, load_suite
 
     refuse_unknown(reading, Reading.__annotations__)
-    fails = checked_kinds("fail_on", fail_on, FAILING_KINDS)
-    allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
+    failing_kinds = checked_kinds("fail_on", fail_on, FAILING_KINDS)
+    allowed_kinds = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.from_tables(
         reading, each, constants, semantics=semantics, strict_names=strict_names
     )
     if specifications is None:
-        named = _paths(logs)
-        if len(named) != 1 or conditions != Conditions():
+        suite_paths = _paths(logs)
+        if len(suite_paths) != 1 or conditions != Conditions():
             raise UsageError("give specifications, or one suite file without other options")
-        suite = load_suite(named[0])
+        suite = load_suite(suite_paths[0])
     else:
         suite = _suite(logs, specifications, conditions)
     workers = workers_of(jobs, dask)
-    result = run_batch(prepare(suite.allowing(allowed)), output, workers, fail_on=fails)
+    result = run_batch(prepare(suite.allowing(allowed_kinds)), output, workers, fail_on=failing_kinds)
     return explain_batch(result, failing_places(result.table), workers, results=output)
 
 
@@ -453,7 +455,7 @@ def judge(
     refuse_unknown(reading, Reading.__annotations__)
     if same_start is not None and not against:
         raise UsageError("same_start is about pairs; give the earlier episodes: against=")
-    allowed = checked_kinds("allow", allow, ALLOWED_KINDS)
+    allowed_kinds = checked_kinds("allow", allow, ALLOWED_KINDS)
     conditions = Conditions.from_tables(
         reading, each, constants, semantics=semantics, strict_names=strict_names
     )
@@ -461,17 +463,17 @@ def judge(
     specifications = files if failures is None else [failures, *files]
     suites = [_suite(episodes, specifications, conditions) for episodes in (logs, against) if episodes]
     label_files = (None if labels is None else fspath(labels), None)
-    prepared = [
-        prepare_judgement(suite.allowing(allowed), file, result, has_failures=failures is not None)
+    preparations = [
+        prepare_judgement(suite.allowing(allowed_kinds), file, result, has_failures=failures is not None)
         for suite, file in zip(suites, label_files, strict=False)
     ]
     with TemporaryDirectory() as folder:
-        cases = [part.case for part in prepared]
+        cases = [preparation.case for preparation in preparations]
         workers = workers_of(jobs)
         batch = run_batch(cases, folder if output is None else output, workers)
-        for part in prepared:
-            batch = part.explain(batch, workers, allowed)
-    judgement = judge_batch(prepared, batch, allowed, same_start)
+        for preparation in preparations:
+            batch = preparation.explain(batch, workers, allowed_kinds)
+    judgement = judge_batch(preparations, batch, allowed_kinds, same_start)
     return with_stages(judgement, episode_stages(judgement, cases[0])) if stages else judgement
 
 
@@ -577,11 +579,11 @@ def _files(
     paths = [choice for choice in choices if isinstance(choice, Path)]
     if constants and choices and not paths:
         raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
-    loaded = load_files(paths, source, constants=constants) if paths or not choices else []
+    loaded_files = load_files(paths, source, constants=constants) if paths or not choices else []
     if not choices:
-        return loaded
-    files = iter(loaded)
-    return [choice if isinstance(choice, Specification) else next(files) for choice in choices]
+        return loaded_files
+    remaining_files = iter(loaded_files)
+    return [choice if isinstance(choice, Specification) else next(remaining_files) for choice in choices]
 
 
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:

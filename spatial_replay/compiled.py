@@ -112,17 +112,17 @@ class Compiler:
             compiler, is_cached = self._compiler, self.folder is not None
             # numba reads the folder from its settings when a function is decorated; they also apply to the
             # user's own functions, so they are restored
-            before = compiler.config.CACHE_DIR
+            previous_folder = compiler.config.CACHE_DIR
             if is_cached:
                 compiler.config.CACHE_DIR = str(self.folder)
             try:
-                available = compiler.njit(function).targetdescr.options
+                available_options = compiler.njit(function).targetdescr.options
                 # options that another version of numba does not have only affect speed
-                options = {name: value for name, value in options.items() if hasattr(available, name)}
+                options = {name: value for name, value in options.items() if hasattr(available_options, name)}
                 # with numba's default error model, a division by zero would raise
                 return compiler.njit(cache=is_cached, error_model="numpy", **options)(function)
             finally:
-                compiler.config.CACHE_DIR = before
+                compiler.config.CACHE_DIR = previous_folder
 
     @contextmanager
     def compiling(self, function: Any) -> Iterator[None]:
@@ -130,8 +130,8 @@ class Compiler:
         if self.holds(function):
             yield
             return
-        for hear in tuple(self.listeners):
-            hear()
+        for listener in tuple(self.listeners):
+            listener()
         timer = threading.Timer(_WAIT_S, self._announce)
         timer.daemon = True
         timer.start()
@@ -148,14 +148,14 @@ class Compiler:
         """Let this thread load machine code, while others interpret."""
         # stale after a child has written files
         self.__dict__.pop("_cached", None)
-        before, thread = sys.getswitchinterval(), threading.get_ident()
+        previous_interval, thread_id = sys.getswitchinterval(), threading.get_ident()
         sys.setswitchinterval(_SLICE_S)
-        self._loading.add(thread)
+        self._loading.add(thread_id)
         try:
             yield
         finally:
-            self._loading.discard(thread)
-            sys.setswitchinterval(before)
+            self._loading.discard(thread_id)
+            sys.setswitchinterval(previous_interval)
 
     def await_code(self) -> bool:
         """Start a thread that loads the code of all trials unless one runs; return whether it started."""
@@ -335,20 +335,20 @@ def _target() -> str:
     # imported before a control loop runs, which would wait for the import
     import numba
 
-    target = [sys.version, numba.__version__, platform.machine(), platform.processor()]
+    target_parts = [sys.version, numba.__version__, platform.machine(), platform.processor()]
     with suppress(OSError):  # not Linux
         # lines of the first core
-        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
-        target += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
-    return hashlib.sha256("\n".join(target).encode()).hexdigest()[:16]
+        cpu_lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+        target_parts += [line for line in cpu_lines if line.startswith(("model name", "flags", "Features"))]
+    return hashlib.sha256("\n".join(target_parts).encode()).hexdigest()[:16]
 
 
 def _load_code(folder: Path) -> None:
     """Load the code of all trials. A child process compiles each of them, one at a time on a machine."""
-    count = 0
+    trial_index = 0
     try:
-        while not _process.finish(count):
-            task, trial = _process.trials[count]
+        while not _process.finish(trial_index):
+            task, trial = _process.trials[trial_index]
             note = _note_of(task, folder)
             # waits for children of other processes; the child inherits the lock, so it lasts for both
             with turn(folder, "warmup") as lock:
@@ -357,7 +357,7 @@ def _load_code(folder: Path) -> None:
                 raise OSError(f"the child process that compiles it has ended with status {status}")
             with _process.loading(), _no_collection():
                 trial()
-            count += 1
+            trial_index += 1
     except Exception as error:
         # kernels stay interpreted, because a control loop must not wait for the compiler
         _process.loader = None
@@ -424,11 +424,11 @@ def kernels() -> Iterator[_Kernel[..., Any]]:
 @contextmanager
 def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
     """Run kernels in one form only within this context."""
-    before, _process.only = _process.only, form
+    previous_form, _process.only = _process.only, form
     try:
         yield
     finally:
-        _process.only = before
+        _process.only = previous_form
 
 
 @contextmanager
@@ -467,8 +467,8 @@ class _Kernel(Generic[_Arguments, _Result]):
     def __call__(self, *arguments: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
         if (ready := self._ready) is not None and _process.only != "interpreted":
             return ready(*arguments, **named)
-        elements = _CALL + _elements(arguments)
-        if not self._may_interpret(elements):
+        element_count = _CALL + _elements(arguments)
+        if not self._may_interpret(element_count):
             compiled = self.compiled_form()
             with _process.compiling(self.__wrapped__):
                 result = compiled(*arguments, **named)
@@ -476,14 +476,14 @@ class _Kernel(Generic[_Arguments, _Result]):
             return result
         run = cast(Callable[..., _Result], self.interpreted_form())
         # processor time of this thread, without the time that it waits for others
-        begin = time.thread_time()
+        begin_s = time.thread_time()
         # as in machine code, a division by zero or an overflow gives no error and no warning
         with np.errstate(all="ignore"):
             result = run(*(map(_view, arguments) if self._is_elementwise else arguments), **named)
-        took = time.thread_time() - begin
-        self._spent_s += took
-        _process.spent_s += took
-        self._element_s = max(took / elements, self._element_s or 0.0)
+        took_s = time.thread_time() - begin_s
+        self._spent_s += took_s
+        _process.spent_s += took_s
+        self._element_s = max(took_s / element_count, self._element_s or 0.0)
         return result
 
     @property
@@ -496,20 +496,20 @@ class _Kernel(Generic[_Arguments, _Result]):
         """Whether there is machine code for the arguments of at least one call."""
         return bool(getattr(self._compiled, "signatures", ()))
 
-    def _may_interpret(self, elements: int) -> bool:
+    def _may_interpret(self, element_count: int) -> bool:
         """Return whether a call is interpreted: little work is due in this process or for this kernel."""
         if _process.only is not None:
             return _process.only == "interpreted"
         if not _process.interprets:
             return _process.is_awaiting
-        guess = _GUESS_S * self.times if self._element_s is None else self._element_s
-        cost = elements * guess
+        element_guess_s = _GUESS_S * self.times if self._element_s is None else self._element_s
+        cost_s = element_count * element_guess_s
         is_guess = self._element_s is None and not _process.has_compiler
         patience_s = _FIRST_S if is_guess else _PATIENCE_S
-        if _process.spent_s + cost <= patience_s or self._spent_s + cost <= _WARM_S:
+        if _process.spent_s + cost_s <= patience_s or self._spent_s + cost_s <= _WARM_S:
             return True
         # tested last, because searching the cache takes time, too
-        return self._spent_s + cost <= _COLD_S and not _process.holds(self.__wrapped__)
+        return self._spent_s + cost_s <= _COLD_S and not _process.holds(self.__wrapped__)
 
     def interpreted_form(self) -> Callable[_Arguments, _Result]:
         """Return the plain function, which calls the plain forms of other kernels."""
@@ -530,10 +530,14 @@ def _link(
 ) -> Callable[_Arguments, _Result]:
     """Return a copy of a function that calls the given form of every kernel that it names."""
     original = cast(FunctionType, function)
-    names = {name: original.__globals__[name] for name in _names(original) if name in original.__globals__}
-    linked = {name: form(value) if isinstance(value, _Kernel) else value for name, value in names.items()}
-    linked |= {"__builtins__": original.__globals__["__builtins__"], "__name__": original.__module__}
-    copy = FunctionType(original.__code__, linked, original.__name__, original.__defaults__)
+    globals_by_name = {
+        name: original.__globals__[name] for name in _names(original) if name in original.__globals__
+    }
+    linked_globals = {
+        name: form(value) if isinstance(value, _Kernel) else value for name, value in globals_by_name.items()
+    }
+    linked_globals |= {"__builtins__": original.__globals__["__builtins__"], "__name__": original.__module__}
+    copy = FunctionType(original.__code__, linked_globals, original.__name__, original.__defaults__)
     copy.__qualname__, copy.__doc__ = original.__qualname__, original.__doc__
     copy.__kwdefaults__ = original.__kwdefaults__
     return cast(Callable[_Arguments, _Result], copy)
@@ -564,8 +568,8 @@ def _elements(values: object) -> int:
 def _view(value: Any) -> object:
     if isinstance(value, tuple):
         # kernels take rows of arrays in named tuples, and memoryviews of several dimensions have no rows
-        make: Any = type(value)
-        return cast(object, make(*(_view(array) if array.ndim == 1 else array for array in value)))
+        tuple_type: Any = type(value)
+        return cast(object, tuple_type(*(_view(array) if array.ndim == 1 else array for array in value)))
     return value.data if isinstance(value, np.ndarray) else value
 
 
@@ -591,14 +595,14 @@ def over_cores(
         used: long kernel that `run` calls; until it is compiled, there is one share.
         least: least length of a share, which should take about a millisecond.
     """
-    shares = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
-    if shares < 2:
+    share_count = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
+    if share_count < 2:
         run(0, count)
         return
-    ends = [count * share // shares for share in range(shares + 1)]
-    with ThreadPoolExecutor(shares - 1) as threads:
-        tasks = [threads.submit(run, begin, end) for begin, end in pairwise(ends[1:])]
-        run(0, ends[1])
+    share_ends = [count * share // share_count for share in range(share_count + 1)]
+    with ThreadPoolExecutor(share_count - 1) as threads:
+        tasks = [threads.submit(run, begin, end) for begin, end in pairwise(share_ends[1:])]
+        run(0, share_ends[1])
         for task in tasks:
             task.result()
 
@@ -614,10 +618,10 @@ def cache_folder() -> Path | None:
 
     Code is loaded unchecked, so only the user, or the installer of the package, may write to the folder.
     """
-    name = f"kernels-{source_digest()}"
-    shipped: Path | None = None
+    folder_name = f"kernels-{source_digest()}"
+    packaged_folder: Path | None = None
     for parent in _cache_parents():
-        folder = parent / name
+        folder = parent / folder_name
         try:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -628,14 +632,14 @@ def cache_folder() -> Path | None:
                     raise OSError(errno.ENOSPC, "no space left")
         except OSError:
             # this may be code of a container image, which is read-only or on a full disk
-            shipped = shipped or (folder if any(folder.rglob("*.nbi")) else None)
+            packaged_folder = packaged_folder or (folder if any(folder.rglob("*.nbi")) else None)
             continue
         if is_new:
-            _remove_stale(parent, keep=name)
-            if shipped is not None:
+            _remove_stale(parent, keep=folder_name)
+            if packaged_folder is not None:
                 # code of a read-only image is copied, because it need not be compiled again
                 with suppress(OSError):
-                    shutil.copytree(shipped, folder, dirs_exist_ok=True)
+                    shutil.copytree(packaged_folder, folder, dirs_exist_ok=True)
         return folder
     return None
 
@@ -699,8 +703,8 @@ def seal(folder: Path) -> None:
 
 def _is_sealed(path: Path) -> bool:
     """Return whether the digest of a file was written after the file."""
-    sealed = _seal_of(path)
-    return sealed.exists() and sealed.stat().st_mtime_ns >= path.stat().st_mtime_ns
+    seal_file = _seal_of(path)
+    return seal_file.exists() and seal_file.stat().st_mtime_ns >= path.stat().st_mtime_ns
 
 
 def _seal_of(path: Path) -> Path:
@@ -725,10 +729,10 @@ def _cache_parents() -> Iterator[Path]:
 
 def _remove_stale(parent: Path, keep: str) -> None:
     """Remove machine code of other sources to which no process has added for a week."""
-    oldest = time.time() - _STALE_S
+    oldest_s = time.time() - _STALE_S
     for folder in parent.glob("kernels-*"):
         with suppress(OSError):
-            if folder.name != keep and folder.stat().st_mtime < oldest:
+            if folder.name != keep and folder.stat().st_mtime < oldest_s:
                 shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -34,8 +34,8 @@ def system_reason(error: Exception) -> str:
         # several attempts to connect failed, each with its own error
         number = int(match[1])
     # errors of getaddrinfo have negative numbers, which strerror does not know
-    words = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
-    return (words or str(error) or type(error).__name__).lower()
+    reason = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
+    return (reason or str(error) or type(error).__name__).lower()
 
 
 @contextmanager

@@ -120,9 +120,9 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Step the environment, and judge the observation that follows."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         episodes = self._episodes
-        judged = episodes.extend(observation, info, ended=bool(terminated or truncated))
+        judgement = episodes.extend(observation, info, ended=bool(terminated or truncated))
         terminated = bool(terminated or episodes.ends)
-        return observation, episodes.gain(reward), terminated, truncated, {**info, "judge": judged}
+        return observation, episodes.gain(reward), terminated, truncated, {**info, "judge": judgement}
 
     def close(self) -> None:
         """Write the log of an unfinished episode if requested, and close the environment."""
@@ -156,44 +156,46 @@ class VectorJudge(_VectorWrapper):
         self._episodes = [
             _Episodes(specification, *arguments, env=number, **options) for number in range(env.num_envs)
         ]
-        self._ended = np.zeros(env.num_envs, np.bool_)
+        self._has_ended = np.zeros(env.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of the option `reset_mask`."""
-        mask = (options or {}).get("reset_mask")
-        begins = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask, np.bool_)
+        reset_mask = (options or {}).get("reset_mask")
+        is_reset = np.ones(self.num_envs, np.bool_) if reset_mask is None else np.array(reset_mask, np.bool_)
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._ended &= ~begins
+        self._has_ended &= ~is_reset
         infos = dict(infos)
-        for number, observation in enumerate(iterate(self.env.observation_space, observations)):
-            if begins[number]:
-                judged = self._episodes[number].begin(observation, _info_of(infos, number))
-                infos = self._add_info(infos, {"judge": judged}, number)
+        for env_index, observation in enumerate(iterate(self.env.observation_space, observations)):
+            if is_reset[env_index]:
+                judgement = self._episodes[env_index].begin(observation, _info_of(infos, env_index))
+                infos = self._add_info(infos, {"judge": judgement}, env_index)
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments, and judge the observations that follow."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        begins = self._ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._ended)
-        self._ended = np.logical_or(terminations, truncations)
+        is_reset = (
+            self._has_ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._has_ended)
+        )
+        self._has_ended = np.logical_or(terminations, truncations)
         # copies, because an environment may reuse its arrays
         rewards, terminations, infos = np.array(rewards), np.array(terminations), dict(infos)
-        for number, observation in enumerate(iterate(self.env.observation_space, observations)):
-            episodes, info = self._episodes[number], _info_of(infos, number)
-            last = info.pop("final_obs", None), info.pop("final_info", None)
-            if begins[number]:
+        for env_index, observation in enumerate(iterate(self.env.observation_space, observations)):
+            episodes, info = self._episodes[env_index], _info_of(infos, env_index)
+            final_values = info.pop("final_obs", None), info.pop("final_info", None)
+            if is_reset[env_index]:
                 # in this mode, the step after the end is the reset, and its action is ignored
-                judged = episodes.begin(observation, info)
-            elif self._mode is AutoresetMode.SAME_STEP and self._ended[number]:
-                judged = episodes.extend(*_last_of(last), ended=True)
-                infos = self._add_info(infos, {"final_info": {"judge": judged}}, number)
-                rewards[number] = episodes.gain(rewards[number])
-                judged = episodes.begin(observation, info)
+                judgement = episodes.begin(observation, info)
+            elif self._mode is AutoresetMode.SAME_STEP and self._has_ended[env_index]:
+                judgement = episodes.extend(*_last_of(final_values), ended=True)
+                infos = self._add_info(infos, {"final_info": {"judge": judgement}}, env_index)
+                rewards[env_index] = episodes.gain(rewards[env_index])
+                judgement = episodes.begin(observation, info)
             else:
-                judged = episodes.extend(observation, info, ended=self._ended[number])
-                rewards[number] = episodes.gain(rewards[number])
-                terminations[number] |= episodes.ends
-            infos = self._add_info(infos, {"judge": judged}, number)
+                judgement = episodes.extend(observation, info, ended=self._has_ended[env_index])
+                rewards[env_index] = episodes.gain(rewards[env_index])
+                terminations[env_index] |= episodes.ends
+            infos = self._add_info(infos, {"judge": judgement}, env_index)
         return observations, rewards, terminations, truncations, infos
 
     def close(self, **options: Any) -> None:
@@ -225,9 +227,9 @@ class _Episodes:
     ) -> None:
         if objects is None and signals is None:
             raise UsageError("no objects and no signals; give objects=, a function of observation and info")
-        for name, value, values in (("until", until, _UNTIL), ("reward", reward, _REWARDS)):
-            if value is not None and value not in values:
-                raise UsageError(f"{name} is {value!r}; give {listing(values)}, or None")
+        for name, value, allowed_values in (("until", until, _UNTIL), ("reward", reward, _REWARDS)):
+            if value is not None and value not in allowed_values:
+                raise UsageError(f"{name} is {value!r}; give {listing(allowed_values)}, or None")
         self._specification = _with_only_result(specification, result)
         self._spec = self._specification.results[-1].name
         self._monitor = Monitor(self._specification, missing_after=1)
@@ -238,14 +240,14 @@ class _Episodes:
         period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
         # multiplying an int takes a tenth of the time of a Fraction
         self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns
-        self._about: Judged = {} if env is None else {"env": env}
+        self._env_entry: Judged = {} if env is None else {"env": env}
         self._episode = -1
         self._frame = 0
         self._samples: list[Sample] = []
         self._judged: Judged | None = None
         self._remarked: set[str] = set()
         self._gain = 0.0
-        self._level: float | None = None
+        self._last_value: float | None = None
         self.ends = False
 
     def begin(self, observation: Any, info: dict[str, Any]) -> Judged:
@@ -255,7 +257,7 @@ class _Episodes:
         if self._stages is not None:
             self._stages.reset()
         self._episode += 1
-        self._frame, self._samples, self._level = 0, [], None
+        self._frame, self._samples, self._last_value = 0, [], None
         return self.extend(observation, info)
 
     def extend(self, observation: Any, info: dict[str, Any], *, ended: bool = False) -> Judged:
@@ -269,21 +271,21 @@ class _Episodes:
         if self._log is not None:
             self._samples.append(sample)
         update = self._monitor.update(sample)
-        judged = self._judge(update)
+        judgement = self._judge(update)
         self._gain = 0.0
-        level = judged[self._reward] if self._reward is not None else math.nan
-        if math.isfinite(level):
-            if self._level is not None:
-                self._gain = level - self._level
-            self._level = level
-        is_settled = judged["settled"] and self._until in ("settled", judged["verdict"])
+        reward_value = judgement[self._reward] if self._reward is not None else math.nan
+        if math.isfinite(reward_value):
+            if self._last_value is not None:
+                self._gain = reward_value - self._last_value
+            self._last_value = reward_value
+        is_settled = judgement["settled"] and self._until in ("settled", judgement["verdict"])
         self.ends = self._until is not None and is_settled
-        self._judged = judged
+        self._judged = judgement
         if ended or self.ends:
             if update.violations:
-                judged["reason"] = str(update.violations[0])
+                judgement["reason"] = str(update.violations[0])
             self.end()
-        return judged
+        return judgement
 
     def gain(self, reward: Any) -> Any:
         """Return the reward of the last step: the environment's reward, or the gain."""
@@ -291,8 +293,8 @@ class _Episodes:
 
     def end(self) -> None:
         """End the episode unless it has ended, and write its log if requested."""
-        judged, self._judged = self._judged, None
-        path = None if self._log is None or judged is None else self._log(judged)
+        judgement, self._judged = self._judged, None
+        path = None if self._log is None or judgement is None else self._log(judgement)
         if path is not None:
             with Recorder(path, specifications=self._specification) as recorder:
                 for sample in self._samples:
@@ -309,8 +311,8 @@ class _Episodes:
             raise UsageError("the monitor has no numbers")
         margin, _, lower, upper = numbers[0].tolist()
         verdict = final_verdict(*self._monitor.interval(self._spec))
-        judged: Judged = {
-            **self._about,
+        judgement: Judged = {
+            **self._env_entry,
             "episode": self._episode,
             "verdict": verdict.value,
             "success": verdict is Verdict.SATISFIED,
@@ -319,8 +321,8 @@ class _Episodes:
         }
         if self._stages is not None:
             stage, progress = self._stages.extend(update.time_ns, numbers, self._monitor.leaves)
-            judged |= {"stage": stage.name, "owed": stage.owed, "progress": progress}
-        return judged
+            judgement |= {"stage": stage.name, "owed": stage.owed, "progress": progress}
+        return judgement
 
 
 def _with_only_result(specification: Specification, result: str | None) -> Specification:
@@ -345,9 +347,9 @@ def _stages(specification: Specification, rate_hz: float, *, is_needed: bool) ->
         return None
 
 
-def _last_of(last: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
+def _last_of(final_values: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
     """Return the last observation of an episode that was reset in the same step, and its info."""
-    observation, info = last
+    observation, info = final_values
     if observation is None:
         raise UsageError(
             'the vector environment has no info["final_obs"]: the last observation of an episode is lost; use'
@@ -356,17 +358,17 @@ def _last_of(last: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
     return observation, {} if info is None else info
 
 
-def _info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
+def _info_of(infos: Mapping[str, Any], env_index: int) -> dict[str, Any]:
     """Return the info of one environment of a vector, without values that its masks exclude."""
     info: dict[str, Any] = {}
     for key, values in infos.items():
         mask = infos.get(f"_{key}")
         is_mask = key.startswith("_") and key[1:] in infos
-        if is_mask or (mask is not None and not mask[number]):
+        if is_mask or (mask is not None and not mask[env_index]):
             continue
         if isinstance(values, dict):
-            info[key] = _info_of(values, number)
+            info[key] = _info_of(values, env_index)
         else:
             # without a mask, a value may apply to all environments
-            info[key] = values[number] if mask is not None or np.ndim(values) else values
+            info[key] = values[env_index] if mask is not None or np.ndim(values) else values
     return info

@@ -25,8 +25,8 @@ class Html(str):
 def element(tag: str, *content: str, **attributes: str) -> Html:
     """Return an element; content that is not `Html` is escaped."""
     attribute_text = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
-    inner = "".join(part if isinstance(part, Html) else escape(printable(part)) for part in content)
-    return Html(f"<{tag}{attribute_text}>{inner}</{tag}>")
+    inner_html = "".join(piece if isinstance(piece, Html) else escape(printable(piece)) for piece in content)
+    return Html(f"<{tag}{attribute_text}>{inner_html}</{tag}>")
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:

@@ -24,8 +24,8 @@ def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Call
     @cache
     def modules() -> dict[str, str]:
         # imports for type checkers do not run, so they are read from the source
-        tree = ast.parse(Path(package["__file__"]).read_text(encoding="utf-8"))
-        imports = (node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom))
+        syntax_tree = ast.parse(Path(package["__file__"]).read_text(encoding="utf-8"))
+        imports = (node for node in ast.walk(syntax_tree) if isinstance(node, ast.ImportFrom))
         return {alias.name: node.module or "" for node in imports for alias in node.names}
 
     def load(name: str) -> Any:

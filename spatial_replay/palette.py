@@ -40,7 +40,7 @@ def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
 
 def lighter(colour: str) -> str:
     """Return a hexadecimal colour mixed with white, so that it stays visible in viewers that darken it."""
-    shares = (int(colour[begin : begin + 2], 16) / 255.0 for begin in (1, 3, 5))
+    shares = (int(colour[start : start + 2], 16) / 255.0 for start in (1, 3, 5))
     red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
     return hexadecimal((red, green, blue))
 

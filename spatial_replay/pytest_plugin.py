@@ -48,17 +48,17 @@ class SuiteFile(pytest.File):
             cases = prepare(load_suite(self.path))
         except SpatialReplayError as error:
             raise self.CollectError(str(error)) from None
-        for prepared in cases:
-            case = prepared.case
-            for log in prepared.logs:
-                task = Task(log.path, tuple(file.text for file in prepared.files), case.conditions)
-                for number, file in enumerate(prepared.files):
+        for prepared_case in cases:
+            case = prepared_case.case
+            for log in prepared_case.logs:
+                task = Task(log.path, tuple(file.text for file in prepared_case.files), case.conditions)
+                for file_index, file in enumerate(prepared_case.files):
                     # several specification files may have a spec of the same name
-                    stem = f"{file.name.removesuffix('.spatial')}." if len(prepared.files) > 1 else ""
-                    for spec in _result_names(task, number):
+                    stem = f"{file.name.removesuffix('.spatial')}." if len(prepared_case.files) > 1 else ""
+                    for spec in _result_names(task, file_index):
                         name = f"{case.name}[{log.name}-{stem}{spec}]"
                         yield ReplayItem.from_parent(
-                            self, name=name, case=case, task=task, file=number, spec=spec, log=log.name
+                            self, name=name, case=case, task=task, file=file_index, spec=spec, log=log.name
                         )
 
 
@@ -95,8 +95,8 @@ class ReplayItem(pytest.Item):
         if failure is None:
             return None
         title = row.spec if row.object is None else f"{row.spec}[{row.object}]"
-        about = requirement_text(row.requirement or ", ".join(self._case.requirements), row.title)
-        lines = [f"{self._log}: {title}: {failure}", about, *(row.explanation or ())]
+        requirement = requirement_text(row.requirement or ", ".join(self._case.requirements), row.title)
+        lines = [f"{self._log}: {title}: {failure}", requirement, *(row.explanation or ())]
         return "\n".join(filter(None, lines))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:

@@ -61,8 +61,8 @@ def assert_satisfied(
         if failure is not None:
             title = result.name if result.object is None else f"{result.name}[{result.object}]"
             explanation = result.sentences(replayed.first_ns) if result.can_explain else ()
-            about = requirement_text(result.spec.id, result.spec.title)
-            lines = [f"{replayed.log}: {title}: {failure}", about, *map(str, explanation)]
+            requirement = requirement_text(result.spec.id, result.spec.title)
+            lines = [f"{replayed.log}: {title}: {failure}", requirement, *map(str, explanation)]
             reasons.append("\n".join(filter(None, lines)))
     if "vacuous" not in expectation.allow:
         reasons += [f"{replayed.log}: {part.message}" for part in replayed.vacuous]

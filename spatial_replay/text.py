@@ -64,7 +64,7 @@ class Sentence(str):
         sentence = super().__new__(cls, "".join(map(str, parts)))
         # a part may be a clause with times of its own
         sentence.parts = tuple(
-            inner for part in parts for inner in (part.parts if isinstance(part, Sentence) else (part,))
+            piece for part in parts for piece in (part.parts if isinstance(part, Sentence) else (part,))
         )
         return sentence
 
@@ -107,12 +107,12 @@ def without_numbers(text: str) -> str:
 
 def without_repetition(texts: Iterable[str]) -> list[str]:
     """Return texts, with one text and a count for several texts that differ in their numbers only."""
-    alike: dict[str, list[str]] = {}
+    texts_by_form: dict[str, list[str]] = {}
     for text in texts:
-        alike.setdefault(without_numbers(text), []).append(text)
+        texts_by_form.setdefault(without_numbers(text), []).append(text)
     return [
         text
-        for group in alike.values()
+        for group in texts_by_form.values()
         for text in (group if len(group) <= _FEW else [f"{group[0]} (and {len(group) - 1:,} more like it)"])
     ]
 
@@ -138,18 +138,18 @@ def number_text(number: float) -> str:
 def with_unit(number: float, unit: str) -> str:
     """Return a number with its unit: "0.05 m". Infinity and numbers of unit "1" have none."""
     if names := names_from_unit(unit):
-        called = [f" ({json.dumps(name, ensure_ascii=False)})" for name in names if names[name] == number]
-        return number_text(number) + "".join(called[:1])
+        name_texts = [f" ({json.dumps(name, ensure_ascii=False)})" for name in names if names[name] == number]
+        return number_text(number) + "".join(name_texts[:1])
     return number_text(number) if unit in ("", "1") or math.isinf(number) else f"{number_text(number)} {unit}"
 
 
 def interval_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
     """Return a robustness with its unit, and its interval if that is wider: "between -inf and -0.2 m"."""
-    number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
+    robustness_text = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
     if math.isnan(lower) or lower == upper == robustness:
-        return number
+        return robustness_text
     interval = f"between {with_unit(lower, unit)} and {with_unit(upper, unit)}"
-    return interval if math.isnan(robustness) else f"{number}, {interval}"
+    return interval if math.isnan(robustness) else f"{robustness_text}, {interval}"
 
 
 def names_from_unit(unit: str) -> dict[str, float]:
@@ -210,8 +210,8 @@ def listing(names: Sequence[str], most: int = 8) -> str:
 
 def first_lines(lines: Sequence[str], most: int) -> list[str]:
     """Return the first lines, and a line that counts the others."""
-    more = [f"… and {len(lines) - most:,} more"] if len(lines) > most else []
-    return [*lines[:most], *more]
+    count_line = [f"… and {len(lines) - most:,} more"] if len(lines) > most else []
+    return [*lines[:most], *count_line]
 
 
 def escape_text(text: str, kept: str = "") -> str:
@@ -276,9 +276,9 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
     if len(name) > _LONGEST_NAME:
         return ""
     candidates = [candidate for candidate in known if len(candidate) <= _LONGEST_NAME][:_MOST_NAMES]
-    same = [candidate for candidate in candidates if candidate.casefold() == name.casefold()]
-    close = same or difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
-    return f"did you mean {max(close, key=partial(_likeness, name))!r}?" if close else ""
+    equal_names = [candidate for candidate in candidates if candidate.casefold() == name.casefold()]
+    close_names = equal_names or difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
+    return f"did you mean {max(close_names, key=partial(_likeness, name))!r}?" if close_names else ""
 
 
 def named_arguments(called: _Called) -> _Called:
@@ -290,12 +290,12 @@ def named_arguments(called: _Called) -> _Called:
     function = called.__init__ if isinstance(called, type) else called  # type: ignore[misc]
 
     @wraps(function)
-    def checked_call(*values: Any, **named: Any) -> Any:
+    def checked_call(*positionals: Any, **keywords: Any) -> Any:
         try:
-            return function(*values, **named)
+            return function(*positionals, **keywords)
         except TypeError:
             # any other cause is raised again below
-            refuse_unknown(named, [name for name in signature(called).parameters if name != "cls"])
+            refuse_unknown(keywords, [name for name in signature(called).parameters if name != "cls"])
             raise
 
     if not isinstance(called, type):

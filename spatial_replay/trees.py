@@ -102,8 +102,8 @@ class PlannedSteps(Decorator):
             return Outcome(True, tip.feedback_message)
         ancestors = list(_ancestors(tip, self.decorated))
         failed = next(behaviour for behaviour in ancestors if behaviour.status is self.decorated.status)
-        named = (self._stages[behaviour.name] for behaviour in ancestors if behaviour.name in self._stages)
-        return Outcome(False, f"{failed.name}: {failed.feedback_message or 'failed'}", next(named, None))
+        stages = (self._stages[behaviour.name] for behaviour in ancestors if behaviour.name in self._stages)
+        return Outcome(False, f"{failed.name}: {failed.feedback_message or 'failed'}", next(stages, None))
 
 
 def _ancestors(behaviour: Behaviour, root: Behaviour) -> Iterator[Behaviour]:
@@ -120,12 +120,12 @@ def record_ticks(tree: Tree, recorder: Recorder) -> None:
     A tick has the time of the newest sample; ticks before the first sample are not recorded.
     """
     channel = recorder.channel(BEHAVIOUR_TREE, schema=BehaviourTree)
-    recorded: list[object] = [()]
+    recorded_nodes: list[object] = [()]
 
     def record(tree: Tree) -> None:
         nodes, time_ns = tree_nodes(tree.root), recorder.newest_ns
-        if time_ns is not None and nodes != recorded[-1]:
-            recorded[-1] = nodes
+        if time_ns is not None and nodes != recorded_nodes[-1]:
+            recorded_nodes[-1] = nodes
             channel.write(time_ns, TreeTick(tree.count, nodes).payload(time_ns))
 
     tree.add_post_tick_handler(record)

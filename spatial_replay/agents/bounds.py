@@ -87,10 +87,10 @@ class Bounds:
             if ".." not in text and text.startswith(self.addresses or ("\0",)):
                 return text
             raise UsageError(f"{argument}: {_quote(text)} is outside the roots, which are {self.names}")
-        path, episode = self._path(text, argument), ""
+        path, episode_suffix = self._path(text, argument), ""
         if path is None and "#" in text:
-            text, _, episode = text.rpartition("#")
-            path, episode = self._path(text, argument), f"#{episode}"
+            text, _, episode_suffix = text.rpartition("#")
+            path, episode_suffix = self._path(text, argument), f"#{episode_suffix}"
         if path is None:
             raise UsageError(
                 f"{argument}: {_quote(text)} is not a file below the roots; list_logs names the logs"
@@ -100,7 +100,7 @@ class Bounds:
             self._check_links(path, argument)
         elif not stat.S_ISREG(mode):
             raise UsageError(f"{argument}: {_quote(text)} is neither a file nor a folder; give a log")
-        return f"{path}{episode}"
+        return f"{path}{episode_suffix}"
 
     def _path(self, text: str, argument: str) -> Path | None:
         """Return an existing path without links; None if there is none.
@@ -128,20 +128,20 @@ class Bounds:
 
     def _check_links(self, folder: Path, argument: str) -> None:
         """Refuse a folder with a link to the outside, or with a pipe, which would block its reader."""
-        count, pending, visited = 0, [str(folder)], {str(folder)}
-        while pending:
-            for parent, folders, names in os.walk(pending.pop()):
-                count += len(folders) + len(names)
-                if count > _MOST_ENTRIES:
+        entry_count, pending_folders, visited_folders = 0, [str(folder)], {str(folder)}
+        while pending_folders:
+            for parent, folders, file_names in os.walk(pending_folders.pop()):
+                entry_count += len(folders) + len(file_names)
+                if entry_count > _MOST_ENTRIES:
                     raise UsageError(
                         f"{argument}: {folder.name} has over {_MOST_ENTRIES:,} entries; give a folder in it"
                     )
-                for path in map(Path(parent).joinpath, (*folders, *names)):
+                for path in map(Path(parent).joinpath, (*folders, *file_names)):
                     target = self._inside(path, argument)
                     # the target folder of a link may contain links, too
-                    if target is not None and target not in visited and os.path.isdir(target):  # noqa: PTH112
-                        visited.add(target)
-                        pending.append(target)
+                    if target is not None and target not in visited_folders and os.path.isdir(target):  # noqa: PTH112
+                        visited_folders.add(target)
+                        pending_folders.append(target)
 
     def _inside(self, path: Path, argument: str) -> str | None:
         """Return the target of a link; None for a file or a folder.
@@ -180,8 +180,8 @@ class Bounds:
         if self.output is None:
             raise UsageError("nothing can be written; start the server with --output FOLDER")
         path = self.output / (name if name.endswith(ending) else f"{name}{ending}")
-        is_name = name.isprintable() and len(path.name) < 200 and path.name == os.path.basename(path)  # noqa: PTH119
-        if not is_name or "/" in name or name.startswith(".") or (path.exists() and not path.is_file()):
+        is_file_name = name.isprintable() and len(path.name) < 200 and path.name == os.path.basename(path)  # noqa: PTH119
+        if not is_file_name or "/" in name or name.startswith(".") or (path.exists() and not path.is_file()):
             raise UsageError(f"name: {_quote(name)} is not the name of a file; give one such as run{ending}")
         if path.is_symlink():
             raise UsageError(f"name: {_quote(name)} is a link; give another name")
@@ -271,27 +271,27 @@ def page_of(
     """
     first_line, first_row = _place(start)
     left_off: list[str] = []
-    texts = [_cut(line, "line", 1_000, 0, []) for line in lines]
-    lines_here = list(_prefix(texts[first_line:], _LINES))
-    warnings_here: list[str] = []
+    cut_lines = [_cut(line, "line", 1_000, 0, []) for line in lines]
+    page_lines = list(_prefix(cut_lines[first_line:], _LINES))
+    page_warnings: list[str] = []
     if not start:
-        texts_of_warnings = [_cut(warning, "warning", 400, 0, []) for warning in warnings]
-        warnings_here = list(_prefix(texts_of_warnings, _WARNINGS))
-        if len(warnings_here) < len(texts_of_warnings):
-            left_off.append(f"{plural(len(texts_of_warnings) - len(warnings_here), 'line')} of the warnings")
+        cut_warnings = [_cut(warning, "warning", 400, 0, []) for warning in warnings]
+        page_warnings = list(_prefix(cut_warnings, _WARNINGS))
+        if len(page_warnings) < len(cut_warnings):
+            left_off.append(f"{plural(len(cut_warnings) - len(page_warnings), 'line')} of the warnings")
     rows = list(document.get(rows_key) or ())
-    others = {key: value for key, value in document.items() if key != rows_key}
-    part = _fit(others, _OTHERS, left_off)
+    other_values = {key: value for key, value in document.items() if key != rows_key}
+    page_document = _fit(other_values, _OTHERS, left_off)
     # lines and warnings are sent twice; 1,000 bytes are for the other fields
-    spent = 2 * (_size(lines_here) + _size(warnings_here)) + _size(part) + 1_000
-    fitting = [_fit(row, _ROW, left_off) for row in rows[first_row : first_row + 200]]
-    rows_here = list(_prefix(fitting, MOST_BYTES - spent))
+    spent_bytes = 2 * (_size(page_lines) + _size(page_warnings)) + _size(page_document) + 1_000
+    fitted_rows = [_fit(row, _ROW, left_off) for row in rows[first_row : first_row + 200]]
+    page_rows = list(_prefix(fitted_rows, MOST_BYTES - spent_bytes))
     if rows_key in document:
-        part[rows_key] = rows_here
-    last_line, last_row = first_line + len(lines_here), first_row + len(rows_here)
-    is_last = last_line >= len(lines) and last_row >= len(rows)
-    following = "" if is_last else f"{last_line}.{last_row}"
-    return Page(lines_here, warnings_here, part, list(dict.fromkeys(left_off))[:10], following)
+        page_document[rows_key] = page_rows
+    end_line, end_row = first_line + len(page_lines), first_row + len(page_rows)
+    is_last = end_line >= len(lines) and end_row >= len(rows)
+    next_start = "" if is_last else f"{end_line}.{end_row}"
+    return Page(page_lines, page_warnings, page_document, list(dict.fromkeys(left_off))[:10], next_start)
 
 
 def _place(start: str) -> tuple[int, int]:
@@ -303,12 +303,12 @@ def _place(start: str) -> tuple[int, int]:
     return int(line), int(row)
 
 
-def _prefix(values: Iterable[Any], most: int) -> Iterator[Any]:
+def _prefix(values: Iterable[Any], max_bytes: int) -> Iterator[Any]:
     """Yield the first values that fit into a number of bytes; at least one."""
-    total = 0
-    for number, value in enumerate(values):
-        total += _size(value) + 1
-        if total > most and number:
+    total_bytes = 0
+    for index, value in enumerate(values):
+        total_bytes += _size(value) + 1
+        if total_bytes > max_bytes and index:
             return
         yield value
 
@@ -321,18 +321,18 @@ _LIMITS: Final = ((1_000, 100), (300, 30), (200, 10), (120, 4), (80, 2), (40, 1)
 """Limits for characters of a text and entries of a list, from loose to strict."""
 
 
-def _fit(value: Any, most: int, left_off: list[str]) -> Any:
+def _fit(value: Any, max_bytes: int, left_off: list[str]) -> Any:
     """Return a value cut to a number of bytes."""
     part, notes = value, list[str]()
     for characters, entries in _LIMITS:
         notes = []
         part = _cut(value, "", characters, entries, notes)
-        if _size(part) <= most:
+        if _size(part) <= max_bytes:
             break
     # if that is not enough, the largest values are dropped
-    sizes = sorted(part, key=lambda key: _size(part[key])) if isinstance(part, dict) else []
-    while sizes and _size(part) > most:
-        key = sizes.pop()
+    keys_by_size = sorted(part, key=lambda key: _size(part[key])) if isinstance(part, dict) else []
+    while keys_by_size and _size(part) > max_bytes:
+        key = keys_by_size.pop()
         notes.append(key)
         part = {name: entry for name, entry in part.items() if name != key}
     left_off += notes

@@ -87,26 +87,26 @@ class Processes:
     async def run(self, call: Call, report: Report) -> Outcomes:
         """Run a call to its end, or until the time limit. If the call is cancelled, its process is killed."""
         async with self._limiter:
-            ours, theirs = multiprocessing.Pipe(duplex=False)
-            process = self._context().Process(target=self._work, args=(theirs, call), daemon=True)
+            receiver, sender = multiprocessing.Pipe(duplex=False)
+            process = self._context().Process(target=self._work, args=(sender, call), daemon=True)
             outcomes: list[Outcome] = []
-            progress = ""
+            progress_text = ""
             try:
                 # the first start waits for the imports of the fork server
                 await to_thread.run_sync(process.start)
-                theirs.close()
+                sender.close()
                 with anyio.move_on_after(self._limit_s):
                     while len(outcomes) < len(call.commands):
-                        await anyio.wait_readable(ours)
-                        message = ours.recv()
+                        await anyio.wait_readable(receiver)
+                        message = receiver.recv()
                         if message[0] == "result":
                             outcomes.append(Outcome(*message[1:]))
                         else:
                             _, label, steps, total = message
-                            progress = f" after {steps:,} {label}"
+                            progress_text = f" after {steps:,} {label}"
                             await report(label, steps, total)
                     return Outcomes(tuple(outcomes), "")
-                reason = f"the call took longer than {self._limit_s:g} s and was ended{progress}"
+                reason = f"the call took longer than {self._limit_s:g} s and was ended{progress_text}"
                 return Outcomes(
                     tuple(outcomes), f"{reason}; give less, or start the server with a greater --limit"
                 )
@@ -114,7 +114,7 @@ class Processes:
                 reason = "the process of this call ended unexpectedly; is there memory enough?"
                 return Outcomes(tuple(outcomes), f"{reason} Other calls are served as before")
             finally:
-                ours.close()
+                receiver.close()
                 # the process may not have been started
                 with suppress(AttributeError, ValueError):
                     process.kill()

@@ -63,10 +63,10 @@ def relation_picture(name: str) -> str:
 
 def _document(path: str) -> str:
     """Return a file of the documentation. In wheels, it lies inside the package."""
-    shipped = resources.files(__package__).joinpath("docs", path)
-    source = Path(__file__).parents[2] / "docs" / path
+    packaged_file = resources.files(__package__).joinpath("docs", path)
+    source_file = Path(__file__).parents[2] / "docs" / path
     try:
-        return shipped.read_text("utf-8") if shipped.is_file() else source.read_text("utf-8")
+        return packaged_file.read_text("utf-8") if packaged_file.is_file() else source_file.read_text("utf-8")
     except FileNotFoundError:
         raise UsageError(f"no page {path!r:.80}; spatial://relations names the relations") from None
 
@@ -76,12 +76,12 @@ def _sections(text: str, headings: Sequence[str]) -> str:
     if not headings:
         return text
     lines: list[str] = []
-    is_inside = is_code = False
+    is_requested = is_in_code = False
     for line in text.splitlines():
         # a comment in code looks like a heading
-        is_code ^= line.startswith("```")
-        if not is_code and (match := _HEADING.match(line)):
-            is_inside = match[2] in headings
-        if is_inside:
+        is_in_code ^= line.startswith("```")
+        if not is_in_code and (match := _HEADING.match(line)):
+            is_requested = match[2] in headings
+        if is_requested:
             lines.append(line)
     return "\n".join(lines) + "\n"

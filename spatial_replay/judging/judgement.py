@@ -170,10 +170,10 @@ class Judgement:
     @cached_property
     def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
         """The failed episodes by their first failure, the most frequent first; None is any other failure."""
-        failed = [row for row in self.rows if row.is_success is False]
-        counts = Counter(row.failure for row in failed)
-        names = sorted(counts, key=lambda name: (name is None, -counts[name]))
-        return {name: tuple(row for row in failed if row.failure == name) for name in names}
+        failed_rows = [row for row in self.rows if row.is_success is False]
+        failure_counts = Counter(row.failure for row in failed_rows)
+        failure_names = sorted(failure_counts, key=lambda name: (name is None, -failure_counts[name]))
+        return {name: tuple(row for row in failed_rows if row.failure == name) for name in failure_names}
 
     @cached_property
     def agreement(self) -> Agreement:
@@ -202,10 +202,10 @@ class Judgement:
 
         None if that depends on undecided episodes or unstored successes.
         """
-        total, pending = len(self.rows), self.agreement.undecided + self.agreement.unstored
-        intervals = [Rate(self.rate.successes + more, total).interval for more in (0, pending)]
-        low, high = (interval is not None and interval.low >= least for interval in intervals)
-        return low if low == high else None
+        episode_count, open_count = len(self.rows), self.agreement.undecided + self.agreement.unstored
+        intervals = [Rate(self.rate.successes + extra, episode_count).interval for extra in (0, open_count)]
+        is_certain, is_possible = (interval is not None and interval.low >= least for interval in intervals)
+        return is_certain if is_certain == is_possible else None
 
     @property
     def pass_k(self) -> dict[int, float]:
@@ -213,15 +213,17 @@ class Judgement:
 
         Runs of one start have the same task and seed, or logs whose names differ only in the run: `cross#2`.
         """
-        outcomes = defaultdict[object, list[bool]](list)
+        outcomes_by_start = defaultdict[object, list[bool]](list)
         for row in self.rows:
-            name = row.log if data_set_address(row.log) else RUN.sub("", row.log)
-            is_repeated = row.seed is not None or name != row.log
+            start_name = row.log if data_set_address(row.log) else RUN.sub("", row.log)
+            is_repeated = row.seed is not None or start_name != row.log
             if row.is_success is not None and is_repeated:
-                outcomes[name if row.seed is None else (row.task, row.seed)].append(row.is_success)
-        fewest_runs = min(map(len, outcomes.values()), default=0)
+                outcomes_by_start[start_name if row.seed is None else (row.task, row.seed)].append(
+                    row.is_success
+                )
+        fewest_runs = min(map(len, outcomes_by_start.values()), default=0)
         return {
-            k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes.values())
+            k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes_by_start.values())
             for k in range(2, min(fewest_runs, _MOST_RUNS) + 1)
         }
 
@@ -242,24 +244,24 @@ class Judgement:
             "with_unstored_": self.rate_with_unstored,
             "label_": self.label_rate,
         }
-        numbers: dict[str, Any] = {}
+        rate_values: dict[str, Any] = {}
         for name, rate in rates.items():
-            numbers[f"{name}rate"] = rate.value
-            numbers[f"{name}interval"] = None if rate.interval is None else list(rate.interval)
+            rate_values[f"{name}rate"] = rate.value
+            rate_values[f"{name}interval"] = None if rate.interval is None else list(rate.interval)
         rows = [
             {**{name: getattr(row, name) for name in self.columns}, "agreement": row.kind}
             for row in self.rows
         ]
         document = {"name": self.name, "episodes": len(self.rows), "decided": self.rate.episodes}
         document |= {"file": self.file, "result": self.result, "formula": self.formula}
-        document |= {"agreement": asdict(self.agreement), **numbers, "pass_k": self.pass_k}
+        document |= {"agreement": asdict(self.agreement), **rate_values, "pass_k": self.pass_k}
         if self.comparison is not None:
             document["comparison"] = self.comparison.document
         if self.failure_file:
             document["failures"] = {name or "other": len(failed) for name, failed in self.failures.items()}
         if self.stages:
-            counts = Counter(row.stage for row in self.rows)
-            document["stages"] = {name: counts[name] for name in self.stages}
+            stage_counts = Counter(row.stage for row in self.rows)
+            document["stages"] = {name: stage_counts[name] for name in self.stages}
         document |= {"remarks": self.remarks, "rows": rows}
         return {name: json_value(value) for name, value in document.items()}
 
@@ -268,9 +270,9 @@ class Judgement:
         """The rows with the columns of `document`. Missing values are null."""
         import pyarrow as pa
 
-        types = {"label": pa.bool_(), "seed": pa.int64()}
-        types |= dict.fromkeys(("margin", "success_at", "failure_at", "progress"), pa.float64())
-        schema = pa.schema([(name, types.get(name, pa.string())) for name in (*self.columns, "kind")])
+        column_types = {"label": pa.bool_(), "seed": pa.int64()}
+        column_types |= dict.fromkeys(("margin", "success_at", "failure_at", "progress"), pa.float64())
+        schema = pa.schema([(name, column_types.get(name, pa.string())) for name in (*self.columns, "kind")])
         columns = [[getattr(row, name) for row in self.rows] for name in schema.names]
         return pa.table(columns, schema=schema).rename_columns([*self.columns, "agreement"])
 
@@ -344,9 +346,9 @@ class Comparison:
     @property
     def document(self) -> dict[str, Any]:
         """The comparison for JSON."""
-        names = ["decision", "won", "lost", "elsewhere", "undecided", "alone"]
-        names += ["p", "evidence", "more_pairs", "margins"]
-        numbers = {name: getattr(self, name) for name in names}
+        keys = ["decision", "won", "lost", "elsewhere", "undecided", "alone"]
+        keys += ["p", "evidence", "more_pairs", "margins"]
+        numbers = {name: getattr(self, name) for name in keys}
         return {
             "old": self.old.name,
             "pairs": len(self.pairs),
@@ -385,13 +387,13 @@ class PreparedJudgement:
         Args:
             allow: kinds of inconclusive verdicts that count: "vacuous", "dropped" and "doubtful".
         """
-        paths = {log.name: log.path for log in self.case.logs}
-        batch = _part_of_batch(batch, set(paths))
+        paths_by_name = {log.name: log.path for log in self.case.logs}
+        batch = _part_of_batch(batch, set(paths_by_name))
         row_by_log: dict[str, Values] = {}
         for row in worst_rows(_rows_of(batch.table, self.spec), len(batch.table)):
             # rows are sorted, so the first one of a template is the worst object
             row_by_log.setdefault(row["log"], row)
-        episode_by_log = _episode_names(list(paths))
+        episode_by_log = _episode_names(list(paths_by_name))
         rows = tuple(
             _judged_episode(
                 episode_by_log[log],
@@ -400,11 +402,14 @@ class PreparedJudgement:
                 self.labels.by_path.get(path, SuccessLabel(None)),
                 allow,
             )
-            for log, path in paths.items()
+            for log, path in paths_by_name.items()
         )
         if self.failure_file:
-            failures = _first_failures(batch.table, self.failure_file)
-            rows = tuple(_with_failure(row, failures.get(log)) for row, log in zip(rows, paths, strict=True))
+            failures_by_log = _first_failures(batch.table, self.failure_file)
+            rows = tuple(
+                _with_failure(row, failures_by_log.get(log))
+                for row, log in zip(rows, paths_by_name, strict=True)
+            )
         return Judgement(
             self.name,
             *self.spec,
@@ -430,15 +435,17 @@ class PreparedJudgement:
         """
         kinds: set[Kind] = {"only_theirs", "only_ours", "undecided"}
         rows = self.judgement(batch, allow).rows
-        paths = {row.log for row in rows if row.kind in kinds or (is_exported and not row.is_success)}
-        logs = {log.name for log in self.case.logs if log.path in paths}
-        names = zip(*(batch.table.column(name).to_pylist() for name in ("log", "file", "spec")), strict=True)
-        places = [
-            place
-            for place, (log, file, spec) in enumerate(names)
-            if log in logs and (file, spec) == (self.spec.file, self.spec.name)
+        log_paths = {row.log for row in rows if row.kind in kinds or (is_exported and not row.is_success)}
+        log_names = {log.name for log in self.case.logs if log.path in log_paths}
+        row_keys = zip(
+            *(batch.table.column(name).to_pylist() for name in ("log", "file", "spec")), strict=True
+        )
+        row_indices = [
+            index
+            for index, (log, file, spec) in enumerate(row_keys)
+            if log in log_names and (file, spec) == (self.spec.file, self.spec.name)
         ]
-        return explain_batch(batch, places, workers, progress=progress)
+        return explain_batch(batch, row_indices, workers, progress=progress)
 
 
 def prepare_judgement(
@@ -471,13 +478,13 @@ def prepare_judgement(
     )
 
 
-def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
+def _judging_spec(case: PreparedCase, result: str | None, first_index: int) -> _Spec:
     """Return the spec that judges. Files before the place `first` are not considered."""
     texts = tuple(file.text for file in case.files)
     files = parsed_specifications(texts, case.case.conditions)
     specs = [
-        _Spec(named.name, spec.name, printable(format_formula(spec.formula), 200))
-        for named, file in zip(case.files[first:], files[first:], strict=True)
+        _Spec(spec_file.name, spec.name, printable(format_formula(spec.formula), 200))
+        for spec_file, file in zip(case.files[first_index:], files[first_index:], strict=True)
         for spec in file.results
     ]
     if result is None:
@@ -489,9 +496,9 @@ def _judging_spec(case: PreparedCase, result: str | None, first: int) -> _Spec:
         raise UsageError(
             f"--result {result}: {listing([spec.file for spec in matches])} have it; give one --spec"
         )
-    names = [spec.name for spec in specs]
-    hint = nearest_hint(result, names) or f"results are {listing(names)}"
-    if any(result == spec.name for file in files[first:] for spec in file.specs):
+    spec_names = [spec.name for spec in specs]
+    hint = nearest_hint(result, spec_names) or f"results are {listing(spec_names)}"
+    if any(result == spec.name for file in files[first_index:] for spec in file.specs):
         hint = f"other specs use it, so it has no result; add `spec judged = {result}`"
     raise UsageError(f"--result {result}: no result has this name; {hint}")
 
@@ -503,8 +510,8 @@ def _name_of(case: PreparedCase) -> str:
         return Path(patterns[0]).resolve().name or "episodes"
     folders = {log.path.rpartition("#")[0] or log.path.rpartition("/")[0] or "." for log in case.logs}
     folder = folders.pop() if len(folders) == 1 else ""
-    path = PurePosixPath(folder) if is_address(folder) or not folder else Path(folder).resolve()
-    return path.name or "episodes"
+    folder_path = PurePosixPath(folder) if is_address(folder) or not folder else Path(folder).resolve()
+    return folder_path.name or "episodes"
 
 
 def _episode_names(logs: Sequence[str]) -> dict[str, str]:
@@ -522,8 +529,8 @@ def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
     import pyarrow.compute as pc
 
     requests = tuple(request for request in batch.requests if request.log.name in logs)
-    is_about = pc.is_in(batch.table["log"], pa.array(sorted(logs), pa.string()))
-    return replace(batch, table=batch.table.filter(is_about), requests=requests)
+    is_of_logs = pc.is_in(batch.table["log"], pa.array(sorted(logs), pa.string()))
+    return replace(batch, table=batch.table.filter(is_of_logs), requests=requests)
 
 
 def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:
@@ -560,14 +567,14 @@ def _judged_episode(
         kind = _AGREEMENTS[label.success, is_satisfied]
     if kind == "only_theirs" and label.is_unstored:
         kind, reason = "unstored", _unstored_reason(margin, row["unit"] or "")
-    times = [row[name] for name in ("satisfied_at_ns", "first_satisfied_ns") if row[name] is not None]
+    times_ns = [row[name] for name in ("satisfied_at_ns", "first_satisfied_ns") if row[name] is not None]
     return JudgedEpisode(
         episode,
         label.success,
         row["verdict"],
         kind,
         margin,
-        success_at=(times[0] - row["zero_ns"]) / 1e9 if times and is_satisfied else None,
+        success_at=(times_ns[0] - row["zero_ns"]) / 1e9 if times_ns and is_satisfied else None,
         tested=row["tested"],
         reason=reason or row["reason"] or "",
         task=label.task,
@@ -633,5 +640,5 @@ def _unstored_reason(margin: float | None, unit: str) -> str:
     if margin is None or margin == -float("inf"):
         return sentence
     is_small = unit == "m" and -margin < _SMALL_M
-    missing = f"{-margin * 1000.0:.2g} mm" if is_small else with_unit(-margin, unit)
-    return f"{sentence}; {missing} were missing"
+    missing_text = f"{-margin * 1000.0:.2g} mm" if is_small else with_unit(-margin, unit)
+    return f"{sentence}; {missing_text} were missing"

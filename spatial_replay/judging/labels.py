@@ -71,7 +71,7 @@ def read_labels(
     is_file = labels is not None and (labels.lower().endswith((".json", ".csv")) or Path(labels).is_file())
     if labels is not None and not is_file:
         reading = reading._replace(label=labels)
-    by_path: dict[str, SuccessLabel] = {}
+    labels_by_path: dict[str, SuccessLabel] = {}
     folders: dict[Path, None] = {}
     remarks: dict[str, None] = {}
     for log in logs:
@@ -81,40 +81,42 @@ def read_labels(
             remarks |= dict.fromkeys(f"{data_set.name}: {remark}" for remark in data_set.remarks)
             label = _stored_label(data_set, address[1], reading)
             # a file replaces all labels of the data set, because a rate of mixed labels has no meaning
-            by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
+            labels_by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
         elif not is_address(log.path) and not log.path.lower().endswith(DATA_SET_ENDINGS):
             # a data set that cannot be opened has no episodes for labels
             folders[Path(log.path).parent] = None
     candidates = [folder / name for folder in folders for name in LABEL_FILES]
-    files = [Path(labels or "")] if is_file else [file for file in candidates if file.is_file()]
-    for file in files:
+    label_files = [Path(labels or "")] if is_file else [file for file in candidates if file.is_file()]
+    for file in label_files:
         successes = _labels_of(file, logs)
         if is_file and not successes:
             raise UsageError(f"--labels {file}: it has no entry for a judged episode; give another file")
         for path, success in successes.items():
-            by_path[path] = by_path.get(path, SuccessLabel(None))._replace(success=success, is_unstored=False)
-    return Labels(by_path, tuple(files), tuple(remarks))
+            labels_by_path[path] = labels_by_path.get(path, SuccessLabel(None))._replace(
+                success=success, is_unstored=False
+            )
+    return Labels(labels_by_path, tuple(label_files), tuple(remarks))
 
 
 def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> SuccessLabel:
     """Return the label of an episode in its data set; no label if the data is unreadable."""
     episode, label = data_set.episode(number), data_set.label
-    about = SuccessLabel(None, task=episode.task, seed=episode.seed)
+    unlabelled = SuccessLabel(None, task=episode.task, seed=episode.seed)
     field = reading.label
     try:
         success = data_set.success(number, reading)
     except LogError:
-        return about
+        return unlabelled
     if success is None or not success.size:
-        return about
+        return unlabelled
     # a label in an earlier frame describes a stored state
     is_last = success.ndim == 1 and not success[:-1].any()
     is_own = field is None or (label is not None and label.field == field)
     is_about_next = label is not None and label.is_about_next if is_own else str(field).startswith("next.")
     is_stored = label is not None and label.is_stored
-    return about._replace(
+    return unlabelled._replace(
         success=bool(success.any()), is_unstored=is_last and is_about_next and not is_stored
     )
 
@@ -141,9 +143,9 @@ def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:
 
 
 def _repetition(entry: Mapping[str, Any], place: str) -> str:
-    frame = next((key for key in _FRAME_KEYS if key in entry), None)
-    if frame is not None:
-        return f"a label for each frame ({frame!r}); give one entry per episode"
+    frame_key = next((key for key in _FRAME_KEYS if key in entry), None)
+    if frame_key is not None:
+        return f"a label for each frame ({frame_key!r}); give one entry per episode"
     return f"{place} labels this episode already; keep one of them"
 
 
@@ -151,14 +153,14 @@ def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield each entry of a label file, with its place."""
     try:
         with file.open("rb") as stream:
-            data = stream.read(_LARGEST + 1)
+            content = stream.read(_LARGEST + 1)
         # spreadsheets write CSV with a byte order mark
-        text = data.decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UsageError(f"{file} is not UTF-8; save it as UTF-8") from None
     except (OSError, ValueError) as error:
         raise MissingFileError.of(file, error) from None
-    if len(data) > _LARGEST:
+    if len(content) > _LARGEST:
         raise UsageError(f"{file} is larger than {_LARGEST // 2**20} MB; labels have one entry per episode")
     if file.suffix.lower() == ".csv":
         rows = csv.DictReader(text.splitlines())
@@ -186,28 +188,28 @@ def _entry_path(
     entry: Mapping[str, Any], paths_by_name: Mapping[str, Sequence[str]], file: Path
 ) -> str | None:
     """Return the path of the log that an entry names; None if that log exists but is not judged."""
-    value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
+    log_value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
     # a bool is an int in Python
-    if not isinstance(value, str | int) or isinstance(value, bool):
+    if not isinstance(log_value, str | int) or isinstance(log_value, bool):
         raise UsageError("it names no episode; give 'log', a path, or 'episode', a number or name")
-    name = str(value).strip()
+    log_name = str(log_value).strip()
     # first next to the label file, because other folders may have logs of the same name
-    paths = paths_by_name.get(_stem(str(file.parent / name))) or paths_by_name.get(_stem(name)) or []
+    paths = paths_by_name.get(_stem(str(file.parent / log_name))) or paths_by_name.get(_stem(log_name)) or []
     if len(paths) > 1:
-        raise UsageError(f"{name!r:.100} names {plural(len(paths), 'log')}; write more of the path")
+        raise UsageError(f"{log_name!r:.100} names {plural(len(paths), 'log')}; write more of the path")
     if paths:
-        neighbour, path = file.parent / name, Path(paths[0])
-        is_like = neighbour.name == path.name and neighbour.is_file() and path.is_file()
-        if is_like and not neighbour.samefile(path):
+        neighbour, path = file.parent / log_name, Path(paths[0])
+        has_same_name = neighbour.name == path.name and neighbour.is_file() and path.is_file()
+        if has_same_name and not neighbour.samefile(path):
             raise UsageError(
-                f"{name!r:.100} is the log next to this file, not {path}; copy the file next to the"
+                f"{log_name!r:.100} is the log next to this file, not {path}; copy the file next to the"
                 " logs that it labels"
             )
         return paths[0]
-    if "\0" not in name and (file.parent / name).exists():
+    if "\0" not in log_name and (file.parent / log_name).exists():
         return None
-    hint = nearest_hint(name, paths_by_name) or "remove this entry, or judge that episode"
-    raise UsageError(f"no judged episode is named {name!r:.100}; {hint}")
+    hint = nearest_hint(log_name, paths_by_name) or "remove this entry, or judge that episode"
+    raise UsageError(f"no judged episode is named {log_name!r:.100}; {hint}")
 
 
 def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
@@ -215,7 +217,7 @@ def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
     paths_by_name = defaultdict[str, list[str]](list)
     for log in logs:
         parts = PurePosixPath(log.path).parts
-        names = {_stem(log.name), *(_stem("/".join(parts[begin:])) for begin in range(len(parts)))}
+        names = {_stem(log.name), *(_stem("/".join(parts[start:])) for start in range(len(parts)))}
         if data_set_address(log.path) is not None:
             names.add(log.path.rpartition("#")[2])
         for name in names | {_stem(log.path)}:

@@ -39,7 +39,7 @@ def judge_batch(
         allow: see `PreparedJudgement.judgement`.
         same_start: see `compare_judgements`; 0.001 unless given.
     """
-    judgement, *earlier = (part.judgement(batch, allow) for part in prepared)
+    judgement, *earlier = (preparation.judgement(batch, allow) for preparation in prepared)
     if not earlier:
         return judgement
     distance = SAME_START if same_start is None else same_start
@@ -56,11 +56,11 @@ def compare_judgements(
         conditions: how the logs are read.
         same_start: largest distance of an object's first places.
     """
-    by_seed = all(row.seed is not None for row in (*new.rows, *old.rows))
-    partners = dict(_rows_by_key(old.rows, by_seed))
+    has_seeds = all(row.seed is not None for row in (*new.rows, *old.rows))
+    old_rows = dict(_rows_by_key(old.rows, has_seeds))
     pairs, counts = [], Counter[str]()
-    for key, row in _rows_by_key(new.rows, by_seed):
-        partner = partners.pop(key, None)
+    for key, row in _rows_by_key(new.rows, has_seeds):
+        partner = old_rows.pop(key, None)
         if partner is None:
             counts["alone"] += 1
         elif None in (row.stored_success, partner.stored_success):
@@ -69,27 +69,27 @@ def compare_judgements(
             counts["elsewhere"] += 1
         else:
             pairs.append((row, partner))
-    counts["alone"] += len(partners)
-    numbers = counts["elsewhere"], counts["undecided"], counts["alone"]
-    return Comparison(new.name, old, tuple(pairs), *numbers)
+    counts["alone"] += len(old_rows)
+    other_counts = counts["elsewhere"], counts["undecided"], counts["alone"]
+    return Comparison(new.name, old, tuple(pairs), *other_counts)
 
 
 def _rows_by_key(
-    rows: Sequence[JudgedEpisode], by_seed: bool
+    rows: Sequence[JudgedEpisode], has_seeds: bool
 ) -> Iterator[tuple[tuple[object, ...], JudgedEpisode]]:
     """Yield each row with its key. Equal keys are numbered, so that the nth rows of both sides are a pair."""
-    counts = Counter[tuple[object, ...]]()
+    key_counts = Counter[tuple[object, ...]]()
     for row in rows:
-        key = (row.task, row.seed) if by_seed else (row.episode.rpartition("#")[2],)
-        counts[key] += 1
-        yield (*key, counts[key]), row
+        key = (row.task, row.seed) if has_seeds else (row.episode.rpartition("#")[2],)
+        key_counts[key] += 1
+        yield (*key, key_counts[key]), row
 
 
 def _start_alike(new: JudgedEpisode, old: JudgedEpisode, conditions: Conditions, same_start: float) -> bool:
-    places, others = _first_places(new.log, conditions), _first_places(old.log, conditions)
-    if not places or places.keys() != others.keys():
+    new_places, old_places = _first_places(new.log, conditions), _first_places(old.log, conditions)
+    if not new_places or new_places.keys() != old_places.keys():
         return False
-    return all(dist(place, others[name]) <= same_start for name, place in places.items())
+    return all(dist(place, old_places[name]) <= same_start for name, place in new_places.items())
 
 
 def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
@@ -104,9 +104,11 @@ def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
     if trace is None:
         return {}
     centres = centres_of(trace.footprints)
-    rows = {name: row for name, row in zip(trace.names, trace.rows[0].tolist(), strict=True) if row >= 0}
+    rows_by_name = {
+        name: row for name, row in zip(trace.names, trace.rows[0].tolist(), strict=True) if row >= 0
+    }
     places = {}
-    for name, row in rows.items():
+    for name, row in rows_by_name.items():
         bottom, top = trace.footprints.height(row) or (0.0, 0.0)
         x, y = centres.vertices[row].tolist()
         places[name] = (x, y, (bottom + top) / 2.0)
@@ -115,24 +117,24 @@ def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
 
 def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Yield lines with the number of pairs, the better side and the significance."""
-    pairs, won, lost = len(comparison.pairs), comparison.won, comparison.lost
-    parts = [f"{plural(pairs, 'pair')} with the same start"]
-    parts += [f"{comparison.elsewhere:,} with another start"] if comparison.elsewhere else []
-    parts += [f"{comparison.undecided:,} undecided"] if comparison.undecided else []
-    parts += [f"{plural(comparison.alone, 'episode')} without a partner"] if comparison.alone else []
-    yield f"against {comparison.old.name}: {', '.join(parts)}"
-    if not pairs:
+    pair_count, won, lost = len(comparison.pairs), comparison.won, comparison.lost
+    count_texts = [f"{plural(pair_count, 'pair')} with the same start"]
+    count_texts += [f"{comparison.elsewhere:,} with another start"] if comparison.elsewhere else []
+    count_texts += [f"{comparison.undecided:,} undecided"] if comparison.undecided else []
+    count_texts += [f"{plural(comparison.alone, 'episode')} without a partner"] if comparison.alone else []
+    yield f"against {comparison.old.name}: {', '.join(count_texts)}"
+    if not pair_count:
         return
     if not won and not lost:
         yield "undecided: both episodes of each pair succeed, or both fail"
         return
-    more = comparison.more_pairs
+    more_pairs = comparison.more_pairs
     if comparison.decision == "undecided":
-        after = "" if more is None else f"; about {more:,} more pairs would decide"
-        yield f"undecided: {won:,} won, {lost:,} lost of {pairs:,}, p = {comparison.p:.2g}{after}"
+        estimate = "" if more_pairs is None else f"; about {more_pairs:,} more pairs would decide"
+        yield f"undecided: {won:,} won, {lost:,} lost of {pair_count:,}, p = {comparison.p:.2g}{estimate}"
     else:
-        counts = f"{won:,} won, {lost:,} lost of {pairs:,} pairs"
-        yield f"{comparison.new} is {comparison.decision}: {counts}, p = {comparison.p:.2g}"
+        counts_text = f"{won:,} won, {lost:,} lost of {pair_count:,} pairs"
+        yield f"{comparison.new} is {comparison.decision}: {counts_text}, p = {comparison.p:.2g}"
     yield f"evidence {comparison.evidence:.2g} of the {EVIDENCE:.0f} needed"
     if comparison.margins is not None:
         yield f"margins: p = {comparison.margins.p:.2g} by Wilcoxon's signed ranks"

@@ -23,32 +23,32 @@ _MOST_IN_LINE: Final = 5
 
 def summary_lines(judgement: Judgement) -> Iterator[str]:
     """Yield lines with the judged episodes, the rates of verdicts and labels, and their agreement."""
-    count = plural(len(judgement.rows), "episode")
-    yield f"{judgement.name}: {count} judged by `{judgement.result}`, `{judgement.formula}`"
+    episodes_text = plural(len(judgement.rows), "episode")
+    yield f"{judgement.name}: {episodes_text} judged by `{judgement.result}`, `{judgement.formula}`"
     agreement = judgement.agreement
     rates = [*_rates("ours", judgement)]
     rates += [("label", judgement.label_rate, "")] if judgement.label_rate.episodes else []
     rates += _rates("against", judgement.comparison.old) if judgement.comparison else []
-    counts = [f"{rate.successes:,} of {rate.episodes:,}" for _, rate, _ in rates]
-    width = max(map(len, counts))
-    yield f"{'':10}{'success':<{width + 9}}95 %"
-    for count_text, (name, rate, end) in zip(counts, rates, strict=True):
-        yield f"{name:<10}{count_text:<{width}}  {_percents(rate)}{end}"
-    numbers = {
+    rate_texts = [f"{rate.successes:,} of {rate.episodes:,}" for _, rate, _ in rates]
+    rate_width = max(map(len, rate_texts))
+    yield f"{'':10}{'success':<{rate_width + 9}}95 %"
+    for rate_text, (name, rate, suffix) in zip(rate_texts, rates, strict=True):
+        yield f"{name:<10}{rate_text:<{rate_width}}  {_percents(rate)}{suffix}"
+    agreement_counts = {
         "both": agreement.both,
         "only the label": agreement.only_theirs,
         "only ours": agreement.only_ours,
         "neither": agreement.neither,
     }
-    rest = {"unstored": agreement.unstored, "undecided": agreement.undecided}
-    rest["without a label"] = len(judgement.rows) - judgement.label_rate.episodes
+    other_counts = {"unstored": agreement.unstored, "undecided": agreement.undecided}
+    other_counts["without a label"] = len(judgement.rows) - judgement.label_rate.episodes
     if not judgement.label_rate.episodes:
-        numbers, rest = {}, {"no labels; undecided": agreement.undecided}
-    numbers |= {name: number for name, number in rest.items() if number}
-    if numbers:
-        agreeing = f"{agreement.both + agreement.neither:,} of {agreement.compared:,}"
-        start = f"agreement {agreeing:<{width + 9}}" if judgement.label_rate.episodes else ""
-        yield f"{start}{', '.join(f'{name} {number:,}' for name, number in numbers.items())}"
+        agreement_counts, other_counts = {}, {"no labels; undecided": agreement.undecided}
+    agreement_counts |= {name: number for name, number in other_counts.items() if number}
+    if agreement_counts:
+        agreement_text = f"{agreement.both + agreement.neither:,} of {agreement.compared:,}"
+        beginning = f"agreement {agreement_text:<{rate_width + 9}}" if judgement.label_rate.episodes else ""
+        yield f"{beginning}{', '.join(f'{name} {number:,}' for name, number in agreement_counts.items())}"
     if judgement.pass_k:
         yield ", ".join(f"pass^{k} {100.0 * value:.0f} %" for k, value in judgement.pass_k.items())
 
@@ -74,38 +74,44 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
         if rows:
             yield ""
             yield f"{title} {len(rows):,}:"
-            lines = defaultdict[tuple[str, str], list[str]](list)
+            episodes_by_reason = defaultdict[tuple[str, str], list[str]](list)
             for row in rows:
                 # undecided episodes often share one reason, which is listed once
-                lines[_reason(row), "" if kind == "undecided" else row.episode].append(row.episode)
-            names = [listing(episodes, _MOST_IN_LINE) for episodes in lines.values()]
-            width = max(map(len, names[:_MOST]))
-            pairs = [f"  {name:<{width}}  {line}" for name, (line, _) in zip(names, lines, strict=True)]
-            yield from first_lines(pairs, _MOST)
+                episodes_by_reason[_reason(row), "" if kind == "undecided" else row.episode].append(
+                    row.episode
+                )
+            episode_lists = [listing(episodes, _MOST_IN_LINE) for episodes in episodes_by_reason.values()]
+            width = max(map(len, episode_lists[:_MOST]))
+            reason_lines = [
+                f"  {name:<{width}}  {reason}"
+                for name, (reason, _) in zip(episode_lists, episodes_by_reason, strict=True)
+            ]
+            yield from first_lines(reason_lines, _MOST)
 
 
 def failure_lines(judgement: Judgement) -> Iterator[str]:
     """Yield a line per first failure: its name, its number of episodes, and the first of them."""
     episode_count = sum(map(len, judgement.failures.values()))
     yield f"first failures of the {plural(episode_count, 'episode')} that fail `{judgement.result}`"
-    names = {name: name or "another failure" for name in judgement.failures}
-    width = max(map(len, names.values()), default=0)
+    failure_names = {name: name or "another failure" for name in judgement.failures}
+    width = max(map(len, failure_names.values()), default=0)
     for name, rows in judgement.failures.items():
         episodes = listing([row.episode for row in rows], _MOST_IN_LINE)
-        yield f"  {names[name]:<{width}}  {len(rows):>{len(str(episode_count))},}  {episodes}"
+        yield f"  {failure_names[name]:<{width}}  {len(rows):>{len(str(episode_count))},}  {episodes}"
 
 
 def stage_lines(judgement: Judgement) -> Iterator[str]:
     """Yield a line per stage: the number of episodes that end there, and of failures by label among them."""
-    failures = [row for row in judgement.rows if row.label is False]
-    title, end = f"stages of `{judgement.result}`", "at the end"
-    width = max(map(len, (*judgement.stages, title)))
-    of_label = f"of the {len(failures):,} that the label calls failures"
-    yield f"{title:<{width}}  {end}  {of_label if failures else ''}".rstrip()
-    numbers = [Counter(row.stage for row in rows) for rows in (judgement.rows, failures)]
+    failed_rows = [row for row in judgement.rows if row.label is False]
+    heading, end_heading = f"stages of `{judgement.result}`", "at the end"
+    width = max(map(len, (*judgement.stages, heading)))
+    failure_heading = f"of the {len(failed_rows):,} that the label calls failures"
+    yield f"{heading:<{width}}  {end_heading}  {failure_heading if failed_rows else ''}".rstrip()
+    stage_counts = [Counter(row.stage for row in rows) for rows in (judgement.rows, failed_rows)]
     for name in judgement.stages:
-        at_end, of_failures = (f"{count[name]:,}" for count in numbers)
-        yield f"{name:<{width}}  {at_end:<{len(end)}}  {of_failures if failures else ''}".rstrip()
+        end_count, failure_count = (f"{count[name]:,}" for count in stage_counts)
+        line = f"{name:<{width}}  {end_count:<{len(end_heading)}}  "
+        yield f"{line}{failure_count if failed_rows else ''}".rstrip()
 
 
 def _reason(row: JudgedEpisode) -> str:

@@ -44,15 +44,15 @@ def episode_stages(
     """
     conditions, texts = case.case.conditions, tuple(file.text for file in case.files)
     specifications = parsed_specifications(texts, conditions)
-    place = [file.name for file in case.files].index(judgement.file)
+    file_index = [file.name for file in case.files].index(judgement.file)
     stages: dict[str, Stages] = {}
     with progress("stages", len(judgement.rows)) as advance:
         for row in judgement.rows:
             # the row of a log already reports its errors
             if row.verdict is not None:
                 with suppress(GeometryError, LogError, TraceError):
-                    task = Task(row.log, (texts[place],), conditions)
-                    stages[row.log] = _stages(task, specifications[place], judgement.result)
+                    task = Task(row.log, (texts[file_index],), conditions)
+                    stages[row.log] = _stages(task, specifications[file_index], judgement.result)
             advance(1)
     return stages
 
@@ -69,8 +69,8 @@ def _stages(task: Task, specification: Specification, name: str) -> Stages:
 def with_stages(judgement: Judgement, stages: Mapping[str, Stages]) -> Judgement:
     """Return a judgement whose rows have the stage and the progress at the end of each episode."""
     rows = tuple(_at_stage(row, stages.get(row.log)) for row in judgement.rows)
-    ends = {row.stage for row in rows}
-    names = tuple(name for name in stage_names(stages) if name in ends or name not in (LOST, UNKNOWN))
+    end_stages = {row.stage for row in rows}
+    names = tuple(name for name in stage_names(stages) if name in end_stages or name not in (LOST, UNKNOWN))
     return replace(judgement, rows=rows, stages=names)
 
 
@@ -94,25 +94,27 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
     """
     import pyarrow as pa
 
-    episodes, frames = (table[name].to_numpy() for name in ("episode_index", "frame_index"))
+    episode_indices, frame_indices = (table[name].to_numpy() for name in ("episode_index", "frame_index"))
     times_s = table["timestamp"].to_pylist()
-    place_of_stage = {name: place for place, name in enumerate(names)}
-    indices = np.full(len(table), -1, np.int64)
+    index_of_stage = {name: row for row, name in enumerate(names)}
+    stage_indices = np.full(len(table), -1, np.int64)
     progress = np.full(len(table), np.nan, np.float32)
     language_rows: list[list[dict[str, Any]]] = [[] for _ in times_s]
-    for number in np.unique(episodes).tolist():
-        run, places = runs.get(number), np.flatnonzero(episodes == number)
-        if run is None or len(run.numbers) != len(places):
+    for episode in np.unique(episode_indices).tolist():
+        run, frame_rows = runs.get(episode), np.flatnonzero(episode_indices == episode)
+        if run is None or len(run.numbers) != len(frame_rows):
             continue
-        places = places[np.argsort(frames[places], kind="stable")]
-        indices[places] = np.array([place_of_stage[stage.name] for stage in run.stages])[run.numbers]
-        progress[places] = run.progress
+        frame_rows = frame_rows[np.argsort(frame_indices[frame_rows], kind="stable")]
+        stage_indices[frame_rows] = np.array([index_of_stage[stage.name] for stage in run.stages])[
+            run.numbers
+        ]
+        progress[frame_rows] = run.progress
         changes = [0, *(np.flatnonzero(np.diff(run.numbers)) + 1).tolist()]
-        run_rows = [_subtask(run[change].name, times_s[places[change]]) for change in changes]
-        for place in places.tolist():
-            language_rows[place] = run_rows
+        subtask_rows = [_subtask(run[change].name, times_s[frame_rows[change]]) for change in changes]
+        for row in frame_rows.tolist():
+            language_rows[row] = subtask_rows
     columns = {
-        SUBTASK: pa.array(indices),
+        SUBTASK: pa.array(stage_indices),
         PROGRESS: pa.array(progress),
         # the types of lerobot's own annotations
         LANGUAGE: pa.array(language_rows, pa.list_(_row_type())),
@@ -153,27 +155,31 @@ def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[st
     import pyarrow as pa
     from pyarrow import parquet
 
-    numbered = {address[1]: run for log, run in runs.items() if (address := data_set_address(log))}
+    runs_by_episode = {address[1]: run for log, run in runs.items() if (address := data_set_address(log))}
     for file in sorted((folder / "data").glob("*/*.parquet")):
         with parquet.ParquetFile(file) as source:
-            groups = [source.read_row_group(place) for place in range(source.num_row_groups)]
-        table = frames_with_stages(pa.concat_tables(groups), numbered, names)
+            row_groups = [source.read_row_group(group_index) for group_index in range(source.num_row_groups)]
+        table = frames_with_stages(pa.concat_tables(row_groups), runs_by_episode, names)
         # the file may be a link to the original data set, which must not change
         file.unlink()
         with parquet.ParquetWriter(file, table.schema) as writer:
-            begin = 0
-            for group in groups:
-                writer.write_table(table.slice(begin, len(group)))
-                begin += len(group)
+            start = 0
+            for row_group in row_groups:
+                writer.write_table(table.slice(start, len(row_group)))
+                start += len(row_group)
     subtasks = pa.table({SUBTASK: pa.array(range(len(names)), pa.int64()), "subtask": list(names)})
     # pandas reads the names as the index, as in LeRobot's table of tasks
     columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind, "metadata": None}
-        for name, kind in ((SUBTASK, "int64"), ("subtask", "object"))
+        {"name": name, "field_name": name, "pandas_type": dtype, "numpy_type": dtype, "metadata": None}
+        for name, dtype in ((SUBTASK, "int64"), ("subtask", "object"))
     ]
-    index = json.dumps({"index_columns": ["subtask"], "column_indexes": [], "columns": columns})
-    parquet.write_table(subtasks.replace_schema_metadata({"pandas": index}), folder / "meta/subtasks.parquet")
+    pandas_metadata = json.dumps({"index_columns": ["subtask"], "column_indexes": [], "columns": columns})
+    parquet.write_table(
+        subtasks.replace_schema_metadata({"pandas": pandas_metadata}), folder / "meta/subtasks.parquet"
+    )
     info = json.loads((folder / "meta/info.json").read_text("utf-8"))
-    types = {SUBTASK: "int64", PROGRESS: "float32", LANGUAGE: "language"}
-    info["features"] |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in types.items()}
+    feature_types = {SUBTASK: "int64", PROGRESS: "float32", LANGUAGE: "language"}
+    info["features"] |= {
+        name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in feature_types.items()
+    }
     (folder / "meta/info.json").write_text(json.dumps(info, indent=4), "utf-8")

@@ -91,25 +91,27 @@ def more_pairs(won: int, lost: int, pairs: int) -> int | None:
     return max(high - pairs, 0)
 
 
-def _power(count: int, won: int, lost: int, pairs: int) -> float:
+def _power(pair_count: int, won: int, lost: int, pairs: int) -> float:
     """Return the probability that the exact test of `count` pairs decides."""
     binom = _scipy().binom
-    differing = np.arange(count + 1)
-    weights = binom.pmf(differing, count, (won + lost) / pairs)
+    differing_pairs = np.arange(pair_count + 1)
+    weights = binom.pmf(differing_pairs, pair_count, (won + lost) / pairs)
     # weights far from the mean do not change the sum of doubles
-    differing, weights = differing[weights > 1e-17], weights[weights > 1e-17]
-    limits = _critical(differing)
-    share = won / (won + lost)
-    decided = binom.cdf(limits, differing, share) + binom.sf(differing - limits - 1, differing, share)
-    return float(np.sum(weights * np.where(limits < 0, 0.0, decided)))
+    differing_pairs, weights = differing_pairs[weights > 1e-17], weights[weights > 1e-17]
+    limits = _critical(differing_pairs)
+    win_share = won / (won + lost)
+    chances = binom.cdf(limits, differing_pairs, win_share) + binom.sf(
+        differing_pairs - limits - 1, differing_pairs, win_share
+    )
+    return float(np.sum(weights * np.where(limits < 0, 0.0, chances)))
 
 
-def _critical(differing: Integers) -> Integers:
+def _critical(differing_pairs: Integers) -> Integers:
     """Return the greatest number of wins of the losing side that still decides; -1 for none."""
     binom = _scipy().binom
     # `ppf` is the least number whose cdf reaches the level, so it may be too large by 1
-    limits = binom.ppf(SIGNIFICANCE / 2.0, differing, 0.5)
-    is_above = binom.cdf(limits, differing, 0.5) > SIGNIFICANCE / 2.0
+    limits = binom.ppf(SIGNIFICANCE / 2.0, differing_pairs, 0.5)
+    is_above = binom.cdf(limits, differing_pairs, 0.5) > SIGNIFICANCE / 2.0
     return np.asarray(np.where(is_above, limits - 1, limits), int)
 
 

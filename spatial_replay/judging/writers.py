@@ -41,18 +41,20 @@ def labelled_batch(judgement: Judgement) -> BatchResult:
         # a violated spec of this file is a failure that did not happen
         table = table.filter(pc.not_equal(table["file"], judgement.failure_file))
     paths = {request.log.name: request.log.path for request in judgement.batch.requests}
-    episodes = {row.log: row for row in judgement.rows}
-    rows = [episodes[paths[log]] for log in table["log"].to_pylist()]
-    table = table.append_column(LABEL, pa.array([_WORDS[row.label] for row in rows], pa.string()))
-    table = table.append_column(AGREEMENT, pa.array([row.kind for row in rows], pa.string()))
+    rows_by_log = {row.log: row for row in judgement.rows}
+    episode_rows = [rows_by_log[paths[log]] for log in table["log"].to_pylist()]
+    table = table.append_column(LABEL, pa.array([_WORDS[row.label] for row in episode_rows], pa.string()))
+    table = table.append_column(AGREEMENT, pa.array([row.kind for row in episode_rows], pa.string()))
     if judgement.label_rate.episodes:
-        results = zip(*(table[name].to_pylist() for name in ("file", "spec", "failure")), strict=True)
+        result_values = zip(*(table[name].to_pylist() for name in ("file", "spec", "failure")), strict=True)
         failures = [
             _failure(row, failure) if spec in (judgement.result, "") and file == judgement.file else None
-            for row, (file, spec, failure) in zip(rows, results, strict=True)
+            for row, (file, spec, failure) in zip(episode_rows, result_values, strict=True)
         ]
-        place = table.schema.get_field_index("failure")
-        table = table.set_column(place, table.schema.field(place), pa.array(failures, pa.string()))
+        column_index = table.schema.get_field_index("failure")
+        table = table.set_column(
+            column_index, table.schema.field(column_index), pa.array(failures, pa.string())
+        )
     return replace(judgement.batch, table=table)
 
 
@@ -71,13 +73,17 @@ def label_table(judgement: Judgement) -> pa.Table:
 
     table = _table_with_success(judgement)
     # readers of CSV would take the names 0.10 and 0.1 for the same number
-    name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
-    numbers = pa.array(_episode_numbers(judgement), pa.int64())
-    names = pa.array([name] * len(table), pa.string())
-    for column, values in {"run_id": names, "policy_id": names, "episode_idx": numbers}.items():
+    policy_name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
+    episode_numbers = pa.array(_episode_numbers(judgement), pa.int64())
+    policy_names = pa.array([policy_name] * len(table), pa.string())
+    for column, values in {
+        "run_id": policy_names,
+        "policy_id": policy_names,
+        "episode_idx": episode_numbers,
+    }.items():
         table = table.append_column(column, values)
-    absent = [column for column in ("task", "seed") if table[column].null_count == len(table)]
-    return table.drop_columns(absent).filter(pc.is_valid(table["success"]))
+    empty_columns = [column for column in ("task", "seed") if table[column].null_count == len(table)]
+    return table.drop_columns(empty_columns).filter(pc.is_valid(table["success"]))
 
 
 def _table_with_success(judgement: Judgement) -> pa.Table:
@@ -165,16 +171,16 @@ def annotate_data_set(
 
     partial = Path(tempfile.mkdtemp(prefix=f".{new.name}.", dir=new.absolute().parent))
     try:
-        for part in folder.iterdir():
-            for parent, _, names in os.walk(part) if part.is_dir() else [(folder, (), [part.name])]:
-                place = partial / Path(parent).relative_to(folder)
-                place.mkdir(parents=True, exist_ok=True)
-                for name in names:
-                    source = Path(parent, name).resolve()
-                    if part.name in ("data", "videos"):
-                        (place / name).symlink_to(source)
+        for entry in folder.iterdir():
+            for parent, _, file_names in os.walk(entry) if entry.is_dir() else [(folder, (), [entry.name])]:
+                target_folder = partial / Path(parent).relative_to(folder)
+                target_folder.mkdir(parents=True, exist_ok=True)
+                for name in file_names:
+                    source_file = Path(parent, name).resolve()
+                    if entry.name in ("data", "videos"):
+                        (target_folder / name).symlink_to(source_file)
                     else:
-                        shutil.copyfile(source, place / name)
+                        shutil.copyfile(source_file, target_folder / name)
         for file in sorted((partial / "meta/episodes").glob("chunk-*/file-*.parquet")):
             parquet.write_table(_with_labels(parquet.read_table(file), judgement), file)
         if stages:
@@ -194,14 +200,14 @@ def _with_labels(table: pa.Table, judgement: Judgement) -> pa.Table:
     """Return a table of episodes with the columns of a judgement; null for episodes that are not judged."""
     import pyarrow as pa
 
-    places = {number: place for place, number in enumerate(_episode_numbers(judgement))}
-    order = [places.get(number) for number in table["episode_index"].to_pylist()]
-    labels = _table_with_success(judgement).take(pa.array(order, pa.int64()))
+    rows_by_number = {number: row for row, number in enumerate(_episode_numbers(judgement))}
+    row_indices = [rows_by_number.get(number) for number in table["episode_index"].to_pylist()]
+    labels = _table_with_success(judgement).take(pa.array(row_indices, pa.int64()))
     # columns of an earlier judgement are replaced, and the metadata describes the old columns only
-    names = [name for name in table.column_names if not name.startswith("judge/")]
-    table = table.select(names).replace_schema_metadata(None)
+    column_names = [name for name in table.column_names if not name.startswith("judge/")]
+    table = table.select(column_names).replace_schema_metadata(None)
     for name in ("success", "margin", "success_at", "tested", "reason"):
         table = table.append_column(f"judge/{name}", labels[name])
     spec = f"{judgement.file}: {judgement.result} = {judgement.formula}"
-    specs = [None if place is None else spec for place in order]
-    return table.append_column("judge/spec", pa.array(specs, pa.string()))
+    spec_texts = [None if row is None else spec for row in row_indices]
+    return table.append_column("judge/spec", pa.array(spec_texts, pa.string()))
