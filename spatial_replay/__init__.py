@@ -1,6 +1,6 @@
 """Spatio-temporal robustness of recorded runs: log → trace → formula → robustness → log.
 
-Names are imported when they are first used, so that importing the package loads no numerical library.
+Names are imported at their first use. Importing the package loads no numerical library.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The commands on whole logs as functions: replay, report, diff, clip, tune, learn, verify, info."""
+"""Commands as functions: replay, report, diff, clip, tune, learn, batch, judge, verify, info."""
 
 from __future__ import annotations
 
@@ -51,10 +51,11 @@ class Evaluating(Reading, total=False):
     """Options of evaluating and reading a log, for `replay_log` and `write_report`.
 
     Attributes:
-        constants: values that replace those in files and in the log's own specifications.
+        constants: values of constants, instead of the values in files and in the log's own specifications.
         each: objects for each parameter of a template: "all", "class:NAME" or a name.
-        semantics: "ltlf" unless given, or "paper": Def. 16 of the paper to the letter.
-        start_ns, end_ns, every: evaluate every `every`th sample from `start_ns` to before `end_ns`.
+        semantics: "ltlf" (default), or "paper" for Def. 16 of the paper to the letter.
+        start_ns, end_ns: window of evaluation, from `start_ns` to before `end_ns`.
+        every: step between evaluated samples: 1 for all samples.
         strict_names: whether missing objects and signals are errors; otherwise they are unknown.
     """
 
@@ -77,16 +78,17 @@ def replay_log(
     arrow: str = "",
     **options: Unpack[Evaluating],
 ) -> Replayed:
-    """Evaluate specifications over a log, and write the annotated log if a file is named.
+    """Evaluate specifications over a log, and write an annotated log if `output` is given.
 
     Args:
         log: a file in any format, its address (s3://, gs://, az://, https://), or a trace.
-        specifications: one or several, parsed or as files; None takes the specifications in the log.
-        output: the annotated log to write (MCAP).
+        specifications: one or several, parsed or as files; None for the specifications in the log.
+        output: path of the annotated log (MCAP).
         layer: whether only derived messages are written, without the log's own messages.
         keep: the log's own messages in the output: "all", "mapped" for mapped topics, or patterns of topics
             such as "/camera/*"; several are combined. The default is all messages, but none of a ROS 2 bag.
-        arrow: the title of the result whose violation the output's scene points at; "" for the first one.
+        arrow: title of the violated result for the arrow in the output's scene; "" for the first violated
+            result.
         options: options of evaluation (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
             `strict_names`; see `Evaluating`) and of reading, as for `read_trace`.
 
@@ -101,7 +103,7 @@ def replay_log(
     if keep is not None and (output is None or layer):
         raise UsageError("keep chooses the log's own messages in an annotated log; give output, and no layer")
     if keep is None and output is None:
-        # without an output, only the messages of samples are read
+        # without an output, only mapped messages are read
         keep = (MAPPED,)
     constants, settings = _evaluation(options)
     source = _source(log, options)
@@ -124,12 +126,12 @@ def write_report(
     output: PathName,
     **options: Unpack[Evaluating],
 ) -> Replayed:
-    """Evaluate specifications over a log and write a report as one HTML page.
+    """Evaluate specifications over a log, and write a report as one HTML page.
 
     Args:
-        output: the page to write; its name ends in .html.
+        output: path of the page; its name ends in .html.
 
-    The other arguments and errors are those of `replay_log`.
+    The other arguments and errors are the same as for `replay_log`.
     """
     constants, settings = _evaluation(options)
     inputs = _inputs(log, specifications, options)
@@ -155,12 +157,12 @@ def diff_specifications(
 
     Args:
         log: a file in any format, or a trace.
-        old, new: parsed, or as files.
-        output: a page to write, with both sides under one time cursor; its name ends in .html.
+        old, new: specifications, parsed or as files.
+        output: path of a page with both sides under one time cursor; its name ends in .html.
         options: options of evaluation and reading, as for `replay_log`.
 
     Raises:
-        UsageError: the versions have no spec in common, an option is invalid, or the window has no sample.
+        UsageError: the versions have no common spec, an option is invalid, or the window has no sample.
         SpecificationError: a specification has errors.
         LogError: the log cannot be read.
     """
@@ -183,18 +185,18 @@ def diff_logs(
     output: PathName | None = None,
     **options: Unpack[Evaluating],
 ) -> LogDiff:
-    """Compare two runs: objects that moved differently, and the effects on each spec and decision.
+    """Compare two runs: objects with different motions, and the effects on each spec and decision.
 
     Args:
-        specifications: one or several, parsed or as files; None takes the specifications in a log.
-        align: "time" since the zero of each log, "progress" of an automaton, or the name of a spec. The
-            spec's first change of sign in each run is then the event.
-        output: a page to write, with both sides under one time cursor; its name ends in .html.
+        specifications: one or several, parsed or as files; None for the specifications in a log.
+        align: "time" since the zero of each log, "progress" of an automaton, or the name of a spec. A spec
+            aligns the runs at the first change of its robustness' sign.
+        output: path of a page with both sides under one time cursor; its name ends in .html.
         options: options of evaluation and reading for both logs, as for `replay_log`.
 
     Raises:
-        UsageError: the runs have no common object, different units or nothing to align by, or an option is
-            invalid.
+        UsageError: the runs have no common object, different units, or no common event for `align`; or an
+            option is invalid.
         SpecificationError: a specification has errors.
         LogError: a log cannot be read.
     """
@@ -225,12 +227,12 @@ def clip_log(
     """Write the smallest part of a log with the same verdicts, robustness and witnesses.
 
     Args:
-        output: the clip to write (MCAP), an annotated log.
-        around_ns: least time to keep before and after the deciding samples.
-        of: names of the specs whose verdicts are kept; without it, all results.
-        topics: patterns of the topics to keep, such as "/camera/*"; None for all.
+        output: path of the clip (MCAP), an annotated log.
+        around_ns: least time in the clip before and after the deciding samples.
+        of: names of the specs whose verdicts are kept; empty for the violated specs, or all.
+        topics: patterns of the clip's topics, such as "/camera/*"; None for all topics.
 
-    The other arguments are those of `replay_log`.
+    The other arguments are the same as for `replay_log`.
 
     Raises:
         UsageError: a spec is missing, an option is invalid, or the output is an input.
@@ -253,7 +255,7 @@ def clip_log(
 
 
 def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, ReplayOptions]:
-    """Remove the options of evaluation from all options, and return them."""
+    """Remove the options of evaluation from `options`, and return the constants and the other options."""
     refuse_unknown(options, (*Evaluating.__annotations__, "specifications", "output"))
     window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
     objects, constants = options.pop("each", None), options.pop("constants", None)
@@ -275,17 +277,17 @@ def tune(
     """Find constants with which all good runs satisfy a specification, and all bad runs violate it.
 
     With bad runs, the constants have the widest margin. The margin is the least of the good runs' robustness
-    and the bad runs' negated robustness. With good runs only, the constants are the tightest ones that all
-    runs satisfy.
+    and the bad runs' negated robustness. With good runs only, the constants are the tightest constants that
+    all runs satisfy.
 
     Args:
-        specification: parsed, or as a file.
+        specification: a specification, parsed or as a file.
         good, bad: logs in any format, or traces.
-        vary: the values to try, by name: `{"near": (40, 100), "hold": ("1s", "4s")}`; None takes the range in
-            the text. Without `vary`, all constants with a range in the text are tuned.
-        constants: values of other constants, instead of those in the file.
+        vary: ranges by name: `{"near": (40, 100), "hold": ("1s", "4s")}`; the range None is the range in the
+            text. Without `vary`, all constants with a range in the text are tuned.
+        constants: values of other constants, instead of the values in the file.
         each: objects for each parameter of a template: "all", "class:NAME" or a name.
-        seed: seed of the search over several constants; the same seed finds the same values.
+        seed: seed of the search over several constants. Equal seeds give equal values.
         reading: options of reading, as for `read_trace`.
 
     Raises:
@@ -318,20 +320,20 @@ def learn(
     profile: str = DEFAULT_PROFILE,
     **reading: Unpack[Reading],
 ) -> Learned:
-    """Find a short specification: all good runs satisfy it, and a bad run violates each line.
+    """Find a short specification that all good runs satisfy. Some bad run violates each line.
 
-    Without bad runs, its lines are common properties of the good runs: ends, invariants and orders of events.
-    Limits keep a margin from the good runs (see `docs/learning.md`).
+    Without bad runs, the lines are common properties of the good runs: ends, invariants and orders of events.
+    Limits have a margin to the good runs (see `docs/learning.md`).
 
     Args:
-        good, bad: logs in any format, or traces; at least two good ones.
-        lines: largest number of specs; the most telling ones are written.
+        good, bad: logs in any format, or traces; at least two good runs.
+        lines: maximum number of specs. The most distinctive specs are written.
         profile: profile of the relations, "paper" or "spatial_spec".
         reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: a run is too short, runs are equal or in different units, or the good runs are fewer than
-            two or have nothing in common.
+        UsageError: a run is too short, runs are equal or in different units, or there are fewer than two good
+            runs, or the good runs have no common property.
         LogError: a log cannot be read.
     """
     refuse_unknown(reading, Reading.__annotations__)
@@ -362,28 +364,27 @@ def evaluate_logs(
     """Evaluate many logs, and store their results. Results of an earlier batch are reused.
 
     Args:
-        logs: a suite file (.yaml), which has all other settings; or files, folders, addresses, and patterns
-            such as "nightly/**/*.mcap".
-        specifications: the specification files or their addresses, unless `logs` is a suite.
+        logs: a suite file (.yaml) with all other settings; or files, folders, addresses, and patterns such as
+            "nightly/**/*.mcap".
+        specifications: specification files or their addresses; None for a suite.
         output: folder of results, created if needed, or its address, such as "s3://bucket/results".
-        jobs: number of processes; for more than 1, a program needs the guard `if __name__ == "__main__":`, as
+        jobs: number of processes. A program with more than 1 needs the guard `if __name__ == "__main__":`, as
             for every process pool.
-        dask: address of a Dask scheduler, whose workers evaluate instead.
+        dask: address of a Dask scheduler, whose workers evaluate the logs.
         fail_on: "vacuous", "cut", "unknown", "left", "doubtful": further kinds of results that fail.
-        allow: "vacuous", "dropped", "doubtful": kinds of results that pass. Nothing tested them, the recorder
-            dropped samples, or the log contradicts an assumption.
+        allow: "vacuous", "dropped", "doubtful": kinds of results that pass although nothing tested them, the
+            recorder dropped samples, or the log contradicts an assumption.
         constants, each, semantics, strict_names, reading: as for `replay_log`.
 
     Returns:
         `table`, a `pyarrow.Table` with one row for each log, spec and object of a template, and `failures`,
-        the rows that do not pass. A log that cannot be read is a row with its `error`. Rows that pass have
-        no explanation.
+        the failing rows. The row of an unreadable log has an `error`. Passing rows have no explanation.
 
     Raises:
         UsageError: a pattern has no log, an option is invalid, or pyarrow is not installed.
         SpecificationError: specifications have errors.
-        OutputError: results cannot be written; earlier results are kept.
-        ClusterError: the scheduler is lost; results so far are kept.
+        OutputError: results cannot be written; earlier results are stored.
+        ClusterError: the scheduler is lost; the results so far are stored.
     """
     from spatial_replay.batch.explanations import explain_batch, failing_places
     from spatial_replay.batch.run import prepare, run_batch, workers_of
@@ -432,19 +433,19 @@ def judge(
         logs: episodes: files, folders, patterns, data sets.
         labels: a JSON or CSV file, or a field of the data set. By default, labels are in labels.json or
             labels.csv next to the logs, or in the data set.
-        result: the name of the spec that judges; by default the last one that no other spec uses.
-        against: earlier episodes to compare with.
-        same_start: largest distance of an object between the first samples of a pair; 0.001 unless given.
-        failures: a specification file whose specs describe failures; each failed episode has its first
+        result: name of the spec that judges; by default the last spec that no other spec uses.
+        against: earlier episodes for a comparison.
+        same_start: largest distance between an object's two first places in a pair; by default 0.001.
+        failures: specification file whose specs describe failures. Each failed episode then has its first
             failure.
-        stages: whether each episode has its stage of the task at the end.
-        output: the folder of results; without one, results are not stored.
+        stages: whether each episode has its final stage of the task.
+        output: folder of results; None stores no results.
 
-    The other arguments and errors are those of `evaluate_logs`.
+    The other arguments and errors are the same as for `evaluate_logs`.
 
     Returns:
-        `rows`, one for each episode, `rate`, `label_rate`, `agreement`, `comparison`. `to_pandas()` returns
-        the rows as a data frame.
+        `rows`, one row for each episode, `rate`, `label_rate`, `agreement`, `comparison`. `to_pandas()`
+        returns the rows as a data frame.
     """
     from spatial_replay.batch.run import run_batch, workers_of
     from spatial_replay.batch.suite import Conditions
@@ -512,15 +513,15 @@ def read_results(folder: PathName) -> pa.Table:
 def verify(
     log: PathName, source: PathName | None = None, *, explain: bool = False, **reading: Unpack[Reading]
 ) -> Verified:
-    """Recompute a log's certificate, with the log's own specifications and options, and compare.
+    """Recompute a log's certificate with the log's own specifications and options, and compare it.
 
     Args:
-        source: source of the log, which is evaluated instead.
-        explain: whether `explanation` has the first differences, which takes another evaluation.
+        source: log from which `log` was made. The source is evaluated instead of `log`.
+        explain: whether `explanation` has the first differences. This takes another evaluation.
         reading: options of reading `source`, as for `read_trace`.
 
     Returns:
-        Both certificates; `differences` is empty if they are equal.
+        Both certificates. `differences` is empty if the certificates are equal.
 
     Raises:
         UsageError, LogError, SpecificationError: the log cannot be evaluated.
@@ -540,7 +541,7 @@ def info(log: PathName, **reading: Unpack[Reading]) -> Overview:
 
     Raises:
         UsageError: the file is missing, or an external log has no mapping.
-        LogError: nothing in the log can be read.
+        LogError: the whole log is unreadable.
     """
     return overview_of(open_source(log, **reading))
 
@@ -569,11 +570,11 @@ def _specification_list(specifications: Specifications | None) -> list[Specifica
 def _files(
     specifications: Specifications | None, source: Source, constants: Mapping[str, float | str] | None
 ) -> list[Specification]:
-    """Return the specifications to evaluate, in the order in which they are given."""
+    """Return the parsed specifications, in the order of the argument."""
     choices: list[Specification | Path] = []
     for specification in _specification_list(specifications):
         choice = specification if isinstance(specification, Specification) else local_copy(specification)
-        # each path counts once
+        # a repeated path counts once
         if isinstance(choice, Specification) or choice not in choices:
             choices.append(choice)
     paths = [choice for choice in choices if isinstance(choice, Path)]
@@ -587,7 +588,6 @@ def _files(
 
 
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:
-    """Return the input files."""
     files = [
         specification
         for specification in _specification_list(specifications)

@@ -1,16 +1,16 @@
 """Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
 Compiling all kernels takes longer than reading a short log, and loading machine code from disk takes time,
-too. Therefore a kernel is interpreted while little work is due (see `_may_interpret`). Long kernels are
-shared among the processor's cores.
+too. Therefore a kernel is interpreted as long as there is little work (see `_may_interpret`). The work of
+long kernels is shared among the processor's cores.
 
 Both forms give the same bits. Kernels use only sums, products, quotients, square roots, sines and cosines of
 IEEE doubles, without fast-math and fused contraction.
 
-Machine code is cached in a folder named after a digest of all sources of the package, so stale code is never
-loaded. Each file has its digest next to it. Damaged code would end the process by a signal, so it is removed
-and compiled again. `SPATIAL_REPLAY_CACHE` names another folder. `SPATIAL_REPLAY_KERNELS` is `compiled` or
-`interpreted` to allow one form only.
+Machine code is cached in a folder named after a digest of all sources of the package: stale code is never
+loaded. Each file has a digest next to it. Damaged code would end the process by a signal, and is therefore
+removed and compiled again. `SPATIAL_REPLAY_CACHE` names another folder. `SPATIAL_REPLAY_KERNELS` is
+`compiled` or `interpreted` to allow only one form.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ import numpy as np
 from spatial_replay.errors import UsageError
 
 _WAIT_S: Final = 1.0
-"""Compile time above which compiling is announced, seconds."""
+"""Delay of the announcement of a compilation, seconds."""
 _SLICE_S: Final = 2e-4
-"""Switch interval of threads while code is loaded, seconds: a control loop waits at most so long."""
+"""Switch interval of threads while code is loaded, seconds: the longest wait of a control loop."""
 _REMEDY: Final = "`spatial-replay warmup` does it beforehand"
 
 
@@ -60,16 +60,16 @@ class Compiler:
             )
         self.interprets = True
         self.spent_s = 0.0
-        # tasks that a child process compiles, with the trial runs that load their code afterwards
+        # tasks of a child process that compiles, and the trial runs that then load the code
         self.trials: list[tuple[str, Callable[[], object]]] = []
         self.loader: threading.Thread | None = None
         self._loading = set[int]()
         self.listeners: list[Callable[[], None]] = []
         self._is_announced = False
-        # not taken from `sys.modules`, which also has modules that another thread is still importing
+        # not from `sys.modules`, which contains modules that another thread is still importing, too
         self._compiler: Any = None
         self.lock = threading.RLock()
-        # held while files are open that a forked process must not inherit
+        # held as long as files are open that a forked process must not inherit
         self.fork_lock = threading.Lock()
         self.turns = set[int]()
 
@@ -99,25 +99,25 @@ class Compiler:
         return _name(function) in self._cached
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
-        """Return a function that is compiled for the types of its arguments when it is called."""
+        """Return a function that numba compiles at its first call, for the types of the arguments."""
         with self.lock:
             if self._compiler is None:
                 import numba
 
                 if self.folder is not None:
                     remove_damaged_files(self.folder)
-                    # also for cached kernels that are compiled later, for further types
+                    # cached kernels may be compiled later for further types
                     atexit.register(seal, self.folder)
                 self._compiler = numba
             compiler, is_cached = self._compiler, self.folder is not None
-            # numba reads the folder from its settings when a function is decorated; they also apply to the
-            # user's own functions, so they are restored
+            # numba reads the folder from its settings when a function is decorated; the settings are
+            # restored, because they also apply to the user's own functions
             previous_folder = compiler.config.CACHE_DIR
             if is_cached:
                 compiler.config.CACHE_DIR = str(self.folder)
             try:
                 available_options = compiler.njit(function).targetdescr.options
-                # options that another version of numba does not have only affect speed
+                # options that this version of numba lacks only affect speed
                 options = {name: value for name, value in options.items() if hasattr(available_options, name)}
                 # with numba's default error model, a division by zero would raise
                 return compiler.njit(cache=is_cached, error_model="numpy", **options)(function)
@@ -126,7 +126,7 @@ class Compiler:
 
     @contextmanager
     def compiling(self, function: Any) -> Iterator[None]:
-        """Notify listeners of a call that compiles an uncached kernel, and announce it if it takes long."""
+        """Notify listeners before an uncached kernel is compiled. Announce a long compilation."""
         if self.holds(function):
             yield
             return
@@ -145,8 +145,8 @@ class Compiler:
 
     @contextmanager
     def loading(self) -> Iterator[None]:
-        """Let this thread load machine code, while others interpret."""
-        # stale after a child has written files
+        """Let this thread load machine code, while other threads interpret."""
+        # a child process may have written files
         self.__dict__.pop("_cached", None)
         previous_interval, thread_id = sys.getswitchinterval(), threading.get_ident()
         sys.setswitchinterval(_SLICE_S)
@@ -158,7 +158,7 @@ class Compiler:
             sys.setswitchinterval(previous_interval)
 
     def await_code(self) -> bool:
-        """Start a thread that loads the code of all trials unless one runs; return whether it started."""
+        """Start a thread that loads the code of all trials, unless it runs. Return whether it was started."""
         with self.lock:
             if self.loader is not None or self.folder is None:
                 return False
@@ -167,7 +167,7 @@ class Compiler:
             return True
 
     def finish(self, count: int) -> bool:
-        """End the thread that loads code unless more than `count` trials wait; return whether it ends."""
+        """Clear the trials if there are at most `count`, and return whether the loading thread may end."""
         with self.lock:
             if len(self.trials) > count:
                 return False
@@ -176,11 +176,11 @@ class Compiler:
             return True
 
     def renew(self) -> None:
-        """Start the thread again in a forked process, which does not inherit its parent's threads."""
+        """Prepare a forked process: release inherited locks, and start the loading thread again."""
         self.lock = threading.RLock()
         self.fork_lock.release()
         self._loading.clear()
-        # a lock of `flock` lasts until the last process has closed it
+        # a lock of `flock` lasts until all processes have closed it
         for descriptor in self.turns:
             os.close(descriptor)
         self.turns.clear()
@@ -189,7 +189,7 @@ class Compiler:
             self.await_code()
 
     def say(self, text: str) -> None:
-        """Write a line on standard error, unless listeners show that kernels are compiled."""
+        """Write a line to standard error, unless there are listeners, which show the compilation."""
         if not self.listeners:
             sys.stderr.write(f"spatial-replay: {text}\n")
 
@@ -200,7 +200,7 @@ class Compiler:
 
 
 def _name(function: Any) -> str:
-    """Return the beginning of the names of numba's files for a function."""
+    """Return the beginning of the file names of a function's machine code."""
     return f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
 
 
@@ -208,63 +208,64 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 _PATIENCE_S: Final = 0.8
-"""Time that a process interprets kernels in any case, seconds: as long as loading numba and code."""
+"""Time for which a process always interprets kernels, seconds: the time for loading numba and code."""
 _FIRST_S: Final = 1.5
-"""Limit instead of `_PATIENCE_S` for a kernel that was never run, seconds: most take a tenth of the guess."""
+"""Limit instead of `_PATIENCE_S` for a new kernel, seconds. Most kernels take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
-"""Limits per kernel after that, seconds: before compiling (`_COLD_S`), before loading (`_WARM_S`)."""
+"""Further limits per kernel, seconds: before it is compiled (`_COLD_S`), before it is loaded (`_WARM_S`)."""
 _GUESS_S: Final = 2e-6
-"""Guessed time of a kernel that was never run, seconds per array element."""
+"""Guessed time of a new kernel, seconds per array element."""
 _LONG: Final = 3.0
-"""Factor on the guess for long kernels, which work on pairs of elements."""
+"""Factor of the guess for long kernels, which work on pairs of elements."""
 _CALL: Final = 32
 """Fixed cost of a call, in array elements."""
 
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a function of arrays and numbers that may run as machine code."""
-    # a wrapper for calls from C would only take time to compile
+    # no kernel needs the wrapper for calls from C, and compiling it takes time
     return _Kernel(function, {"no_cfunc_wrapper": True})
 
 
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel whose calls may take milliseconds, and let other threads run.
+    """Return a kernel whose calls may take milliseconds. Other threads run during a call.
 
-    Short calls must not use it: a busy thread would get the interpreter, and keep it for milliseconds.
+    Short calls must not use such a kernel: a busy thread would get the interpreter for milliseconds.
     """
     return _Kernel(function, {"nogil": True, "no_cfunc_wrapper": True}, times=_LONG)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel that is interpreted two to five times as fast.
+    """Return a kernel that the interpreter runs two to five times as fast.
 
-    The kernel gets arrays as memoryviews of plain numbers; in named tuples, only arrays of one dimension.
-    Such a kernel may only read and set single elements, slice one dimension, and never divide by zero.
+    The interpreted kernel gets memoryviews of plain numbers instead of arrays. Named tuples have memoryviews
+    only for arrays of one dimension. Such a kernel may read and set single elements, and slice one dimension.
+    It must not divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
     return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True, times=kernel.times)
 
 
 def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel that only other kernels call, without an entry from Python."""
+    """Return a kernel for calls from other kernels only."""
     return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
 def inlined(function: Callable[_Arguments, _Result], **options: bool) -> Callable[_Arguments, _Result]:
-    """Return a piece that is inlined into every kernel that calls it.
+    """Return a piece that is inlined into its calling kernels.
 
-    A call counts references to its arrays. Within one function, these counts cancel out.
+    A call counts references to its arrays. Inlining removes these counts.
 
     Args:
-        options: further options of numba, ignored by versions without them.
+        options: further options of numba. Versions without these options ignore them.
     """
     options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return _Kernel(function, options)
 
 
 def compile_ahead() -> None:
-    """Interpret no kernel in this process from now on."""
+    """End the interpretation of kernels in this process."""
     _process.interprets = False
 
 
@@ -278,7 +279,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
         task: name of the `spatial-replay warmup` task that compiles all kernels of the trial.
         wait: whether to compile in this process, and return when all kernels are compiled.
     """
-    # only at the first start, so that garbage of a program with many monitors is still collected
+    # only at the first start: the garbage of a program with many monitors must be collected
     collections = _no_collection() if _process.interprets else nullcontext()
     compile_ahead()
     if _process.only is not None or wait or _is_compiled(task):
@@ -289,7 +290,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
         _process.folder = _passing_folder()
     _process.trials.append((task, trial))
     try:
-        # the interpreted trial imports and caches everything that the first sample would wait for
+        # the interpreted trial has all imports and caches that would delay the first sample
         with collections:
             trial()
     except BaseException:
@@ -302,7 +303,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
 
 
 def _passing_folder() -> Path | None:
-    """Return a temporary folder for machine code of this process; None if none can be written."""
+    """Return a temporary folder for machine code of this process; None if no folder is writable."""
     try:
         folder = Path(tempfile.mkdtemp(prefix="spatial-replay-"), f"kernels-{source_digest()}")
         folder.mkdir()
@@ -314,7 +315,7 @@ def _passing_folder() -> Path | None:
 
 
 def write_note(task: str) -> None:
-    """Note that the cache holds all kernels of a task of `spatial-replay warmup`."""
+    """Mark a task of `spatial-replay warmup` as compiled: the cache has all kernels of the task."""
     if _process.folder is not None:
         seal(_process.folder)
         _note_of(task, _process.folder).touch()
@@ -332,7 +333,7 @@ def _note_of(task: str, folder: Path) -> Path:
 @cache
 def _target() -> str:
     """Return a digest of the target of machine code: Python, numba and processor."""
-    # imported before a control loop runs, which would wait for the import
+    # imported before a control loop runs, because the import would delay the loop
     import numba
 
     target_parts = [sys.version, numba.__version__, platform.machine(), platform.processor()]
@@ -344,13 +345,13 @@ def _target() -> str:
 
 
 def _load_code(folder: Path) -> None:
-    """Load the code of all trials. A child process compiles each of them, one at a time on a machine."""
+    """Load the code of all trials. Child processes compile the trials, one at a time on a machine."""
     trial_index = 0
     try:
         while not _process.finish(trial_index):
             task, trial = _process.trials[trial_index]
             note = _note_of(task, folder)
-            # waits for children of other processes; the child inherits the lock, so it lasts for both
+            # waits for children of other processes; the child inherits the lock, and keeps it until its end
             with turn(folder, "warmup") as lock:
                 status = 0 if note.exists() else _compile_in_child(task, folder, lock)
             if not note.exists():
@@ -368,7 +369,7 @@ def _load_code(folder: Path) -> None:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep new objects out of garbage collections, each of which stops all threads for 50 ms."""
+    """Keep new objects out of garbage collections. A collection stops all threads for 50 ms."""
     if not gc.isenabled():
         yield
         return
@@ -389,16 +390,16 @@ compile_task(sys.argv[1])
 
 
 def _compile_in_child(task: str, folder: Path, lock: int) -> int:
-    """Compile a task in a child, which continues if this process ends. Return its status."""
+    """Compile a task in a child process, and return its status. The child continues if this process ends."""
     if not sys.executable or getattr(sys, "frozen", False):
         raise OSError("this program has no Python interpreter for a child process")
-    # with this setting, the child starts no child itself
+    # with this setting, the child starts no further child
     environment = {
         **os.environ,
         "SPATIAL_REPLAY_KERNELS": "compiled",
         "SPATIAL_REPLAY_CACHE": str(folder.parent),
     }
-    # a process forked during the start would keep open the pipe by which Popen notices the start
+    # a process forked during the start would keep the pipe open through which Popen notices the start
     with _process.fork_lock:
         # -P keeps the current folder out of sys.path; in its own session, the child gets no Ctrl-C
         child = subprocess.Popen(
@@ -414,7 +415,7 @@ def _compile_in_child(task: str, folder: Path, lock: int) -> int:
 
 
 def kernels() -> Iterator[_Kernel[..., Any]]:
-    """Yield the kernels of all loaded modules, without pieces that only kernels call."""
+    """Yield the kernels of all loaded modules, without pieces."""
     for module in tuple(sys.modules.values()):
         for value in tuple(vars(module).values()) if module.__name__.startswith(__package__) else ():
             if isinstance(value, _Kernel) and value.__module__ == module.__name__ and value.is_entry:
@@ -442,7 +443,7 @@ def compilations(hear: Callable[[], None]) -> Iterator[None]:
 
 
 class _Kernel(Generic[_Arguments, _Result]):
-    """A function in two forms, interpreted and compiled, each made when it is first needed."""
+    """A function in two forms, interpreted and compiled. Each form is created at its first use."""
 
     def __init__(
         self,
@@ -475,9 +476,9 @@ class _Kernel(Generic[_Arguments, _Result]):
             self._ready = compiled
             return result
         run = cast(Callable[..., _Result], self.interpreted_form())
-        # processor time of this thread, without the time that it waits for others
+        # processor time of this thread, without waiting for other threads
         begin_s = time.thread_time()
-        # as in machine code, a division by zero or an overflow gives no error and no warning
+        # like machine code, without an error or a warning for a division by zero or an overflow
         with np.errstate(all="ignore"):
             result = run(*(map(_view, arguments) if self._is_elementwise else arguments), **named)
         took_s = time.thread_time() - begin_s
@@ -493,11 +494,11 @@ class _Kernel(Generic[_Arguments, _Result]):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is machine code for the arguments of at least one call."""
+        """Whether machine code exists for the argument types of at least one call."""
         return bool(getattr(self._compiled, "signatures", ()))
 
     def _may_interpret(self, element_count: int) -> bool:
-        """Return whether a call is interpreted: little work is due in this process or for this kernel."""
+        """Return whether a call is interpreted: this process or this kernel has little work."""
         if _process.only is not None:
             return _process.only == "interpreted"
         if not _process.interprets:
@@ -528,7 +529,7 @@ class _Kernel(Generic[_Arguments, _Result]):
 def _link(
     function: Callable[_Arguments, _Result], form: Callable[[Any], Any]
 ) -> Callable[_Arguments, _Result]:
-    """Return a copy of a function that calls the given form of every kernel that it names."""
+    """Return a copy of a function that calls its kernels in the form that `form` returns."""
     original = cast(FunctionType, function)
     globals_by_name = {
         name: original.__globals__[name] for name in _names(original) if name in original.__globals__
@@ -544,7 +545,7 @@ def _link(
 
 
 def _names(function: FunctionType) -> set[str]:
-    """Return the names that a function, or a comprehension within it, may look up globally."""
+    """Return the names of possible globals in a function and in its comprehensions."""
     names, codes = set[str](), [function.__code__]
     while codes:
         code = codes.pop()
@@ -554,9 +555,9 @@ def _names(function: FunctionType) -> set[str]:
 
 
 def _elements(values: object) -> int:
-    """Return the number of elements of arrays, also within tuples.
+    """Return the number of elements of arrays, also of arrays within tuples.
 
-    In arrays of bytes, 64 bytes count as an element, because kernels copy bytes at once or skip records.
+    64 bytes of a byte array count as an element, because kernels copy bytes at once or skip records.
     """
     if isinstance(values, np.ndarray):
         return values.size // (64 if values.itemsize == 1 else 1)
@@ -567,7 +568,7 @@ def _elements(values: object) -> int:
 
 def _view(value: Any) -> object:
     if isinstance(value, tuple):
-        # kernels take rows of arrays in named tuples, and memoryviews of several dimensions have no rows
+        # kernels read rows of arrays in named tuples, and memoryviews of several dimensions have no rows
         tuple_type: Any = type(value)
         return cast(object, tuple_type(*(_view(array) if array.ndim == 1 else array for array in value)))
     return value.data if isinstance(value, np.ndarray) else value
@@ -592,8 +593,9 @@ def over_cores(
     """Split range(count) into shares, and call `run(begin, end)` for each share on its own core.
 
     Args:
-        used: long kernel that `run` calls; until it is compiled, there is one share.
-        least: least length of a share, which should take about a millisecond.
+        used: long kernel that `run` calls. Until it is compiled, there is one share.
+        count: length of the range.
+        least: least length of a share, with about a millisecond of work.
     """
     share_count = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
     if share_count < 2:
@@ -609,14 +611,15 @@ def over_cores(
 
 _STALE_S: Final = 7 * 24 * 3600.0
 _ROOM_BYTES: Final = 2**25
-"""Free disk space below which code is not cached, bytes. A kernel that cannot be written ends the process."""
+"""Least free disk space for the cache, bytes. The process ends if numba cannot write a kernel."""
 _PACKAGE: Final = Path(__file__).parent
 
 
 def cache_folder() -> Path | None:
-    """Return the folder for machine code of these sources, created if needed; None if none can be written.
+    """Return the folder for machine code of these sources, created if needed; None if no folder is writable.
 
-    Code is loaded unchecked, so only the user, or the installer of the package, may write to the folder.
+    Code is loaded without checks of its origin: only the user, or the installer of the package, may write to
+    the folder.
     """
     folder_name = f"kernels-{source_digest()}"
     packaged_folder: Path | None = None
@@ -625,19 +628,19 @@ def cache_folder() -> Path | None:
         try:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # in a folder where several users write, the lock of another user cannot be opened
+            # in a folder of several users, the lock of another user cannot be opened
             os.close(_opened_lock(folder))
             with tempfile.TemporaryFile(dir=folder):
                 if shutil.disk_usage(folder).free < _ROOM_BYTES:
                     raise OSError(errno.ENOSPC, "no space left")
         except OSError:
-            # this may be code of a container image, which is read-only or on a full disk
+            # the folder may have code of a container image, and be read-only or on a full disk
             packaged_folder = packaged_folder or (folder if any(folder.rglob("*.nbi")) else None)
             continue
         if is_new:
             _remove_stale(parent, keep=folder_name)
             if packaged_folder is not None:
-                # code of a read-only image is copied, because it need not be compiled again
+                # code of a read-only image is copied instead of compiled again
                 with suppress(OSError):
                     shutil.copytree(packaged_folder, folder, dirs_exist_ok=True)
         return folder
@@ -647,7 +650,7 @@ def cache_folder() -> Path | None:
 def remove_damaged_files(folder: Path) -> None:
     """Remove machine code that does not match its digest.
 
-    Code newer than its digest is kept while other processes use the folder, because it may be unfinished.
+    Code newer than its digest stays as long as other processes use the folder, because it may be unfinished.
     """
     descriptor = _opened_lock(folder)
     try:
@@ -660,13 +663,13 @@ def remove_damaged_files(folder: Path) -> None:
             is_damaged = not _is_sealed(path) or _seal_of(path).read_bytes() != _digest_of(path)
             if is_damaged and (is_alone or _is_sealed(path)):
                 path.unlink()
-    # a shared lock, until this process ends
+    # this process has a shared lock until it ends
     fcntl.flock(descriptor, fcntl.LOCK_SH)
 
 
 @contextmanager
 def turn(folder: Path | None, kernel: str) -> Iterator[int]:
-    """Wait for other processes that compile the same kernel, because their code can be loaded.
+    """Wait for other processes that compile the same kernel. Their code can then be loaded.
 
     Yields:
         The descriptor of the lock, which a child process may inherit; -1 without a folder.
@@ -683,7 +686,7 @@ def turn(folder: Path | None, kernel: str) -> Iterator[int]:
         yield descriptor
     finally:
         with _process.fork_lock:
-            # in a process that this thread has forked, `renew` has closed it
+            # in a forked process, `renew` has closed the descriptor
             if descriptor in _process.turns:
                 _process.turns.remove(descriptor)
                 os.close(descriptor)
@@ -694,7 +697,7 @@ def _opened_lock(folder: Path, name: str = "lock") -> int:
 
 
 def seal(folder: Path) -> None:
-    """Write the digests of files that were written since the last call."""
+    """Write the digests of all files without a current digest."""
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
             if not _is_sealed(path):
@@ -728,7 +731,7 @@ def _cache_parents() -> Iterator[Path]:
 
 
 def _remove_stale(parent: Path, keep: str) -> None:
-    """Remove machine code of other sources to which no process has added for a week."""
+    """Remove machine code of other sources that has not grown for a week."""
     oldest_s = time.time() - _STALE_S
     for folder in parent.glob("kernels-*"):
         with suppress(OSError):
@@ -738,7 +741,7 @@ def _remove_stale(parent: Path, keep: str) -> None:
 
 @cache
 def source_digest() -> str:
-    """Return a digest of the sources of the package: kernels take constants from anywhere in it."""
+    """Return a digest of all sources of the package, because any module may have constants of kernels."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())

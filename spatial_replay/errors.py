@@ -33,14 +33,14 @@ def system_reason(error: Exception) -> str:
     if number is None and (match := _ERROR_NUMBER.search(str(error))) is not None:
         # several attempts to connect failed, each with its own error
         number = int(match[1])
-    # errors of getaddrinfo have negative numbers, which strerror does not know
+    # `strerror` has no message for the negative numbers of getaddrinfo's errors
     reason = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
     return (reason or str(error) or type(error).__name__).lower()
 
 
 @contextmanager
 def importing(what: str, *, extra: str) -> Iterator[None]:
-    """Context for the import of optional libraries.
+    """Raise UsageError with a remedy if an optional library cannot be imported in this context.
 
     Args:
         what: the feature with its library: "videos need PyAV".
@@ -78,10 +78,10 @@ class MissingFileError(UsageError):
 
 
 class NoAutomatonError(UsageError):
-    """A formula that has no automaton, or one that is too large.
+    """A formula without an automaton, or with too large an automaton.
 
     Attributes:
-        reason: the cause alone, without place and remedy.
+        reason: the cause, without place and remedy.
     """
 
     def __init__(self, message: str, reason: str | None = None) -> None:
@@ -90,7 +90,7 @@ class NoAutomatonError(UsageError):
 
 
 class Diagnosis(Protocol):
-    """One error in a specification; str() gives its text with line, column and caret."""
+    """One error in a specification. `str()` returns its text with line, column and caret."""
 
     @property
     def message(self) -> str: ...
@@ -106,7 +106,7 @@ class SpecificationError(SpatialReplayError):
     """An invalid specification.
 
     Attributes:
-        diagnoses: all its errors, in the order of the text.
+        diagnoses: all errors, in the order of the text.
     """
 
     def __init__(self, diagnoses: Sequence[Diagnosis]) -> None:

@@ -52,15 +52,16 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Every reset and every step gives a sample. `info["judge"]` has:
 
-    - `episode`: its number, from 0; `env`: the number of the environment in a vector.
-    - `verdict`: "satisfied", "violated" or "unknown", if the episode ended with this sample.
+    - `episode`: number of the episode, from 0.
+    - `env`: number of the environment; only in a vector.
+    - `verdict`: "satisfied", "violated" or "unknown", as if the episode ended with this sample.
     - `success`: whether the verdict is "satisfied".
     - `settled`: whether no later sample can change the verdict.
-    - `margin`: the robustness of the episode so far; NaN if it is not determined.
-    - `stage`, `owed`, `progress`: see `annotate.stages`; only of a spec that has an automaton.
-    - `reason`: a sentence on the violation; only if an episode ends with a settled violation.
+    - `margin`: robustness of the episode so far; NaN if not determined.
+    - `stage`, `owed`, `progress`: see `annotate.stages`; only for a spec with an automaton.
+    - `reason`: sentence on the violation; only at the end of an episode with a settled violation.
 
-    The numbers equal those of a replay of the log of the episode.
+    A replay of the episode's log gives equal numbers.
     """
 
     def __new__(cls, env: Any = None, *arguments: Any, **options: Any) -> Any:
@@ -86,18 +87,18 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Args:
             objects, signals: functions that return the objects and signals of a sample.
-            rate_hz: steps per second; the reset of an episode has the time 0.
-            result: the name of the spec that judges; by default the last one that no other spec uses.
-            until: the settled verdict that terminates an episode.
-            reward: replaces the environment's reward by the gain in margin or progress since the previous
-                sample. A margin that is not finite gains 0, and the next gain counts from the last finite
-                margin.
+            rate_hz: steps per second. The reset of an episode has the time 0.
+            result: name of the spec that judges; by default the last spec that no other spec uses.
+            until: settled verdict that terminates an episode.
+            reward: "margin" or "progress": the reward is its gain since the previous sample, instead of the
+                environment's reward. A margin that is not finite gains 0, and the next gain counts from the
+                last finite margin.
             log: function that is called at the end of each episode, and returns the path of its log.
 
         Raises:
-            UsageError: a spec or option is unknown, the spec is a template, or objects and signals are
-                missing; or `until` is given with a vector environment that resets itself.
-            NoAutomatonError: `reward="progress"` with a spec that has no automaton.
+            UsageError: a spec or option is unknown, the spec is a template, objects and signals are missing,
+                or `until` is given with a vector environment that resets itself.
+            NoAutomatonError: `reward="progress"` with a spec without an automaton.
         """
         super().__init__(env)
         self._episodes = _Episodes(
@@ -112,12 +113,12 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset the environment; its observation is the first sample of another episode."""
+        """Reset the environment. The observation is the first sample of a new episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, {**info, "judge": self._episodes.begin(observation, info)}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment, and judge the observation that follows."""
+        """Step the environment, and judge its observation."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         episodes = self._episodes
         judgement = episodes.extend(observation, info, ended=bool(terminated or truncated))
@@ -131,10 +132,10 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class VectorJudge(_VectorWrapper):
-    """A vector environment whose episodes are judged; `Judge` returns it for a vector environment.
+    """A vector environment whose episodes are judged. `Judge` returns it for a vector environment.
 
-    Values of `info["judge"]` are arrays with masks (`_verdict`, …). If the same step resets an episode, its
-    last sample is in `info["final_info"]["judge"]`.
+    Values of `info["judge"]` are arrays with masks (`_verdict`, …). If the last step of an episode also
+    resets it, its last sample is in `info["final_info"]["judge"]`.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class VectorJudge(_VectorWrapper):
         self._has_ended = np.zeros(env.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all environments, or those of the option `reset_mask`."""
+        """Reset all environments, or only the environments in the option `reset_mask`."""
         reset_mask = (options or {}).get("reset_mask")
         is_reset = np.ones(self.num_envs, np.bool_) if reset_mask is None else np.array(reset_mask, np.bool_)
         observations, infos = self.env.reset(seed=seed, options=options)
@@ -172,13 +173,13 @@ class VectorJudge(_VectorWrapper):
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all environments, and judge the observations that follow."""
+        """Step all environments, and judge their observations."""
         observations, rewards, terminations, truncations, infos = self.env.step(actions)
         is_reset = (
             self._has_ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._has_ended)
         )
         self._has_ended = np.logical_or(terminations, truncations)
-        # copies, because an environment may reuse its arrays
+        # copied, because an environment may reuse its arrays
         rewards, terminations, infos = np.array(rewards), np.array(terminations), dict(infos)
         for env_index, observation in enumerate(iterate(self.env.observation_space, observations)):
             episodes, info = self._episodes[env_index], _info_of(infos, env_index)
@@ -206,7 +207,7 @@ class VectorJudge(_VectorWrapper):
 
 
 class _Episodes:
-    """The episodes of one environment; see `Judge` for the arguments.
+    """The episodes of one environment. `Judge` describes the arguments.
 
     Attributes:
         ends: whether the verdict terminates the episode.
@@ -238,7 +239,7 @@ class _Episodes:
         self._until, self._reward = until, reward
         # exact for the written decimal: 29.97 is no binary fraction
         period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
-        # multiplying an int takes a tenth of the time of a Fraction
+        # a product of integers takes a tenth of the time of a product with a Fraction
         self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns
         self._env_entry: Judged = {} if env is None else {"env": env}
         self._episode = -1
@@ -261,7 +262,11 @@ class _Episodes:
         return self.extend(observation, info)
 
     def extend(self, observation: Any, info: dict[str, Any], *, ended: bool = False) -> Judged:
-        """Add a sample, which is the last one if the episode has ended. Return its `info["judge"]`."""
+        """Add a sample, and return its `info["judge"]`.
+
+        Args:
+            ended: whether the sample is the last sample of the episode.
+        """
         sample = Sample(
             round(self._frame * self._period_ns),
             self._objects(observation, info) if self._objects is not None else {},
@@ -326,7 +331,7 @@ class _Episodes:
 
 
 def _with_only_result(specification: Specification, result: str | None) -> Specification:
-    """Return a specification with the only result that judges."""
+    """Return a specification whose only result is the spec that judges."""
     require_specification(specification)
     names = [spec.name for spec in specification.results]
     name = names[-1] if result is None else result
@@ -338,7 +343,7 @@ def _with_only_result(specification: Specification, result: str | None) -> Speci
 
 
 def _stages(specification: Specification, rate_hz: float, *, is_needed: bool) -> LiveStages | None:
-    """Return the stages of the only result, or None if it has no automaton."""
+    """Return the stages of the only result; None for a spec without an automaton."""
     try:
         return LiveStages(specification, specification.results[-1], rate_hz=rate_hz)
     except NoAutomatonError:
@@ -348,7 +353,7 @@ def _stages(specification: Specification, rate_hz: float, *, is_needed: bool) ->
 
 
 def _last_of(final_values: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
-    """Return the last observation of an episode that was reset in the same step, and its info."""
+    """Return the last observation and info of an episode that was reset in the same step."""
     observation, info = final_values
     if observation is None:
         raise UsageError(
@@ -359,7 +364,7 @@ def _last_of(final_values: tuple[Any, Any]) -> tuple[Any, dict[str, Any]]:
 
 
 def _info_of(infos: Mapping[str, Any], env_index: int) -> dict[str, Any]:
-    """Return the info of one environment of a vector, without values that its masks exclude."""
+    """Return the info of one environment in a vector, without values that masks exclude."""
     info: dict[str, Any] = {}
     for key, values in infos.items():
         mask = infos.get(f"_{key}")

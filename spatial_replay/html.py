@@ -1,4 +1,4 @@
-"""Elements of HTML for notebooks and pages. Text is escaped; colours suit light and dark pages."""
+"""Elements of HTML for notebooks and pages. Text is escaped. Colours suit light and dark pages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Html(str):
 
 
 def element(tag: str, *content: str, **attributes: str) -> Html:
-    """Return an element; content that is not `Html` is escaped."""
+    """Return an element. Content that is not `Html` is escaped."""
     attribute_text = "".join(f' {name}="{escape(value)}"' for name, value in attributes.items())
     inner_html = "".join(piece if isinstance(piece, Html) else escape(printable(piece)) for piece in content)
     return Html(f"<{tag}{attribute_text}>{inner_html}</{tag}>")
@@ -37,7 +37,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
 
 
 def code(*content: str) -> Html:
-    """Return content in a monospaced font, with all of its spaces."""
+    """Return content in a monospaced font, with all its spaces."""
     return element("span", *content, style="font-family:ui-monospace,monospace; white-space:pre")
 
 

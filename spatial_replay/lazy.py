@@ -14,10 +14,10 @@ from typing import Any
 def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
-    The module of a name in `__all__` is read from the imports for type checkers in the package's source.
+    The package's source has imports for type checkers, which name the module of each name in `__all__`.
 
     Args:
-        package: its `globals()`, where loaded names are stored.
+        package: `globals()` of the package, which gets the loaded names.
     """
     home = package["__name__"]
 
@@ -43,13 +43,13 @@ def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Call
 class Displayed:
     """A value that `spatial_replay.notebook` can display.
 
-    The package `notebook` imports the values, so values import it only by name, for a display.
+    The package `notebook` imports the values. Values therefore import `notebook` only for a display.
     """
 
     __slots__ = ()
 
     def plot(self, *args: Any, **options: Any) -> Any:
-        """Draw this value with matplotlib; `spatial_replay.notebook.plot` has the options of each type."""
+        """Draw this value with matplotlib. `spatial_replay.notebook.plot` has the options of each type."""
         return _notebook().plot(self, *args, **options)
 
     def _repr_html_(self) -> str:
@@ -57,7 +57,7 @@ class Displayed:
 
 
 class Printed:
-    """A result with one text, which terminals print and notebooks show."""
+    """A result with one text, for terminals and notebooks."""
 
     __slots__ = ()
 
@@ -84,6 +84,6 @@ def data_frame(value: object) -> Any:
 
 
 def drawn_as_svg(value: Displayed) -> str | None:
-    """Return a value as SVG, or None if it cannot be drawn here."""
+    """Return a value as SVG; None if no drawing program is installed."""
     drawing: str | None = import_module("spatial_replay.notebook.evaluation_view").automaton_svg(value)
     return drawing

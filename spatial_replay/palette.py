@@ -1,8 +1,8 @@
-"""The colours of robustness: blue where it is positive, vermillion where it is negative, grey where unknown.
+"""The colours of robustness: blue for positive, vermillion for negative, grey for unknown robustness.
 
 Blue and vermillion, and their mixtures with grey, are distinguishable with every common colour blindness.
-Pages, panel and terminals have shades of their own, for contrast: `report/page.py`, `panel/src/decisions.ts`
-and `cli/terminal.py`.
+Pages, panel and terminals have other shades, for contrast: see `report/page.py`, `panel/src/decisions.ts` and
+`cli/terminal.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NEUTRAL: Final = (0.55, 0.55, 0.55)
 HOLDING: Final = (0.337, 0.706, 0.914)
 """Colour of results that hold so far: light blue."""
 PENDING: Final = (0.941, 0.894, 0.259)
-"""Colour of pending results: yellow. Unknown ones are grey."""
+"""Colour of pending results: yellow. Unknown results are grey."""
 LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 
@@ -39,14 +39,14 @@ def light(colour: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def lighter(colour: str) -> str:
-    """Return a hexadecimal colour mixed with white, so that it stays visible in viewers that darken it."""
+    """Return a hexadecimal colour mixed with white, for viewers that darken colours."""
     shares = (int(colour[start : start + 2], 16) / 255.0 for start in (1, 3, 5))
     red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
     return hexadecimal((red, green, blue))
 
 
 MAP: Final = (hexadecimal(NEGATIVE), "#f5f5f5", hexadecimal(POSITIVE))
-"""Colours of a gradient map: for the least robustness, for 0, and for the greatest."""
+"""Colours of a gradient map for the least robustness, for 0, and for the greatest robustness."""
 
 SIGNS: Final = MappingProxyType(
     {

@@ -1,6 +1,6 @@
-"""A pytest plugin: suites named `*.replay.yaml` are collected, as one test for each log and spec.
+"""A pytest plugin that collects suites named `*.replay.yaml`, with one test for each log and spec.
 
-Every run of pytest imports this module, so it imports the package only if there is such a file.
+Every run of pytest imports this module. It imports the package only if there is a suite.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SuiteFile(pytest.File):
     """A suite: its tests are the specs over the logs of its cases."""
 
     def collect(self) -> Iterable[pytest.Item]:
-        """Yield a test for each case, log and spec; faults of the suite end the collection."""
+        """Yield a test for each case, log and spec. Faults of the suite end the collection."""
         from spatial_replay.batch.rows import Task
         from spatial_replay.batch.run import prepare
         from spatial_replay.batch.suite import load_suite
@@ -76,7 +76,7 @@ class ReplayItem(pytest.Item):
             self.add_marker(pytest.mark.xdist_group(task.log))
 
     def runtest(self) -> None:
-        """Evaluate the log unless its rows are known, and fail for each result that does not pass."""
+        """Evaluate the log if needed, and fail with the explanations of all failing results."""
         rows = [row for row in _results(self.session).rows(self.task)[self._file] if row.spec == self._spec]
         ids = dict.fromkeys([*filter(None, (row.requirement for row in rows)), *self._case.requirements])
         self.user_properties += [("requirement", identifier) for identifier in ids]
@@ -86,7 +86,7 @@ class ReplayItem(pytest.Item):
             raise _NotSatisfiedError("\n\n".join(failures))
 
     def _failure(self, row: ResultRow) -> str | None:
-        """Return the failure of a result with its explanation; None if it passes."""
+        """Return the failure of a result with its explanation; None for a passing result."""
         from spatial_replay.text import requirement_text
 
         failure = row.error
@@ -100,7 +100,7 @@ class ReplayItem(pytest.Item):
         return "\n".join(filter(None, lines))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """Return the explanation without a traceback, which would only show this plugin."""
+        """Return the explanation without a traceback, because a traceback would only show this plugin."""
         if isinstance(excinfo.value, _NotSatisfiedError):
             return str(excinfo.value)
         return super().repr_failure(excinfo)
@@ -111,11 +111,11 @@ class ReplayItem(pytest.Item):
 
 
 class _NotSatisfiedError(Exception):
-    """A result that is not what a case expects."""
+    """A result that differs from the expectation of its case."""
 
 
 class _Results:
-    """The rows of the logs of a session; each log is evaluated once, for the first of its tests.
+    """The rows of a session's logs. Each log is evaluated once, for the first of its tests.
 
     With several processes, all logs are evaluated when the first test runs.
     """
@@ -144,11 +144,11 @@ _RESULTS = pytest.StashKey[_Results]()
 
 
 def _results(session: pytest.Session) -> _Results:
-    """Return the results of a session's tests, which are evaluated on demand."""
+    """Return the results of a session's tests. They are evaluated on demand."""
     if _RESULTS not in session.stash:
         jobs = session.config.getoption("--replay-jobs")
         tasks = [item.task for item in session.items if isinstance(item, ReplayItem)]
-        # under xdist, every worker is one of several processes already
+        # under xdist, each worker starts no further processes
         session.stash[_RESULTS] = _Results(1 if hasattr(session.config, "workerinput") else jobs, tasks)
     return session.stash[_RESULTS]
 

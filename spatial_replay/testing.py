@@ -25,19 +25,19 @@ def assert_satisfied(
 
     Args:
         log: a file in any format, an address, or a trace.
-        specifications: one or several, parsed or as files; None takes the specifications in the log.
-        at_least: least robustness that passes, independent of the verdict, in the units of the formula.
-        tolerance: allowance below the limit, for rounding.
-        allow: "vacuous", "dropped" and "doubtful": kinds of results that pass. Nothing tested them, the
-            recorder dropped samples, or the log contradicts an assumption.
+        specifications: one or several, parsed or as files; None for the specifications in the log.
+        at_least: least robustness of a passing result, instead of a verdict, in the units of the formula.
+        tolerance: accepted loss below the limit, for rounding.
+        allow: "vacuous", "dropped" and "doubtful": kinds of results that pass although nothing tested them,
+            the recorder dropped samples, or the log contradicts an assumption.
         options: options of evaluation and reading, as for `replay_log`.
 
     Returns:
         The results of `replay_log`, for further assertions.
 
     Raises:
-        AssertionError: a result is violated, unknown, less robust, doubtful, or tested by nothing; its text
-            is the output of `explain`.
+        AssertionError: a result is violated, unknown, less robust, doubtful, or tested by nothing, or the log
+            is damaged. The message has the sentences of `explain`.
         UsageError, SpecificationError, LogError: the log cannot be evaluated.
     """
     # pytest leaves this frame out of tracebacks
@@ -46,7 +46,7 @@ def assert_satisfied(
     expectation = Expectation(at_least=at_least, tolerance=tolerance, allow=frozenset(allow))
     reasons = []
     for result in replayed.results:
-        # the fields of a row of a batch that decide whether it passes
+        # the fields of a batch's row that decide between pass and failure
         outcome: Any = SimpleNamespace(
             verdict=result.verdict,
             lower=result.lower,

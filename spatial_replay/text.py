@@ -25,16 +25,16 @@ _LONGEST_FORMULA: Final = 60
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
 _MOST_ALIKE: Final = 5
-"""Limits of comparing names, which takes quadratic time: names come from logs and may be hostile."""
+"""Limits for comparisons of names. They take quadratic time, and names in logs may be hostile."""
 
 
 def is_encodable(text: str) -> bool:
-    """Return whether a text fits UTF-8, unlike one with half of a surrogate pair."""
+    """Return whether UTF-8 can encode a text. It cannot encode half of a surrogate pair."""
     return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def encodable(text: str) -> str:
-    """Return a text that fits UTF-8, with escapes for the invalid bytes of a file name."""
+    """Return a text that UTF-8 can encode, with escapes for the invalid bytes of a file name."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
@@ -51,7 +51,7 @@ class Instant:
 
 
 class Sentence(str):
-    """A sentence that knows the times in it, so that a page can link them.
+    """A sentence with its times as values, for links on pages.
 
     Attributes:
         parts: texts and times of the sentence, in order.
@@ -62,7 +62,7 @@ class Sentence(str):
 
     def __new__(cls, *parts: str | Instant) -> Sentence:
         sentence = super().__new__(cls, "".join(map(str, parts)))
-        # a part may be a clause with times of its own
+        # a part may be a clause with times
         sentence.parts = tuple(
             piece for part in parts for piece in (part.parts if isinstance(part, Sentence) else (part,))
         )
@@ -70,14 +70,14 @@ class Sentence(str):
 
 
 CALENDAR_NS: Final = 500_000_000 * 10**9
-"""Least time that counts from 1970. Smaller times are of clocks that start at power-on."""
+"""Least time since 1970, ns. Smaller times are read from clocks that start at power-on."""
 
 
 def clock_text(time_ns: int, *, with_date: bool = False) -> str:
-    """Return a time as viewers show it: "19:25:04.500 UTC", or seconds on a clock of the log's own."""
+    """Return a time as in viewers: "19:25:04.500 UTC", or seconds on the log's own clock."""
     if time_ns < CALENDAR_NS:
         return f"{time_ns / 1e9:.3f} s on the log's clock"
-    # rounded before the split, so that a carry reaches the seconds
+    # rounded before the split, because rounding may change the seconds
     milliseconds = round(time_ns / 10**6)
     moment = datetime.fromtimestamp(milliseconds // 1000, UTC)
     day = f"{moment:%Y-%m-%d} " if with_date else ""
@@ -85,7 +85,7 @@ def clock_text(time_ns: int, *, with_date: bool = False) -> str:
 
 
 def counted_from(texts: Iterable[str], first_ns: int) -> tuple[Sentence, ...]:
-    """Return texts as sentences. Times of given sentences count from `first_ns`."""
+    """Return texts as sentences. Times in sentences count from `first_ns`."""
     return tuple(
         Sentence(
             *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
@@ -101,12 +101,12 @@ _FEW: Final = 3
 
 
 def without_numbers(text: str) -> str:
-    """Return a text with 0 for each number outside of code, to compare texts without their numbers."""
+    """Return a text with 0 for each number outside of code, for comparisons without numbers."""
     return _CODE_OR_NUMBER.sub(lambda match: match[1] or "0", text)
 
 
 def without_repetition(texts: Iterable[str]) -> list[str]:
-    """Return texts, with one text and a count for several texts that differ in their numbers only."""
+    """Return texts. More than `_FEW` texts that differ only in numbers become one text with a count."""
     texts_by_form: dict[str, list[str]] = {}
     for text in texts:
         texts_by_form.setdefault(without_numbers(text), []).append(text)
@@ -128,7 +128,7 @@ LARGEST_PLAIN: Final = 1e12
 
 
 def number_text(number: float) -> str:
-    """Return a number with four digits, enough for a reader; JSON and logs have all of them."""
+    """Return a number with four digits, for readers. JSON and logs have all digits."""
     # adding 0.0 removes the sign of -0.0
     number += 0.0
     is_long = 10.0**DIGITS <= abs(number) < LARGEST_PLAIN
@@ -144,7 +144,10 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def interval_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
-    """Return a robustness with its unit, and its interval if that is wider: "between -inf and -0.2 m"."""
+    """Return a robustness with its unit, and with a wider interval if it has one.
+
+    The text of an interval is such as "between -inf and -0.2 m".
+    """
     robustness_text = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
     if math.isnan(lower) or lower == upper == robustness:
         return robustness_text
@@ -153,7 +156,7 @@ def interval_text(robustness: float, lower: float, upper: float, unit: str = "")
 
 
 def names_from_unit(unit: str) -> dict[str, float]:
-    """Return the numbers by name in a JSON object that replaces a unit; none for a plain unit."""
+    """Return the numbers by name in a JSON object that replaces a unit. A plain unit has no names."""
     try:
         return {name: float(number) for name, number in json.loads(unit).items()} if unit[:1] == "{" else {}
     except (ValueError, TypeError, OverflowError, RecursionError):
@@ -161,7 +164,7 @@ def names_from_unit(unit: str) -> dict[str, float]:
 
 
 def plain_unit(unit: str) -> str:
-    """Return a unit; "" if names of numbers replace it."""
+    """Return a plain unit; "" for names of numbers instead of a unit."""
     return "" if names_from_unit(unit) else unit
 
 
@@ -175,7 +178,7 @@ def json_number(number: float) -> float | str | None:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value as valid JSON: numbers as `json_number` has them, records by their fields."""
+    """Return a value as valid JSON: numbers as in `json_number`, and records as objects of their fields."""
     if isinstance(value, float):
         return json_number(value)
     if isinstance(value, str):
@@ -194,22 +197,22 @@ def json_fields(record: Any, *names: str) -> dict[str, Any]:
 
 
 def printable(text: str, longest: int = _LONGEST) -> str:
-    """Return a text with blanks in place of unprintable characters, cut to a length."""
+    """Return a text with blanks instead of unprintable characters, cut to a length."""
     return cut("".join(character if character.isprintable() else " " for character in text), longest)
 
 
 def cut(text: str, longest: int) -> str:
-    """Return a text of bounded length, with an ellipsis where it was cut."""
+    """Return a text of bounded length. A cut text ends with an ellipsis."""
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def listing(names: Sequence[str], most: int = 8) -> str:
-    """Return the first of some names, with an ellipsis if there are more."""
+    """Return the first names, with an ellipsis for further names."""
     return ", ".join([*names[:most], *["…"] * (len(names) > most)])
 
 
 def first_lines(lines: Sequence[str], most: int) -> list[str]:
-    """Return the first lines, and a line that counts the others."""
+    """Return the first lines, and a line with the number of further lines."""
     count_line = [f"… and {len(lines) - most:,} more"] if len(lines) > most else []
     return [*lines[:most], *count_line]
 
@@ -227,17 +230,17 @@ def escape_text(text: str, kept: str = "") -> str:
 
 
 def shortened_formula(text: str) -> str:
-    """Return a short text of a formula, for sentences that only mention it."""
+    """Return a short text of a formula, for sentences that only mention the formula."""
     return printable(text, _LONGEST_FORMULA)
 
 
 def time_text(time_ns: int, first_ns: int = 0) -> str:
-    """Return the time since `first_ns`, or a duration, as every text writes it: "5.533 s"."""
+    """Return the time since `first_ns`, or a duration, in the form of all texts: "5.533 s"."""
     return str(Instant(time_ns, first_ns))
 
 
 def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
-    """Return times in seconds, and also in nanoseconds if different times would read the same."""
+    """Return times in seconds, and also in nanoseconds if different times have equal texts."""
     times = tuple(Sentence(Instant(time_ns, 0)) for time_ns in times_ns)
     if len(set(times)) == len(set(map(int, times_ns))):
         return times
@@ -245,34 +248,34 @@ def times_apart(*times_ns: int) -> tuple[Sentence, ...]:
 
 
 def requirement_text(identifier: str | None, title: str | None) -> str:
-    """Return the id and the title of a requirement, if it has them: "REQ-12: no one is hit"."""
+    """Return the id and the title of a requirement: "REQ-12: no one is hit". Either may be missing."""
     return ": ".join(part for part in (identifier, title) if part)
 
 
 def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
-    """Return the names of a result or node: its title, and forms with the id of its requirement."""
+    """Return the names of a result or node: its title, and three forms with the id of its requirement."""
     ids = () if requirement is None else (requirement, f"{requirement} {title}", f"{title} [{requirement}]")
     return title, *ids
 
 
 TEXTS: Final = -(2.0**1000)
-"""The greatest number that stands for a text in signals. Measured numbers are far from this range."""
+"""Greatest number that represents a text in signals. Measured numbers are far from this range."""
 
 
 def text_number(text: str) -> float:
-    """Return the number that stands for a text in signals: 48 bits of its digest."""
+    """Return the number that represents a text in signals: 48 bits of the text's digest."""
     digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=6).digest()
-    # 48 bits are exact in a double, which has 52 after the first one
+    # 48 bits are exact in a double, whose fraction has 52
     return TEXTS * (1.0 + int.from_bytes(digest, "little") / 2**48)
 
 
 def is_text_number(number: float) -> bool:
-    """Return whether a number stands for a text."""
+    """Return whether a number represents a text."""
     return -math.inf < number <= TEXTS
 
 
 def nearest_hint(name: str, known: Iterable[str]) -> str:
-    """Return "did you mean …?" with the known name closest to `name`, or ""."""
+    """Return "did you mean …?" with the known name closest to `name`; "" if no name is close."""
     if len(name) > _LONGEST_NAME:
         return ""
     candidates = [candidate for candidate in known if len(candidate) <= _LONGEST_NAME][:_MOST_NAMES]
@@ -282,10 +285,10 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
 
 
 def named_arguments(called: _Called) -> _Called:
-    """Return a function or class that answers an unknown argument with the nearest name.
+    """Return a function or class that refuses unknown arguments, and suggests the nearest name.
 
     Raises:
-        UsageError: raised by calls with an unknown argument.
+        UsageError: a call has an unknown argument.
     """
     function = called.__init__ if isinstance(called, type) else called  # type: ignore[misc]
 
@@ -294,7 +297,7 @@ def named_arguments(called: _Called) -> _Called:
         try:
             return function(*positionals, **keywords)
         except TypeError:
-            # any other cause is raised again below
+            # a TypeError with another cause is raised again
             refuse_unknown(keywords, [name for name in signature(called).parameters if name != "cls"])
             raise
 
@@ -308,7 +311,7 @@ def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
     """Refuse arguments with an unknown name.
 
     Raises:
-        UsageError: a name is unknown; the message has the nearest name.
+        UsageError: a name is unknown. The message suggests the nearest name.
     """
     for name in given:
         if name not in known:
@@ -317,6 +320,6 @@ def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
 
 
 def _likeness(name: str, known: str) -> tuple[float, float]:
-    """Return the likeness of two names, and that of their sorted letters, which finds swapped letters."""
+    """Return the likeness of two names and of their sorted letters, which also finds swapped letters."""
     ratio = difflib.SequenceMatcher(None, known, name).ratio()
     return ratio, difflib.SequenceMatcher(None, sorted(known), sorted(name)).ratio()

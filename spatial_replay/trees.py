@@ -22,17 +22,17 @@ _NO_STAGES: Mapping[str, Stage] = MappingProxyType({})
 
 
 class PlannedSteps(Decorator):
-    """A decorator that takes steps from a planner, and whose child executes them.
+    """A decorator that requests steps from a planner. Its child executes the steps.
 
-    A tick takes the next step if none is executed, and ticks the child during a step. When the child ends,
-    the tick concludes the step. The reason of a failure is the feedback message of the behaviour that failed.
-    A step has also failed if the planner stops it, or if a parent interrupts it.
+    A tick requests the next step if no step is executed, and ticks the child during a step. When the child
+    ends, the tick concludes the step. The reason of a failure is the feedback message of the failed
+    behaviour. A step also fails if the planner stops it, or if a parent interrupts it.
 
     The status is RUNNING until the specification is satisfied (SUCCESS) or no path is left (FAILURE). Samples
     reach the planner by `recorder.write`, from inside the tree or outside.
 
     Attributes:
-        step: the last step; its target is the child's task. None before the first.
+        step: the last step, whose target is the child's task; None before the first step.
     """
 
     def __init__(
@@ -42,8 +42,8 @@ class PlannedSteps(Decorator):
 
         Args:
             recorder: a recorder with a planner.
-            stages: "pick", "way" or "place" by the name of a behaviour: the stage of a motion that fails if
-                the behaviour, or one below it, fails.
+            stages: stage of a motion ("pick", "way" or "place") by the name of a behaviour. The stage fails
+                if the behaviour, or a behaviour below it, fails.
 
         Raises:
             UsageError: the recorder has no planner.
@@ -56,7 +56,7 @@ class PlannedSteps(Decorator):
         self._is_executing = False
 
     def tick(self) -> Iterator[Behaviour]:
-        """Tick the child if a step is executed."""
+        """Request a step if needed, and tick the child during a step."""
         if self.status is not Status.RUNNING:
             self.initialise()
         self._check_stop()
@@ -80,7 +80,7 @@ class PlannedSteps(Decorator):
         return {"hold": Status.SUCCESS, "no path": Status.FAILURE}.get(kind, Status.RUNNING)
 
     def terminate(self, new_status: Status) -> None:
-        """Conclude a step that is interrupted."""
+        """Conclude an interrupted step."""
         # py_trees interrupts a behaviour with the status INVALID
         if new_status is Status.INVALID and self._is_executing:
             self._conclude(Outcome(False, f"{self.name} was interrupted"))
@@ -96,7 +96,7 @@ class PlannedSteps(Decorator):
         self._recorder.conclude(outcome)
 
     def _outcome(self) -> Outcome:
-        """Return the outcome of the step that the child has ended."""
+        """Return the outcome of a step, after the child has ended."""
         tip = self.decorated.tip() or self.decorated
         if self.decorated.status is Status.SUCCESS:
             return Outcome(True, tip.feedback_message)
@@ -115,9 +115,9 @@ def _ancestors(behaviour: Behaviour, root: Behaviour) -> Iterator[Behaviour]:
 
 
 def record_ticks(tree: Tree, recorder: Recorder) -> None:
-    """Record every later tick that changes the status of a node on `/plan/behaviour_tree`.
+    """Record later ticks on `/plan/behaviour_tree`, if they change the status of a node.
 
-    A tick has the time of the newest sample; ticks before the first sample are not recorded.
+    A tick has the time of the newest sample. Ticks before the first sample are not recorded.
     """
     channel = recorder.channel(BEHAVIOUR_TREE, schema=BehaviourTree)
     recorded_nodes: list[object] = [()]

@@ -1,1 +1,1 @@
-"""A server that agents call: the commands as tools of the Model Context Protocol."""
+"""A server for agents: the commands as tools of the Model Context Protocol."""

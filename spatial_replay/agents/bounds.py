@@ -21,14 +21,14 @@ MOST_TEXT: Final = 100_000
 """Length limit of a text argument, characters."""
 
 _LINES: Final = 4_000
-"""Size limit of the lines of an answer, bytes. The lines are sent twice: as text and as values."""
+"""Size limit of an answer's lines, bytes. The lines are sent twice: as text and as values."""
 _WARNINGS: Final = 1_500
 _ROW: Final = 3_000
 """Size limit of a row, bytes."""
 _OTHERS: Final = 3_000
 """Size limit of all values except the rows, bytes."""
 _MOST_ENTRIES: Final = 20_000
-"""Largest number of entries of a folder, which are all checked for links."""
+"""Maximum number of entries in a folder. All of them are checked for links."""
 _ADDRESSES: Final = "://"
 
 
@@ -37,9 +37,9 @@ class Bounds:
     """Folders and addresses that a server reads, and the folder that it writes.
 
     Attributes:
-        folders: folders, with links resolved.
-        addresses: addresses of folders on other machines; each ends in "/".
-        output: output folder; None if nothing is written.
+        folders: readable folders, with links resolved.
+        addresses: readable addresses of folders; each ends in "/".
+        output: output folder; None if nothing may be written.
     """
 
     folders: tuple[Path, ...]
@@ -74,8 +74,8 @@ class Bounds:
         """Return the path of an input with all links resolved, or its address.
 
         Args:
-            text: a path, also relative to a root, or an address; `push_v3#17` is an episode of a data set.
-            argument: the name of the argument, for errors.
+            text: absolute path, path relative to a root, or address; `push_v3#17` is an episode.
+            argument: name of the argument, for errors.
 
         Raises:
             UsageError: the input is missing, outside the roots, or neither a file nor a folder.
@@ -103,7 +103,7 @@ class Bounds:
         return f"{path}{episode_suffix}"
 
     def _path(self, text: str, argument: str) -> Path | None:
-        """Return an existing path without links; None if there is none.
+        """Return the path of an existing file or folder without links; None for a missing one.
 
         Raises:
             UsageError: the path is outside the roots.
@@ -127,7 +127,7 @@ class Bounds:
         return None
 
     def _check_links(self, folder: Path, argument: str) -> None:
-        """Refuse a folder with a link to the outside, or with a pipe, which would block its reader."""
+        """Refuse a folder with a link to the outside, or with a pipe, because a pipe blocks its reader."""
         entry_count, pending_folders, visited_folders = 0, [str(folder)], {str(folder)}
         while pending_folders:
             for parent, folders, file_names in os.walk(pending_folders.pop()):
@@ -138,7 +138,7 @@ class Bounds:
                     )
                 for path in map(Path(parent).joinpath, (*folders, *file_names)):
                     target = self._inside(path, argument)
-                    # the target folder of a link may contain links, too
+                    # a linked folder may contain links, too
                     if target is not None and target not in visited_folders and os.path.isdir(target):  # noqa: PTH112
                         visited_folders.add(target)
                         pending_folders.append(target)
@@ -147,7 +147,7 @@ class Bounds:
         """Return the target of a link; None for a file or a folder.
 
         Raises:
-            UsageError: the link leads to the outside, or the path is no link, file or folder.
+            UsageError: the target is outside the roots, or the path is no link, file or folder.
         """
         target = None
         try:
@@ -167,7 +167,7 @@ class Bounds:
         return target
 
     def relative(self, path: str) -> str:
-        """Return a path as an argument of tools: relative to the only root, else absolute."""
+        """Return a path as an argument of tools: relative to a single root, otherwise absolute."""
         root = str(self.folders[0]) if len(self.folders) == 1 and not self.addresses else ""
         return os.path.relpath(path, root) if root and path.startswith(root) else path
 
@@ -175,7 +175,7 @@ class Bounds:
         """Return the path of a result in the output folder.
 
         Raises:
-            UsageError: there is no output folder, or the name is not the name of a file in it.
+            UsageError: there is no output folder, or the name is no name of a file in this folder.
         """
         if self.output is None:
             raise UsageError("nothing can be written; start the server with --output FOLDER")
@@ -208,10 +208,10 @@ class Files:
         self._temporary.cleanup()
 
     def path(self, name: str) -> str:
-        """Return a file for the text of an argument: a new file with the text, or the file that it names.
+        """Return the path of a file with the text of an argument, or the path in the text.
 
         Raises:
-            UsageError: the text is empty or too long, or names a file outside the roots.
+            UsageError: the text is empty, too long, or the path of a file outside the roots.
         """
         text = self._texts[name]
         ending, *_ = endings = (".yaml", ".yml") if name == "mapping" else (".spatial",)
@@ -227,7 +227,7 @@ class Files:
         return f"{name}{ending}"
 
     def option(self, option: str, name: str) -> list[str]:
-        """Return an option with the file of a text; nothing for an empty text."""
+        """Return an option and the file of a text; an empty list for an empty text."""
         return [option, self.path(name)] if self._texts.get(name) else []
 
     def json(self, command: Sequence[str]) -> Any:
@@ -244,9 +244,9 @@ class Page(NamedTuple):
 
     Attributes:
         lines: lines of the text.
-        warnings: warnings, only in the first part.
+        warnings: warnings; the first part has all of them.
         document: the document with a part of its rows.
-        left_off: notes on the values that were cut.
+        left_off: notes on cut values.
         next: argument for the next part; "" for the last part.
     """
 
@@ -260,14 +260,14 @@ class Page(NamedTuple):
 def page_of(
     lines: Sequence[str], warnings: Sequence[str], document: Mapping[str, Any], rows_key: str, start: str
 ) -> Page:
-    """Return the part of an answer that begins at a place.
+    """Return the part of an answer that begins at `start`.
 
     Args:
         rows_key: key of the long list in the document.
         start: `next` of the previous part; "" for the first part.
 
     Raises:
-        UsageError: the place is invalid.
+        UsageError: `start` is not the `next` of a part.
     """
     first_line, first_row = _place(start)
     left_off: list[str] = []
@@ -304,7 +304,7 @@ def _place(start: str) -> tuple[int, int]:
 
 
 def _prefix(values: Iterable[Any], max_bytes: int) -> Iterator[Any]:
-    """Yield the first values that fit into a number of bytes; at least one."""
+    """Yield the first values that fit into `max_bytes`, but at least one value."""
     total_bytes = 0
     for index, value in enumerate(values):
         total_bytes += _size(value) + 1
@@ -318,18 +318,18 @@ def _size(value: Any) -> int:
 
 
 _LIMITS: Final = ((1_000, 100), (300, 30), (200, 10), (120, 4), (80, 2), (40, 1))
-"""Limits for characters of a text and entries of a list, from loose to strict."""
+"""Limits of the characters of a text and of the entries of a list, from loose to strict."""
 
 
 def _fit(value: Any, max_bytes: int, left_off: list[str]) -> Any:
-    """Return a value cut to a number of bytes."""
+    """Return a value cut to `max_bytes`. `left_off` gets notes on the cut lists and values."""
     part, notes = value, list[str]()
     for characters, entries in _LIMITS:
         notes = []
         part = _cut(value, "", characters, entries, notes)
         if _size(part) <= max_bytes:
             break
-    # if that is not enough, the largest values are dropped
+    # if the strictest limits are not enough, the largest values are dropped
     keys_by_size = sorted(part, key=lambda key: _size(part[key])) if isinstance(part, dict) else []
     while keys_by_size and _size(part) > max_bytes:
         key = keys_by_size.pop()

@@ -1,4 +1,4 @@
-"""Calls of tools. Each call runs its commands in its own process, which ends with the call."""
+"""Calls of tools. Each call runs its commands in a new process, which ends with the call."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Call(NamedTuple):
     """The commands of one call.
 
     Attributes:
-        commands: arguments of the program, without its name.
-        folder: the current folder.
-        readable: further folders that may be read and written.
+        commands: arguments of the program for each command, without the program's name.
+        folder: current folder of the process.
+        readable: folders that may be read and written.
         is_online: whether addresses may be read.
     """
 
@@ -36,8 +36,8 @@ class Outcome(NamedTuple):
 
     Attributes:
         code: exit code.
-        out, err: the text on standard output and standard error.
-        document: the result as values for JSON; None without any.
+        out, err: text on standard output and on standard error.
+        document: result as values for JSON; None for a command without values.
     """
 
     code: int
@@ -47,11 +47,11 @@ class Outcome(NamedTuple):
 
 
 class Outcomes(NamedTuple):
-    """The outcomes of a call's commands, and the reason if some are missing.
+    """The outcomes of a call's commands.
 
     Attributes:
         outcomes: outcomes of the commands that ended.
-        reason: the reason for missing outcomes; "" if all commands ended.
+        reason: reason for missing outcomes; "" if all commands ended.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -71,7 +71,7 @@ _PRELOADED = (
 
 
 class Processes:
-    """Starts a process for each call, and limits how many run at once."""
+    """Starts a process for each call, and limits the number of concurrent processes."""
 
     def __init__(self, work: Work, limit_s: float, most: int) -> None:
         self._work, self._limit_s = work, limit_s
@@ -85,7 +85,7 @@ class Processes:
         return forking_context([self._work.__module__, *_PRELOADED])
 
     async def run(self, call: Call, report: Report) -> Outcomes:
-        """Run a call to its end, or until the time limit. If the call is cancelled, its process is killed."""
+        """Run a call to its end or to the time limit. The process of a cancelled call is killed."""
         async with self._limiter:
             receiver, sender = multiprocessing.Pipe(duplex=False)
             process = self._context().Process(target=self._work, args=(sender, call), daemon=True)

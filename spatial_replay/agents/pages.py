@@ -1,4 +1,4 @@
-"""Pages for agents, made of sections of the documentation."""
+"""Pages for agents. A page consists of sections of the documentation."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SECTIONS: Final[Mapping[str, Sequence[tuple[str, Sequence[str]]]]] = MappingPro
         "errors": (("agents", ("Mistakes, as they look",)), ("language", ("Errors and limits",))),
     }
 )
-"""Sections of documentation pages, by page for agents. No sections mean the whole page."""
+"""Documentation pages and their sections, by page for agents. No sections mean the whole page."""
 
 _HEADING: Final = re.compile(r"^(#{2,}) (.+)$")
 
@@ -62,7 +62,7 @@ def relation_picture(name: str) -> str:
 
 
 def _document(path: str) -> str:
-    """Return a file of the documentation. In wheels, it lies inside the package."""
+    """Return the text of a documentation file. In wheels, the file is inside the package."""
     packaged_file = resources.files(__package__).joinpath("docs", path)
     source_file = Path(__file__).parents[2] / "docs" / path
     try:
@@ -72,7 +72,7 @@ def _document(path: str) -> str:
 
 
 def _sections(text: str, headings: Sequence[str]) -> str:
-    """Return sections of a page without their subsections; the whole page if no headings are given."""
+    """Return the sections with these headings, without their subsections. No headings: the whole page."""
     if not headings:
         return text
     lines: list[str] = []

@@ -78,17 +78,17 @@ _ROWS: Final = {
     "tune": "runs",
     "report": "",
 }
-"""For each tool, the key of the long list in its document; "" if it has none."""
+"""Key of the long list in the document of each tool; "" for a document without a long list."""
 
 _LEFT_OUT: Final = frozenset({"nodes", "path", "measured", "certificate"})
-"""Keys of long values that are left out of a document, because sentences contain the same facts."""
+"""Keys of long values that documents leave out, because the sentences contain the same facts."""
 _MAPPING: Final = 6_000
-"""Size limit of a mapping that is also given as one text, bytes."""
+"""Size limit of a mapping that the answer repeats as one text, bytes."""
 _CARET: Final = re.compile(r"^\S+:\d+:\d+: error: ", re.MULTILINE)
 _DESCRIBED: Final = 12
-"""Logs in one answer of `list_logs`."""
+"""Maximum number of logs in one answer of `list_logs`."""
 _NAMED: Final = 15
-"""Objects that `list_logs` names per log."""
+"""Maximum number of object names per log in `list_logs`."""
 _OPTIONS: Final = {
     r"with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info \S+ --suggest-mapping": (
         "as mapping; suggest_mapping writes a first one"
@@ -99,11 +99,11 @@ _OPTIONS: Final = {
     "--const": "constants",
     **{f"--{name}": name for name in ("mapping", "labels", "result", "hz", "good", "bad")},
 }
-"""Words of the tools that replace options in errors of commands, by pattern."""
+"""Arguments of tools, by the pattern of the options that they replace in errors of commands."""
 
 
 class Tools:
-    """The tools. Each is a command; its arguments are checked here, and it runs in a process of its own."""
+    """The tools. A tool checks its arguments, and runs a command in a separate process."""
 
     def __init__(self, bounds: Bounds, limit_s: float, work: Work) -> None:
         self._bounds = bounds
@@ -112,7 +112,7 @@ class Tools:
 
     @asynccontextmanager
     async def lifespan(self, server: MCPServer[None]) -> AsyncIterator[None]:
-        """Start the fork server, and keep a folder for texts while the server runs."""
+        """Start the fork server, and provide a folder for texts while the server runs."""
         with TemporaryDirectory(prefix="spatial-replay-", ignore_cleanup_errors=True) as folder:
             self._folder = os.path.realpath(folder)
             await to_thread.run_sync(self._processes.start)
@@ -136,7 +136,7 @@ class Tools:
                 commands.append(["info", self._bounds.place(log["path"], "log")])
                 rows.append({"path": self._bounds.relative(log["path"]), "episodes": log["episodes"]})
         descriptions = await self._run(ctx, commands)
-        # the time limit may have ended the call before the last outcome
+        # outcomes are missing after the time limit
         for row, command, outcome in zip(rows, commands, descriptions.outcomes, strict=False):
             row |= _facts(outcome) | {"bytes": _bytes_of(Path(command[1]))}
         lines = [_log_line(row) for row in rows] or ["no logs below the roots"]
@@ -169,7 +169,7 @@ class Tools:
                 return _failure(outcomes.reason or self._error(outcomes.outcomes[0].err, files))
             outcome = outcomes.outcomes[0]
             mapping_text = "\n".join(escape_text(line, "\t") for line in outcome.out.splitlines())
-            # the lines hold the whole mapping; one text can be passed on to the other tools
+            # the lines have the whole mapping, too; only the text can be an argument of other tools
             document = {"mapping": mapping_text if len(mapping_text.encode()) < _MAPPING else None}
             lines = mapping_text.split("\n")
             return _answer("suggest_mapping", 0, lines, _lines(outcome.err), {}, next, extra=document)
@@ -386,14 +386,19 @@ class Tools:
         start: str = "",
         document: Mapping[str, Any] = MappingProxyType({}),
     ) -> CallToolResult:
-        """Run a command, and return its answer. `document` is for commands without a document."""
+        """Run a command, and return its answer.
+
+        Args:
+            start: `next` of the previous answer; "" for the first answer.
+            document: document of the answer, if the command has none.
+        """
         outcomes = await self._run(ctx, [command], files)
         if not outcomes.outcomes:
             return _failure(outcomes.reason)
         (outcome,) = outcomes.outcomes
         values = outcome.document or files.json(command)
         if values is None:
-            # for `check`, errors in the text are the answer; codes are explained in `answer_schema`
+            # errors in the text are an answer of `check`; `answer_schema` describes the codes
             is_answer = outcome.code in (0, 1, 4) or (outcome.code == 3 and outcome.out)
             if not is_answer and not (tool == "check" and _CARET.search(outcome.err)):
                 return _failure(self._error(outcome.err, files))
@@ -401,12 +406,12 @@ class Tools:
         values = _without({_ROWS[tool]: values} if isinstance(values, list) else values, _LEFT_OUT)
         lines = _lines(outcome.out)
         if tool != "report":
-            # the files of the call are temporary, so their paths are of no use
+            # paths of the call's files are left out, because the files are temporary
             lines = [line for line in lines if not line.startswith("wrote ")]
         return _answer(tool, outcome.code, lines, _lines(outcome.err), values, start)
 
     def _error(self, text: str, files: Files) -> str:
-        """Return the error of a command with arguments of the tools instead of options."""
+        """Return the error of a command, with names of arguments instead of options."""
         lines = _lines(text)
         errors = [line for line in lines if line.startswith("error: ")]
         text = "\n".join(lines if not errors or len(lines) < 12 else errors).removeprefix("error: ")
@@ -426,11 +431,11 @@ def _answer(
     extra: Mapping[str, Any] = MappingProxyType({}),
     next_start: str = "",
 ) -> CallToolResult:
-    """Return a part of an answer.
+    """Return an answer, or the part of a long answer that begins at `start`.
 
     Args:
         extra: short values, which are not cut.
-        following: `next` of an answer that is already a part.
+        next_start: `next` of the answer, if the caller has cut the answer already.
     """
     page = page_of(lines, warnings, document, _ROWS[tool], start)
     next_start = next_start or page.next
@@ -467,7 +472,7 @@ def _without(value: Any, keys: frozenset[str]) -> Any:
 
 
 def _facts(outcome: Outcome) -> dict[str, Any]:
-    """Return the row of a log: a few values from `info`."""
+    """Return a log's row for `list_logs`, with a few values of `info`."""
     document = outcome.document
     if document is None:
         return {
@@ -505,12 +510,12 @@ def _bytes_of(path: Path) -> int | None:
 
 
 class Server(MCPServer[None]):
-    """The SDK's server, with errors of arguments in one sentence."""
+    """The server of the SDK, with errors of arguments as sentences."""
 
     async def call_tool(
         self, name: str, arguments: dict[str, Any], context: Context[None, Any] | None = None
     ) -> CallToolResult | InputRequiredResult:
-        """See `MCPServer.call_tool`. Arguments that a tool does not have are refused."""
+        """See `MCPServer.call_tool`. Unknown arguments are refused."""
         properties: Mapping[str, Any] = {}
         for tool in await self.list_tools():
             if tool.name == name:
@@ -569,7 +574,7 @@ def make_server(bounds: Bounds, limit_s: float, work: Work) -> Server:
 
 
 def answer_schema(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of a tool's answers, given the schema of its document."""
+    """Return the schema of a tool's answers, with the schema of its document."""
     texts_schema = {"type": "array", "items": {"type": "string"}}
     properties = {
         "exit_code": {
@@ -612,6 +617,6 @@ def serve(bounds: Bounds, limit_s: float, work: Work) -> None:
     """Serve over standard input and output, until the client closes them.
 
     Args:
-        work: function that runs a call in its own process, and sends results and progress.
+        work: function that runs a call in another process, and sends results and progress.
     """
     make_server(bounds, limit_s, work).run("stdio")

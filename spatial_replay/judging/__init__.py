@@ -1,5 +1,6 @@
 """Judging episodes: verdicts next to success labels, with rates, intervals and reasons.
 
-`labels` reads labels. `judgement` compares them with the rows of a batch. `sentences` describes the result.
-`statistics` has the numbers, and `writers` makes pages.
+`labels` reads labels. `judgement` compares labels with the rows of a batch, and `pairs` compares two
+judgements. `stages` has the progress of episodes, and `statistics` the tests. `sentences` and `writers` make
+texts and files.
 """

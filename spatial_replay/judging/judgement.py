@@ -55,7 +55,7 @@ _AGREEMENTS: Final[Mapping[tuple[bool, bool], Kind]] = {
 _MOST_RUNS: Final = 8
 """The greatest k of `pass_k`."""
 _SMALL_M: Final = 0.1
-"""Length below which lengths are reported in millimetres, metres."""
+"""Upper limit of lengths that are reported in millimetres, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +63,11 @@ class Agreement:
     """Numbers of episodes by label and verdict.
 
     Attributes:
-        both, neither: label and verdict agree on a success, or on a failure.
-        only_theirs, only_ours: only the label counts a success, or only the verdict.
-        unstored: the label is a success in a state that is not stored; the verdict on the stored states is
-            none.
-        undecided: the verdict is unknown, untested, doubtful or an error.
+        both, neither: episodes whose label and verdict are both a success, or both a failure.
+        only_theirs, only_ours: episodes with a success only by the label, or only by the verdict.
+        unstored: episodes whose label is a success in a state that is not stored, and whose verdict on the
+            stored states is a failure.
+        undecided: episodes whose verdict is unknown, untested, doubtful or an error.
         unlabelled: decided episodes without a label.
     """
 
@@ -81,7 +81,7 @@ class Agreement:
 
     @property
     def compared(self) -> int:
-        """Number of episodes with a label and a verdict about the same states."""
+        """Number of episodes whose label and verdict describe the same states."""
         return self.both + self.only_theirs + self.only_ours + self.neither
 
 
@@ -90,19 +90,19 @@ class JudgedEpisode:
     """A row of a judgement.
 
     Attributes:
-        episode: the log's name without folder and ending, or its address in a data set: `push_v3#17`.
-        label: whether the label counts a success; None without a label.
+        episode: name of the log without folder and ending, or its address in a data set: `push_v3#17`.
+        label: whether the label is a success; None without a label.
         verdict: "satisfied", "violated", "unknown", or None for an error.
         kind: agreement of label and verdict, see `Agreement`.
-        margin: the robustness; None where not determined.
-        success_at: seconds from the begin of the episode to its first success; None without one.
+        margin: robustness; None if not determined.
+        success_at: time of the first success, seconds from the begin of the episode; None without a success.
         tested: see `SpecResult.tested`.
-        reason: the reason of the verdict, a sentence.
+        reason: sentence with the reason of the verdict.
         task, seed: values in the data set, or None.
-        log: path or address.
-        failure, failure_at: name and time in seconds of a failed episode's first failure, if a file of
-            failures is given.
-        stage, progress: stage and progress at the end, if stages are requested; see `annotate.stages`.
+        log: path or address of the log.
+        failure, failure_at: name and time (seconds) of a failed episode's first failure; None without a file
+            of failures.
+        stage, progress: stage and progress at the end, see `annotate.stages`; None unless requested.
     """
 
     episode: str
@@ -123,12 +123,12 @@ class JudgedEpisode:
 
     @property
     def is_success(self) -> bool | None:
-        """Whether the verdict counts a success; None if it is undecided."""
+        """Whether the verdict is a success; None if it is undecided."""
         return None if self.kind == "undecided" else self.verdict == "satisfied"
 
     @property
     def stored_success(self) -> bool | None:
-        """Whether the episode is a success; None if it is undecided, or if its success is unstored."""
+        """Whether the episode is a success; None for an undecided episode or an unstored success."""
         return None if self.kind == "unstored" else self.is_success
 
 
@@ -141,13 +141,13 @@ class Judgement:
 
     Attributes:
         name: name of the folder or data set.
-        file, result, formula: the specification file, the name of the spec, and its text.
-        rows: one for each episode, in their order.
-        batch: the results of all specs.
+        file, result, formula: specification file, name of the spec, and its text.
+        rows: one row for each episode, in the order of the logs.
+        batch: results of all specs.
         comparison: comparison with earlier episodes, or None.
-        failure_file: the name of the file of failures, or "".
+        failure_file: name of the file of failures, or "".
         stages: names of the task's stages, the farthest from success first; empty unless requested.
-        data_set_remarks: messages about whole data sets.
+        data_set_remarks: messages about data sets.
     """
 
     name: str
@@ -163,13 +163,13 @@ class Judgement:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of its rows."""
+        """The names of the columns of `rows`."""
         failures = ("failure", "failure_at") if self.failure_file else ()
         return (*_COLUMNS, *failures, *(("stage", "progress") if self.stages else ()))
 
     @cached_property
     def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
-        """The failed episodes by their first failure, the most frequent first; None is any other failure."""
+        """Failed episodes by first failure, the most frequent first. The key None is any other failure."""
         failed_rows = [row for row in self.rows if row.is_success is False]
         failure_counts = Counter(row.failure for row in failed_rows)
         failure_names = sorted(failure_counts, key=lambda name: (name is None, -failure_counts[name]))
@@ -182,25 +182,25 @@ class Judgement:
 
     @property
     def rate(self) -> Rate:
-        """Successes among decided episodes; unstored successes do not count."""
+        """The success rate of decided episodes. Unstored successes do not count."""
         outcomes = [row.is_success for row in self.rows if row.is_success is not None]
         return Rate(sum(outcomes), len(outcomes))
 
     @property
     def rate_with_unstored(self) -> Rate:
-        """The rate if the unstored successes count."""
+        """The success rate if unstored successes count."""
         return Rate(self.rate.successes + self.agreement.unstored, self.rate.episodes)
 
     @property
     def label_rate(self) -> Rate:
-        """Successes by the labels."""
+        """The success rate of the labels."""
         labels = [row.label for row in self.rows if row.label is not None]
         return Rate(sum(labels), len(labels))
 
     def reaches(self, least: float) -> bool | None:
-        """Return whether the lower end of the interval is at least a rate.
+        """Return whether the lower end of the rate's interval is at least `least`.
 
-        None if that depends on undecided episodes or unstored successes.
+        None if the answer depends on undecided episodes or unstored successes.
         """
         episode_count, open_count = len(self.rows), self.agreement.undecided + self.agreement.unstored
         intervals = [Rate(self.rate.successes + extra, episode_count).interval for extra in (0, open_count)]
@@ -209,9 +209,10 @@ class Judgement:
 
     @property
     def pass_k(self) -> dict[int, float]:
-        """Mean probability that k runs of one start all succeed, by k from 2; empty without repeated starts.
+        """Mean probability that k runs of one start all succeed, by k from 2. Empty without repeated starts.
 
-        Runs of one start have the same task and seed, or logs whose names differ only in the run: `cross#2`.
+        Runs of one start have the same task and seed. Without seeds, their names differ only in the number of
+        the run: `cross#2`.
         """
         outcomes_by_start = defaultdict[object, list[bool]](list)
         for row in self.rows:
@@ -267,7 +268,7 @@ class Judgement:
 
     @property
     def table(self) -> pa.Table:
-        """The rows with the columns of `document`. Missing values are null."""
+        """The rows as a table, with the columns of `document`. Missing values are null."""
         import pyarrow as pa
 
         column_types = {"label": pa.bool_(), "seed": pa.int64()}
@@ -287,10 +288,10 @@ class Comparison:
 
     Attributes:
         new: name of the new episodes.
-        old: the judgement of the old ones.
-        pairs: decided episodes of both that have the same key and first places.
-        elsewhere: number of pairs with the same key but different objects or first places.
-        undecided: number of pairs in which one episode is undecided, or its success unstored.
+        old: judgement of the old episodes.
+        pairs: pairs of a new and an old decided episode with the same key and the same first places.
+        elsewhere: number of pairs with the same key, but with other objects or first places.
+        undecided: number of pairs with an undecided episode or an unstored success.
         alone: number of episodes without a partner.
     """
 
@@ -318,7 +319,7 @@ class Comparison:
 
     @property
     def evidence(self) -> float:
-        """The e-value, see `e_value`; 20 decides."""
+        """The e-value, see `e_value`. An e-value of 20 or more decides."""
         return e_value(self.won, self.lost)
 
     @property
@@ -368,11 +369,14 @@ class _Spec(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PreparedJudgement:
-    """Episodes with their labels, and the result that judges them.
+    """Episodes with their labels, and the spec that judges them.
 
     Attributes:
+        name: name of the folder or data set.
         case: the case for `run_batch`.
-        failure_file: the name of the file of failures among its files, or "".
+        spec: the spec that judges.
+        labels: labels of the episodes.
+        failure_file: name of the file of failures in `case.files`, or "".
     """
 
     name: str
@@ -382,16 +386,17 @@ class PreparedJudgement:
     failure_file: str = ""
 
     def judgement(self, batch: BatchResult, allow: AbstractSet[str] = frozenset()) -> Judgement:
-        """Return the judgement, given the results of a batch with the case.
+        """Return the judgement of the episodes.
 
         Args:
+            batch: results of a batch with the case.
             allow: kinds of inconclusive verdicts that count: "vacuous", "dropped" and "doubtful".
         """
         paths_by_name = {log.name: log.path for log in self.case.logs}
         batch = _part_of_batch(batch, set(paths_by_name))
         row_by_log: dict[str, Values] = {}
         for row in worst_rows(_rows_of(batch.table, self.spec), len(batch.table)):
-            # rows are sorted, so the first one of a template is the worst object
+            # rows are sorted: the first row of a template has the worst object
             row_by_log.setdefault(row["log"], row)
         episode_by_log = _episode_names(list(paths_by_name))
         rows = tuple(
@@ -428,10 +433,10 @@ class PreparedJudgement:
         is_exported: bool = True,
         progress: Progress = no_progress,
     ) -> BatchResult:
-        """Return a batch with explanations of undecided episodes and of disagreements with labels.
+        """Return the batch with explanations of undecided episodes and of disagreements with labels.
 
         Args:
-            is_exported: whether violated episodes that agree with their labels are explained as well.
+            is_exported: whether all other violated episodes are explained, too.
         """
         kinds: set[Kind] = {"only_theirs", "only_ours", "undecided"}
         rows = self.judgement(batch, allow).rows
@@ -456,12 +461,12 @@ def prepare_judgement(
     *,
     has_failures: bool = False,
 ) -> PreparedJudgement:
-    """Find the episodes of a suite of one case, their labels, and the result that judges them.
+    """Find the episodes of a suite with one case, their labels, and the spec that judges them.
 
     Args:
         labels: see `read_labels`.
-        result: the name of a spec; by default the last one that no other spec uses.
-        has_failures: whether the first file of the suite has failures, see `_first_failures`.
+        result: name of the spec that judges; by default the last spec that no other spec uses.
+        has_failures: whether the first file of the suite is a file of failures, see `_first_failures`.
 
     Raises:
         UsageError, SpecificationError: see `batch.run.prepare` and `read_labels`.
@@ -479,7 +484,7 @@ def prepare_judgement(
 
 
 def _judging_spec(case: PreparedCase, result: str | None, first_index: int) -> _Spec:
-    """Return the spec that judges. Files before the place `first` are not considered."""
+    """Return the spec that judges. Files before the index `first_index` are not considered."""
     texts = tuple(file.text for file in case.files)
     files = parsed_specifications(texts, case.case.conditions)
     specs = [
@@ -515,7 +520,7 @@ def _name_of(case: PreparedCase) -> str:
 
 
 def _episode_names(logs: Sequence[str]) -> dict[str, str]:
-    """Return the names of logs without the folder and the ending that all of them share."""
+    """Return the names of logs, by path, without a common folder and a common ending."""
     folders = {log.rpartition("/")[0] for log in logs}
     folder = f"{folders.pop()}/" if len(folders) == 1 else ""
     endings = {max((end for end in LOG_ENDINGS if log.endswith(end)), key=len, default="") for log in logs}
@@ -524,7 +529,7 @@ def _episode_names(logs: Sequence[str]) -> dict[str, str]:
 
 
 def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
-    """Return the part of a batch with the results of some logs."""
+    """Return the part of a batch with the results of these logs."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -534,7 +539,7 @@ def _part_of_batch(batch: BatchResult, logs: AbstractSet[str]) -> BatchResult:
 
 
 def _rows_of(table: pa.Table, spec: _Spec) -> pa.Table:
-    """Return the rows of a spec; an error of its whole file has rows without a name."""
+    """Return the rows of a spec. The rows of an unparsable file have no name of a spec."""
     import pyarrow.compute as pc
 
     is_named = pc.or_(pc.equal(table["spec"], spec.name), pc.equal(table["spec"], ""))
@@ -554,7 +559,7 @@ _READ: Final = (
         "error",
     ),
 )
-"""The columns of a run that a judgement reads. The long texts are in other columns."""
+"""Columns of a run that a judgement reads. Columns of long texts are not among them."""
 
 
 def _judged_episode(
@@ -593,8 +598,8 @@ class _Failure(NamedTuple):
     """A failure of an episode.
 
     Attributes:
-        name: title of the satisfied spec; its name if it has no title.
-        at: seconds from the begin of the episode; None if only its end decides.
+        name: title of the spec that describes the failure, or the spec's name without a title.
+        at: time of the failure, seconds from the begin of the episode; None if the end of the log decides.
     """
 
     name: str
@@ -602,9 +607,9 @@ class _Failure(NamedTuple):
 
 
 def _first_failures(table: pa.Table, file: str) -> dict[str, _Failure]:
-    """Return the first failure in each log, by the log's name, from the results of a batch.
+    """Return the first failure in each log of a batch's table, by the log's name.
 
-    Failures that only the end of the log decides come last. At equal times, the first in the file counts.
+    Failures that only the end of the log decides come last. At equal times, the first spec in the file wins.
     """
     import pyarrow.compute as pc
 
@@ -621,7 +626,7 @@ def _first_failures(table: pa.Table, file: str) -> dict[str, _Failure]:
 
 
 def _undecided_reason(row: Values, allow: AbstractSet[str]) -> str:
-    """Return why a verdict does not count; "" if it does."""
+    """Return the reason why a verdict does not count; "" for a verdict that counts."""
     if row["verdict"] is None:
         return row["error"] or "no result"
     if row["faults"]:

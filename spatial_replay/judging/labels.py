@@ -18,7 +18,7 @@ from spatial_replay.sources.open_log import LOG_ENDINGS
 from spatial_replay.text import first_lines, listing, nearest_hint, plural
 
 LABEL_FILES: Final = ("labels.json", "labels.csv")
-"""Names of label files that are found next to logs."""
+"""Names of label files next to logs."""
 _LARGEST: Final = 256 * 2**20
 """Size limit of a label file, bytes."""
 _MOST_FAULTS: Final = 20
@@ -34,8 +34,8 @@ class SuccessLabel(NamedTuple):
     """The success label of an episode.
 
     Attributes:
-        success: None without a label.
-        is_unstored: whether the label describes the state after the last frame, which is not stored.
+        success: whether the label is a success; None without a label.
+        is_unstored: whether the label describes the state after the last frame. That state is not stored.
         task, seed: values in the data set, or None.
     """
 
@@ -46,7 +46,13 @@ class SuccessLabel(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """Labels by the paths of logs, the files that they were read from, and remarks on the data sets."""
+    """Labels of logs.
+
+    Attributes:
+        by_path: labels by the paths of logs.
+        files: label files.
+        remarks: remarks on data sets.
+    """
 
     by_path: Mapping[str, SuccessLabel]
     files: tuple[Path, ...] = ()
@@ -59,14 +65,14 @@ def read_labels(
     """Read the labels of episodes.
 
     Args:
-        labels: a JSON or CSV file, or the name of a field of the data set. By default, labels are in
+        labels: path of a JSON or CSV file, or name of a field of the data set. By default, labels are in
             `labels.json` or `labels.csv` next to the logs, or in the data set.
-        reading: what a mapping says about data sets.
+        reading: reading options of data sets, from a mapping.
 
     Raises:
         MissingFileError: there is no such file.
-        UsageError: entries name other episodes, frames, or an episode twice (all are listed), or the data set
-            lacks the field.
+        UsageError: the data set lacks the field, or entries name unknown episodes, frames, or an episode
+            twice. The message lists all such entries.
     """
     is_file = labels is not None and (labels.lower().endswith((".json", ".csv")) or Path(labels).is_file())
     if labels is not None and not is_file:
@@ -80,12 +86,12 @@ def read_labels(
         if address is not None and data_set is not None:
             remarks |= dict.fromkeys(f"{data_set.name}: {remark}" for remark in data_set.remarks)
             label = _stored_label(data_set, address[1], reading)
-            # a file replaces all labels of the data set, because a rate of mixed labels has no meaning
+            # a file replaces all labels of the data set, because a rate over mixed labels has no meaning
             labels_by_path[log.path] = label._replace(success=None, is_unstored=False) if is_file else label
         elif labels is not None and not is_file:
             raise UsageError(f"--labels {labels}: no such file, and {log.name} has no such field")
         elif not is_address(log.path) and not log.path.lower().endswith(DATA_SET_ENDINGS):
-            # a data set that cannot be opened has no episodes for labels
+            # an unreadable data set has no episodes for labels
             folders[Path(log.path).parent] = None
     candidates = [folder / name for folder in folders for name in LABEL_FILES]
     label_files = [Path(labels or "")] if is_file else [file for file in candidates if file.is_file()]
@@ -101,7 +107,7 @@ def read_labels(
 
 
 def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> SuccessLabel:
-    """Return the label of an episode in its data set; no label if the data is unreadable."""
+    """Return the label of an episode in its data set. An unreadable episode has no label."""
     episode, label = data_set.episode(number), data_set.label
     unlabelled = SuccessLabel(None, task=episode.task, seed=episode.seed)
     field = reading.label
@@ -122,7 +128,7 @@ def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> Su
 
 
 def _labels_of(file: Path, logs: Sequence[FoundLog]) -> dict[str, bool | None]:
-    """Return the labels in a file. Entries of existing logs that are not judged are left out."""
+    """Return the labels in a file, by path. Entries of existing logs outside the judgement are left out."""
     paths_by_name = _paths_by_name(logs)
     labels: dict[str, bool | None] = {}
     places: dict[str, str] = {}
@@ -150,7 +156,7 @@ def _repetition(entry: Mapping[str, Any], place: str) -> str:
 
 
 def _entries(file: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each entry of a label file, with its place."""
+    """Yield the place of each entry in a label file, and the entry."""
     try:
         with file.open("rb") as stream:
             content = stream.read(_LARGEST + 1)
@@ -187,13 +193,13 @@ def _success(entry: Mapping[str, Any]) -> bool | None:
 def _entry_path(
     entry: Mapping[str, Any], paths_by_name: Mapping[str, Sequence[str]], file: Path
 ) -> str | None:
-    """Return the path of the log that an entry names; None if that log exists but is not judged."""
+    """Return the path of the log that an entry names; None for an existing log outside the judgement."""
     log_value = entry.get("log") if entry.get("log") is not None else entry.get("episode")
     # a bool is an int in Python
     if not isinstance(log_value, str | int) or isinstance(log_value, bool):
         raise UsageError("it names no episode; give 'log', a path, or 'episode', a number or name")
     log_name = str(log_value).strip()
-    # first next to the label file, because other folders may have logs of the same name
+    # logs next to the label file have priority, because other folders may have logs of the same name
     paths = paths_by_name.get(_stem(str(file.parent / log_name))) or paths_by_name.get(_stem(log_name)) or []
     if len(paths) > 1:
         raise UsageError(f"{log_name!r:.100} names {plural(len(paths), 'log')}; write more of the path")
@@ -213,7 +219,7 @@ def _entry_path(
 
 
 def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
-    """Return the paths of logs by all names in labels: ends of paths, and numbers of episodes."""
+    """Return the paths of logs by possible names in label files: ends of paths, and numbers of episodes."""
     paths_by_name = defaultdict[str, list[str]](list)
     for log in logs:
         parts = PurePosixPath(log.path).parts
@@ -226,6 +232,6 @@ def _paths_by_name(logs: Sequence[FoundLog]) -> Mapping[str, list[str]]:
 
 
 def _stem(name: str) -> str:
-    """Return a path without the ending of a log."""
+    """Remove the ending of a log from a path."""
     ending = max((end for end in LOG_ENDINGS if name.lower().endswith(end)), key=len, default="")
     return str(PurePosixPath(name[: len(name) - len(ending)]))

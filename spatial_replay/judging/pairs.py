@@ -1,4 +1,4 @@
-"""Two judgements compared by pairs of episodes that start alike."""
+"""Comparison of two judgements by pairs of episodes with the same start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spatial_replay.judging.statistics import (
 from spatial_replay.text import plural
 
 SAME_START: Final = 0.001
-"""Largest distance of equal first places, in units of length."""
+"""Largest distance between two equal first places, in units of length."""
 _Place: TypeAlias = tuple[float, float, float]
 
 
@@ -31,13 +31,13 @@ def judge_batch(
     allow: AbstractSet[str] = frozenset(),
     same_start: float | None = None,
 ) -> Judgement:
-    """Return the judgement of new episodes, with a comparison if earlier episodes are prepared.
+    """Return the judgement of new episodes, and compare them with earlier episodes if there are any.
 
     Args:
-        prepared: the new episodes, and optionally the earlier ones.
-        batch: the results of both.
+        prepared: the new episodes, and optionally the earlier episodes.
+        batch: results of all these episodes.
         allow: see `PreparedJudgement.judgement`.
-        same_start: see `compare_judgements`; 0.001 unless given.
+        same_start: see `compare_judgements`; by default 0.001.
     """
     judgement, *earlier = (preparation.judgement(batch, allow) for preparation in prepared)
     if not earlier:
@@ -50,11 +50,11 @@ def judge_batch(
 def compare_judgements(
     new: Judgement, old: Judgement, conditions: Conditions, same_start: float = SAME_START
 ) -> Comparison:
-    """Pair episodes by their seed, or their name or number, and by the places of their objects.
+    """Pair episodes by seed, or by name or number, and by the first places of their objects.
 
     Args:
-        conditions: how the logs are read.
-        same_start: largest distance of an object's first places.
+        conditions: options of reading the logs.
+        same_start: largest distance between an object's two first places, in units of length.
     """
     has_seeds = all(row.seed is not None for row in (*new.rows, *old.rows))
     old_rows = dict(_rows_by_key(old.rows, has_seeds))
@@ -77,7 +77,7 @@ def compare_judgements(
 def _rows_by_key(
     rows: Sequence[JudgedEpisode], has_seeds: bool
 ) -> Iterator[tuple[tuple[object, ...], JudgedEpisode]]:
-    """Yield each row with its key. Equal keys are numbered, so that the nth rows of both sides are a pair."""
+    """Yield each row with its key. Equal keys are numbered: the nth rows of both sides are a pair."""
     key_counts = Counter[tuple[object, ...]]()
     for row in rows:
         key = (row.task, row.seed) if has_seeds else (row.episode.rpartition("#")[2],)
@@ -93,7 +93,7 @@ def _start_alike(new: JudgedEpisode, old: JudgedEpisode, conditions: Conditions,
 
 
 def _first_places(log: str, conditions: Conditions) -> Mapping[str, _Place]:
-    """Return the centre of each object in the first sample of a log; none if the log is unreadable."""
+    """Return the centre of each object in the first sample of a log. An unreadable log has no objects."""
     try:
         source, options = opened_task(Task(log, (), conditions), ())
         window = options.window

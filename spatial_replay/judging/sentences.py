@@ -1,4 +1,4 @@
-"""Lines on a judgement, for terminals."""
+"""Text of a judgement, for terminals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TITLES: Final[dict[Kind, str]] = {
     "undecided": "undecided",
 }
 _MOST: Final = 10
-"""Listed lines per kind."""
+"""Maximum number of lines for each kind."""
 _MOST_IN_LINE: Final = 5
 
 
@@ -54,7 +54,7 @@ def summary_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def _rates(name: str, judgement: Judgement) -> Iterator[tuple[str, Rate, str]]:
-    """Yield name, rate and end of line for each rate of a judgement."""
+    """Yield the name, the rate and the end of the line for each rate of a judgement."""
     yield name, judgement.rate, ""
     if unstored := judgement.agreement.unstored:
         yield "", judgement.rate_with_unstored, f"   if the {unstored:,} unstored count"
@@ -68,7 +68,7 @@ def _percents(rate: Rate) -> str:
 
 
 def difference_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield lines with undecided episodes and disagreements of label and verdict, with reasons."""
+    """Yield lines with undecided episodes, and with disagreements of label and verdict, with reasons."""
     for kind, title in _TITLES.items():
         rows = [row for row in judgement.rows if row.kind == kind]
         if rows:
@@ -76,7 +76,7 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
             yield f"{title} {len(rows):,}:"
             episodes_by_reason = defaultdict[tuple[str, str], list[str]](list)
             for row in rows:
-                # undecided episodes often share one reason, which is listed once
+                # undecided episodes with the same reason share a line
                 episodes_by_reason[_reason(row), "" if kind == "undecided" else row.episode].append(
                     row.episode
                 )
@@ -90,7 +90,7 @@ def difference_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def failure_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield a line per first failure: its name, its number of episodes, and the first of them."""
+    """Yield a line for each first failure: its name, the number of its episodes, and the first episodes."""
     episode_count = sum(map(len, judgement.failures.values()))
     yield f"first failures of the {plural(episode_count, 'episode')} that fail `{judgement.result}`"
     failure_names = {name: name or "another failure" for name in judgement.failures}
@@ -101,7 +101,7 @@ def failure_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def stage_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield a line per stage: the number of episodes that end there, and of failures by label among them."""
+    """Yield a line for each stage: the number of episodes with this final stage, and of labelled failures."""
     failed_rows = [row for row in judgement.rows if row.label is False]
     heading, end_heading = f"stages of `{judgement.result}`", "at the end"
     width = max(map(len, (*judgement.stages, heading)))

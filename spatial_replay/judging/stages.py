@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 SUBTASK: Final = "subtask_index"
 PROGRESS: Final = "judge.progress"
 LANGUAGE: Final = "language_persistent"
-"""Columns of frames with stages."""
+"""Columns with the stages of frames."""
 
 
 def episode_stages(
     judgement: Judgement, case: PreparedCase, progress: Progress = no_progress
 ) -> dict[str, Stages]:
-    """Return the stages of each episode that can be read, by the path of its log.
+    """Return the stages of each readable episode, by the path of its log.
 
     Args:
         case: the judged case.
@@ -67,7 +67,7 @@ def _stages(task: Task, specification: Specification, name: str) -> Stages:
 
 
 def with_stages(judgement: Judgement, stages: Mapping[str, Stages]) -> Judgement:
-    """Return a judgement whose rows have the stage and the progress at the end of each episode."""
+    """Return a judgement whose rows have the final stage and the final progress of each episode."""
     rows = tuple(_at_stage(row, stages.get(row.log)) for row in judgement.rows)
     end_stages = {row.stage for row in rows}
     names = tuple(name for name in stage_names(stages) if name in end_stages or name not in (LOST, UNKNOWN))
@@ -75,7 +75,7 @@ def with_stages(judgement: Judgement, stages: Mapping[str, Stages]) -> Judgement
 
 
 def stage_names(runs: Mapping[str, Stages]) -> tuple[str, ...]:
-    """Return the names of all stages of some episodes, the farthest from success first."""
+    """Return the names of all stages of these episodes, the farthest from success first."""
     return tuple(dict.fromkeys(stage.name for run in runs.values() for stage in run.stages))
 
 
@@ -86,11 +86,16 @@ def _at_stage(row: JudgedEpisode, stages: Stages | None) -> JudgedEpisode:
 
 
 def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Sequence[str]) -> pa.Table:
-    """Return a table of frames of a LeRobot data set with the stages of episodes.
+    """Return the frames of a LeRobot data set with the stages of their episodes.
 
     `subtask_index` is the index of the frame's stage in `names`, and `judge.progress` is its progress.
-    `language_persistent` has a row for each change of the stage, with the style `subtask`. Frames of other
-    episodes have -1, NaN and no rows, as have episodes whose numbers of frames and samples differ.
+    `language_persistent` has a row for each change of the stage, with the style `subtask`. These columns are
+    -1, NaN and empty for episodes without stages, or with unequal numbers of frames and samples.
+
+    Args:
+        table: frames of a LeRobot data set.
+        runs: stages by the index of the episode.
+        names: names of all stages.
     """
     import pyarrow as pa
 
@@ -119,7 +124,7 @@ def frames_with_stages(table: pa.Table, runs: Mapping[int, Stages], names: Seque
         # the types of lerobot's own annotations
         LANGUAGE: pa.array(language_rows, pa.list_(_row_type())),
     }
-    # the metadata describes the old columns only
+    # the metadata describes only the old columns
     table = table.drop_columns([name for name in columns if name in table.column_names])
     table = table.replace_schema_metadata(None)
     for name, column in columns.items():
@@ -146,7 +151,7 @@ def _row_type() -> pa.StructType:
 
 
 def annotate_frames(folder: Path, runs: Mapping[str, Stages], names: Sequence[str]) -> None:
-    """Write the stages of episodes into a LeRobot data set, whose files are replaced.
+    """Write the stages of episodes into a LeRobot data set. Its files of frames are replaced.
 
     Args:
         runs: stages by the address of the episode.

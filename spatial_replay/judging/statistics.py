@@ -15,23 +15,23 @@ if TYPE_CHECKING:
     from spatial_replay.geometry.arrays import Integers
 
 SIGNIFICANCE: Final = 0.05
-"""Largest p-value that decides between two sets of episodes."""
+"""Largest p-value of a decision between two sets of episodes."""
 EVIDENCE: Final = 1.0 / SIGNIFICANCE
-"""The least e-value that decides."""
+"""Least e-value of a decision."""
 _POWER: Final = 0.8
-"""Probability that a test with the estimated number of pairs decides."""
+"""Required probability of a decision with the estimated number of pairs."""
 _MOST_PAIRS: Final = 100_000
 
 
 class Interval(NamedTuple):
-    """Bounds of a rate."""
+    """Bounds of a rate, from 0 to 1."""
 
     low: float
     high: float
 
 
 class Rate(NamedTuple):
-    """Successes among episodes."""
+    """A success rate: numbers of successes and of episodes."""
 
     successes: int
     episodes: int
@@ -51,28 +51,27 @@ class Rate(NamedTuple):
 
 
 def mcnemar_p(won: int, lost: int) -> float:
-    """Return the p-value of McNemar's exact test, given the pairs in which only one side succeeds."""
+    """Return the p-value of McNemar's exact test. The arguments count pairs in which one side succeeds."""
     return float(_scipy().binomtest(won, won + lost).pvalue) if won + lost else 1.0
 
 
 def e_value(won: int, lost: int) -> float:
-    """Return the e-value for one side winning more often; it may be checked after every episode.
+    """Return the e-value for one side winning more often. It may be checked after every episode.
 
-    The e-value is the likelihood of a uniformly distributed chance of winning, divided by that of 1/2.
+    The e-value is a ratio of likelihoods: a uniformly distributed chance of winning against a chance of 1/2.
     """
     _scipy()
     from scipy.special import betaln
 
-    # in logarithms, because the power of 2 overflows from 1,024 pairs on
+    # computed with logarithms, because the power of 2 overflows from 1,024 pairs on
     return math.exp((won + lost) * math.log(2.0) + float(betaln(won + 1, lost + 1)))
 
 
 def more_pairs(won: int, lost: int, pairs: int) -> int | None:
-    """Return the number of further pairs for a significant difference with 80 % probability.
+    """Return the number of further pairs for a significant difference with a probability of 80 %.
 
-    The shares of won and lost pairs are assumed to stay the same.
-
-    None if neither side is ahead, or no number up to 100,000 suffices.
+    The shares of won and lost pairs are assumed constant. None if neither side is ahead, or if more than
+    100,000 pairs are needed.
     """
     if won == lost:
         return None
@@ -92,7 +91,7 @@ def more_pairs(won: int, lost: int, pairs: int) -> int | None:
 
 
 def _power(pair_count: int, won: int, lost: int, pairs: int) -> float:
-    """Return the probability that the exact test of `count` pairs decides."""
+    """Return the probability of a decision by the exact test of `pair_count` pairs."""
     binom = _scipy().binom
     differing_pairs = np.arange(pair_count + 1)
     weights = binom.pmf(differing_pairs, pair_count, (won + lost) / pairs)
@@ -107,9 +106,13 @@ def _power(pair_count: int, won: int, lost: int, pairs: int) -> float:
 
 
 def _critical(differing_pairs: Integers) -> Integers:
-    """Return the greatest number of wins of the losing side that still decides; -1 for none."""
+    """Return the losing side's greatest number of wins in a decided test; -1 if no number decides.
+
+    Args:
+        differing_pairs: (N,) numbers of pairs in which only one side succeeds.
+    """
     binom = _scipy().binom
-    # `ppf` is the least number whose cdf reaches the level, so it may be too large by 1
+    # `ppf` is the least number whose cdf reaches the level, and may be too large by 1
     limits = binom.ppf(SIGNIFICANCE / 2.0, differing_pairs, 0.5)
     is_above = binom.cdf(limits, differing_pairs, 0.5) > SIGNIFICANCE / 2.0
     return np.asarray(np.where(is_above, limits - 1, limits), int)
@@ -131,7 +134,7 @@ def wilcoxon(new: Sequence[float], old: Sequence[float]) -> SignedRank | None:
 
 
 def pass_hat_k(successes: int, runs: int, k: int) -> float:
-    """Return the estimated probability that `k` runs of one start all succeed."""
+    """Return the estimated probability that `k` runs with the same start all succeed."""
     return math.comb(successes, k) / math.comb(runs, k)
 
 

@@ -1,4 +1,4 @@
-"""Judgements as pages, as tables, and as labels in data sets for training."""
+"""Writers of judgements: pages, tables of labels, and labels in data sets for training."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _WORDS: Final = {True: "success", False: "failure", None: None}
 
 
 def labelled_batch(judgement: Judgement) -> BatchResult:
-    """Return the batch of a judgement with its labels. Disagreements are the failures of this batch."""
+    """Return the batch of a judgement with its labels. The failures of this batch are disagreements."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     table = judgement.batch.table
     if judgement.failure_file:
-        # a violated spec of this file is a failure that did not happen
+        # a spec of this file describes a failure: its violation is no failure of the episode
         table = table.filter(pc.not_equal(table["file"], judgement.failure_file))
     paths = {request.log.name: request.log.path for request in judgement.batch.requests}
     rows_by_log = {row.log: row for row in judgement.rows}
@@ -63,16 +63,16 @@ def _failure(row: JudgedEpisode, failure: str | None) -> str | None:
 
 
 def label_table(judgement: Judgement) -> pa.Table:
-    """Return a table of decided episodes for training and for comparing rates.
+    """Return a table of decided episodes, for training and for comparisons of rates.
 
-    `success` is true or false, and `policy_id` is the name of the data set. `task` and `seed` are left out if
-    the data set has none.
+    `success` is true or false, and `policy_id` is the name of the data set. Empty columns `task` and `seed`
+    are left out.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     table = _table_with_success(judgement)
-    # readers of CSV would take the names 0.10 and 0.1 for the same number
+    # readers of CSV would convert the names 0.10 and 0.1 to the same number
     policy_name = f"policy-{judgement.name}" if _is_number(judgement.name) else judgement.name
     episode_numbers = pa.array(_episode_numbers(judgement), pa.int64())
     policy_names = pa.array([policy_name] * len(table), pa.string())
@@ -110,7 +110,7 @@ def ending_of_labels(file: Path) -> str:
     """Return the ending of a file for labels.
 
     Raises:
-        UsageError: the ending is not that of a table.
+        UsageError: the ending is neither .parquet nor .csv.
     """
     ending = file.suffix.lower()
     if ending not in (".parquet", ".csv"):
@@ -139,7 +139,8 @@ def check_annotation(logs: Sequence[str], new: Path) -> Path:
     """Return the folder of the data set to copy.
 
     Raises:
-        UsageError: the copy exists, or the logs are no episodes of one LeRobot data set of version 3.
+        UsageError: the copy exists, its folder is missing, or the logs are not the episodes of one LeRobot
+            data set of version 3.
     """
     if new.exists() or new.is_symlink():
         raise UsageError(f"--annotate {new}: it exists; give a new name, since no data set is changed")
@@ -161,8 +162,11 @@ def annotate_data_set(
 ) -> None:
     """Copy a LeRobot data set, and add columns such as `judge/success` to its episodes.
 
-    If stages are given by the addresses of episodes, frames have them, see `frames_with_stages`. Files of
-    data and videos are links to the original, and the metadata is copied.
+    Files of data and videos are links to the original, and the metadata is copied.
+
+    Args:
+        new: folder of the copy.
+        stages: stages by the address of the episode, for the frames; see `frames_with_stages`.
 
     Raises:
         OutputError: the copy cannot be written; the partial copy is removed.
@@ -191,19 +195,19 @@ def annotate_data_set(
     except OSError as error:
         raise output_error(new, error) from error
     finally:
-        # after the rename, there is nothing to remove
+        # after the rename, the folder does not exist any more
         with suppress(OSError):
             shutil.rmtree(partial)
 
 
 def _with_labels(table: pa.Table, judgement: Judgement) -> pa.Table:
-    """Return a table of episodes with the columns of a judgement; null for episodes that are not judged."""
+    """Return a table of episodes with the columns of a judgement. Other episodes have null."""
     import pyarrow as pa
 
     rows_by_number = {number: row for row, number in enumerate(_episode_numbers(judgement))}
     row_indices = [rows_by_number.get(number) for number in table["episode_index"].to_pylist()]
     labels = _table_with_success(judgement).take(pa.array(row_indices, pa.int64()))
-    # columns of an earlier judgement are replaced, and the metadata describes the old columns only
+    # columns of an earlier judgement are replaced, and the metadata describes only the old columns
     column_names = [name for name in table.column_names if not name.startswith("judge/")]
     table = table.select(column_names).replace_schema_metadata(None)
     for name in ("success", "margin", "success_at", "tested", "reason"):
