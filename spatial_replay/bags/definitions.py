@@ -81,7 +81,7 @@ def full_type_name(name: str) -> str:
 def definitions_from_msg(text: str, type_name: str) -> Definitions:
     """Parse the types in a .msg text: the main type, then each used type after a line of equals signs.
 
-    Constants and default values are ignored, because messages do not depend on them.
+    Constants and default values are ignored, because messages do not depend on these values.
 
     Raises:
         LogError: a line is not a field, or a name is malformed.

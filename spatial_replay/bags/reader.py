@@ -41,7 +41,7 @@ class Message(NamedTuple):
 
     Attributes:
         log_time_ns: time of recording.
-        publish_time_ns: time of sending; the log time if the log does not store it.
+        publish_time_ns: time of sending; the log time if the log stores no time of sending.
         sequence: number of the message within its topic; 0 for a log without such numbers. Messages of one
             topic and time are ordered by this number.
         payload: message in the encoding of its topic.
@@ -192,7 +192,7 @@ def without_jumps(
         disorder_ns: largest disorder of recording that is allowed.
 
     Raises:
-        LogError: a message was recorded before a message of its topic that is earlier by more than
+        LogError: a topic's clock jumps: a message was recorded before a message that is earlier by more than
             `disorder_ns`.
     """
     first_ns: int | None = None

@@ -230,7 +230,7 @@ class BagChunk:
 
     Attributes:
         offset: offset of the chunk's record in the file.
-        counts: number of messages of each connection; None if only reading the chunk shows them.
+        counts: number of messages of each connection; None if only reading the chunk shows the numbers.
     """
 
     offset: int
@@ -534,7 +534,7 @@ class Ros1Bag(MessageReader):
     def _is_in_parts(self) -> bool:
         """Whether chunks do not overlap in time; such chunks are read by time, not by place in the file.
 
-        Bags are played by their index. Tools that merge or repair bags write chunks in any order.
+        Players read a bag by its index. Tools that merge or repair bags write chunks in any order.
         """
         sorted_chunks = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
         return all(before.end_ns <= after.start_ns for before, after in pairwise(sorted_chunks))
@@ -603,7 +603,7 @@ class Ros1Bag(MessageReader):
             name=connection.topic,
             type=full_type_name(connection.type),
             encoding="ros1",
-            # a scan counts only the readable chunks, so its count shows no loss
+            # a scan counts only the readable chunks, so the scan's count shows no loss
             count=count if self._directory.is_indexed else None,
             schema=Schema(connection.type, "ros1msg", definition),
             latched=connection.is_latched,

@@ -411,7 +411,7 @@ class SqliteBag(MessageReader):
     def _report_losses(
         self, damage: str, intact_rows: Sequence[RowHead], lost_spans: Collection[_Span]
     ) -> None:
-        """Report the lost rows of a damaged database, with the times of the messages around them."""
+        """Report the lost rows of a damaged database, with the times of the messages around these rows."""
         damage_text = f"{self.name}: the database is damaged ({damage})"
         spans = _joined_spans(lost_spans)
         if not spans:
@@ -447,7 +447,7 @@ class SqliteBag(MessageReader):
 
 @contextmanager
 def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open the database in a file, read-only; no other file is read, and no function in it is trusted.
+    """Open a database read-only; no other file is read, and no function in the database is trusted.
 
     Raises:
         LogError: the database cannot be opened.
@@ -463,7 +463,7 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(10**6, file_bytes))
             # texts of a damaged file may hold any bytes
             database.text_factory = lambda text: text.decode("utf-8", "replace")
-            # without this, SQLite refuses a truncated file; nothing is ever written
+            # without this setting, SQLite refuses a truncated file; nothing is ever written
             database.execute("PRAGMA writable_schema=ON")
             # as advised for untrusted files: https://www.sqlite.org/security.html
             database.execute("PRAGMA trusted_schema=OFF")
@@ -479,7 +479,7 @@ def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _bytes_missing(path: Path) -> tuple[int, int]:
-    """Return how many bytes are missing at a file's end, and the length of its complete pages, in bytes."""
+    """Return the number of missing bytes at a file's end, and the length of its complete pages, in bytes."""
     # https://www.sqlite.org/fileformat.html#the_database_header
     file_bytes = path.stat().st_size
     with path.open("rb") as stream:
@@ -497,7 +497,7 @@ def _bytes_missing(path: Path) -> tuple[int, int]:
 
 
 def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Topic], str | None]:
-    """Read the topics of a file by number, and the ROS release that wrote it.
+    """Read the topics of a file by number, and the ROS release that wrote the file.
 
     Raises:
         LogError: the file is not a bag.

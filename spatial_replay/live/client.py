@@ -141,7 +141,7 @@ class Client:
 
     Attributes:
         wants: function that returns whether to subscribe to a topic.
-        record: receiver of each message at its arrival, even if it is dropped before evaluation.
+        record: receiver of each message at its arrival, even of messages that are dropped before evaluation.
     """
 
     address: str

@@ -176,7 +176,8 @@ class LiveUpdate:
         sample: the objects and signals.
         changes: verdicts and signs that changed with this sample, each with its reason.
         notes: other events since the last update, such as a lost connection or a silent topic.
-        delay_s: time from the arrival of the message that completed the sample to its verdict, seconds.
+        delay_s: time from the arrival of the message that completed the sample to the sample's verdict,
+            seconds.
         dropped: number of samples that were dropped so far.
         updates: update of the monitor of each specification file.
     """
@@ -241,7 +242,7 @@ _SAMPLES_BEFORE_DOUBTS: Final = 100
 """Number of samples before a run is first compared with its mapping; each comparison doubles the number."""
 
 _USUAL: Final = 9
-"""Number of latest intervals between messages of a topic; their median is its usual interval."""
+"""Number of latest intervals between messages of a topic, whose median is the topic's usual interval."""
 
 _GRACE_TURNS: Final = 5
 """Maximum number of turns of the event loop in which arrived messages reach the inbox."""
@@ -416,7 +417,7 @@ class LiveSession:
         client = Client(self._address, self._wants, inbox, self._record)
         client_task = asyncio.create_task(client.run())
         client_task.add_done_callback(lambda _: inbox.filled.set())
-        # objects that are loaded by now stay, and scans of them for garbage would delay samples:
+        # objects that are loaded by now stay, and garbage collection of these objects would delay samples:
         # https://docs.python.org/3/library/gc.html#gc.freeze
         gc.freeze()
         try:
@@ -742,7 +743,7 @@ class LiveSession:
         turn_start_s = time.monotonic()
         last_ns = int(trace.times_ns[-1])
         for sample in trace.samples():
-            # the log must hold each evaluated sample; while it is full, the inbox drops messages
+            # the log must hold each evaluated sample; while the log is full, the inbox drops messages
             while not all(log.reserve() for log in self._logs):
                 await asyncio.sleep(_PAUSE_S)
             now_s = time.monotonic()
@@ -760,7 +761,7 @@ class LiveSession:
     def _relevant_samples(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
         """Return the samples of the run.
 
-        The run begins when all needed topics can be judged, and stops where it may have ended.
+        The run begins when all needed topics can be judged, and stops where the run may have ended.
         """
         self._members.add(trace)
         run_ends = self._ends
@@ -943,7 +944,7 @@ async def monitor(
 
 
 _GATHER_S: Final = 1 / 30
-"""Time in which samples are gathered before they are sent to viewers, seconds."""
+"""Time in which samples for viewers are gathered before they are sent, seconds."""
 
 _MOST_WAITING: Final = 4_096
 
@@ -983,7 +984,7 @@ class _ViewerLog(RecorderLog):
 
 
 class Viewing(SampleWriter):
-    """A writer that shows a run to viewers; a session gets it in its list of recorders."""
+    """A writer that shows a run to viewers; it is one of a session's recorders."""
 
     def __init__(self, files: Sequence[Specification], about: Mapping[str, str], server: RunServer) -> None:
         """Compile the specifications."""

@@ -72,7 +72,7 @@ class Nav2Tree:
     """Nodes of a Nav2 behaviour tree, from its log of status changes.
 
     The log names no parents. Nodes are sorted by `uid`, which Nav2 counts depth first. Older versions of Nav2
-    give no `uid`; their nodes are in the order of their first status change.
+    give no `uid`; then nodes are in the order of their first status change.
     """
 
     def __init__(self) -> None:

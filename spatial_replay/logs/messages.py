@@ -176,8 +176,8 @@ class Block:
 def merge(streams: Sequence[Messages]) -> Messages:
     """Merge messages by log time, channel and sequence.
 
-    Channel numbers are local to a log. Channels are ordered by their content, so the order of messages does
-    not depend on these numbers.
+    Channel numbers are local to a log. Channels are ordered by content, so the order of messages does not
+    depend on channel numbers.
     """
     joined = join(streams)
     return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))
@@ -185,7 +185,7 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
-    # by identity: a rank holds the whole schema, so it is computed only once for each channel
+    # by identity: a rank holds the whole schema, so the rank of a channel is computed only once
     channel_by_id = {id(channel): channel for stream in streams for channel in stream.channels.values()}
     channel_by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
     number_by_rank = {rank: number for number, rank in enumerate(sorted(channel_by_rank))}

@@ -1,7 +1,7 @@
 """Encode samples as messages of /spatial/objects and decode them, many at a time.
 
 Most messages of a log differ only in their numbers. So the protobuf library parses one message of a layout,
-and the numbers of all others are read or written at its offsets (see `wire`).
+and the numbers of the other messages are read or written at the layout's offsets (see `wire`).
 """
 
 from __future__ import annotations
@@ -199,7 +199,8 @@ def decode_objects(
 def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
     """Group the numbers of all messages by layout; invalid payloads go to `faults`.
 
-    If layouts serve too few messages, messages are split into their objects and signals, which share layouts.
+    If layouts serve too few messages, messages are split into objects and signals, because objects of many
+    messages share a layout.
     """
     whole_messages = _Pieces(np.arange(len(payloads), dtype=np.int64), payloads)
     groups, leftover_pieces = _group_by_layout(whole_messages, faults, SAMPLES_PER_LAYOUT)
@@ -518,7 +519,7 @@ def _row_layout(trace: Trace) -> Integers:
 
 
 def _message(trace: Trace, name_index: int, row: int, *, is_unreadable: bool) -> ObjectStates:
-    """Return the message of one observation, with all its numbers 0.
+    """Return the message of one observation, with 0 for every number.
 
     An unreadable observation gets orientation and height, because its orientation or its height is not
     finite.

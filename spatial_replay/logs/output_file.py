@@ -38,7 +38,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
         return
     # a symbolic link stays, and its target is replaced
     output = output.resolve()
-    # named before it is created, so that `finally` removes it after an interruption at any step
+    # named before the file is created, so that `finally` removes it after an interruption at any step
     partial_path = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
     try:
         with _writing(output):
@@ -49,7 +49,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
         with _writing(output):
             partial_path.replace(output)
     finally:
-        # the partial file is missing if it was not created or is renamed already
+        # a partial file that was not created, or was renamed, is missing
         with suppress(OSError):
             partial_path.unlink()
 
@@ -59,7 +59,7 @@ Durability: TypeAlias = Literal["process", "disk"]
 
 
 def open_output(output: Path, durability: Durability = "process", *, overwrite: bool = True) -> BinaryIO:
-    """Open a file to write in place. Failures to open, write or close it are OutputErrors.
+    """Open a file to write in place. Failures to open, write or close the file are OutputErrors.
 
     Args:
         durability: "disk" makes every flush wait until the disk has the data.

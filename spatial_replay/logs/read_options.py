@@ -57,7 +57,7 @@ class ReadOptions:
         rate: frames per second of annotations that count frames; 30 by default.
         lost: "drop" or "keep" annotations that are marked as lost.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
-            default, it points down in drone annotations, and up in all other files.
+            default, y points down in drone annotations, and up in all other files.
         max_lateness: largest lateness of messages in an external log, such as "2s"; "all" sorts the whole log
             in memory.
         max_gap: longest pause, such as "1s"; objects are unknown in longer pauses of samples or their topic.

@@ -149,7 +149,7 @@ def each_ahead(
         while pending_reads:
             yield pending_reads.popleft()[1].result()
     finally:
-        # garbage collection may close this generator while a thread starts, and a wait would then block it
+        # garbage collection may close this generator while a thread starts; a wait would block that thread
         threads.shutdown(wait=False, cancel_futures=True)
 
 
@@ -566,7 +566,7 @@ def open_store(scheme: str, bucket: str) -> Any:
 
 @lru_cache(maxsize=32)
 def _store(scheme: str, bucket: str, settings: tuple[tuple[str, str], ...]) -> Any:
-    """Return the store of a bucket; it reads the environment, so `settings` are only a cache key."""
+    """Return the store of a bucket; obstore reads the environment, so `settings` are only a cache key."""
     stores = obstore_library().store
     options: dict[str, Any] = {"client_options": _CLIENT, "retry_config": _RETRIES}
     open_bucket = {"s3": stores.S3Store, "gs": stores.GCSStore, "az": stores.AzureStore}.get(scheme)
@@ -672,10 +672,10 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
     versions, limit_bytes = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     downloads_folder = user_cache_folder("downloads")
-    # with the version, so that each version has its own copy
+    # a name with the version, so that each version has its own copy
     version_texts = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
     folder = downloads_folder / hashlib.sha256("\n".join(version_texts).encode()).hexdigest()[:32]
-    # without a strong tag, a copy may be outdated, so it is made again
+    # without a strong tag, a copy may be outdated, so the file is downloaded again
     if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
     ):

@@ -297,7 +297,7 @@ def read_blocks(
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     """Yield the blocks unchanged. From the third block on, a thread reads the next block in advance.
 
-    A short log has one or two blocks, and reading them takes less time than starting a thread.
+    A short log has one or two blocks, which are read in less time than a thread needs to start.
     """
     for _ in range(2):
         early_block = next(blocks, None)

@@ -190,7 +190,7 @@ def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
 
 def protobuf_channel(topic: str, message: type[Message]) -> Channel:
     """Return the channel of a topic of one protobuf type, with all descriptors that decoding needs."""
-    # imported here because readers do not need it
+    # imported here because readers do not need this module
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     descriptors = FileDescriptorSet()

@@ -393,7 +393,7 @@ class Session:
             self._requested.notify()
 
     def set_constants(self, values: Values) -> None:
-        """Set the values of constants. An error changes none of them.
+        """Set the values of constants. After an error, all constants are unchanged.
 
         Raises:
             UsageError: a constant does not exist, or its value has another type.
@@ -455,7 +455,7 @@ class Session:
     # -------------------------------------------------------------------------- called by the player
 
     def next_requests(self, patience_s: float, *, is_due: bool = False) -> PendingRequests:
-        """Wait for requests and return them.
+        """Wait for requests, and return the pending requests.
 
         Args:
             patience_s: longest wait in seconds while the log plays or work is due; otherwise without limit.
@@ -513,7 +513,7 @@ class Session:
             return constant_values(self.edited.constants)
 
     def pause(self) -> PlaybackState:
-        """Pause, unless a seek is pending, and return the state."""
+        """Pause unless a seek is pending; return the state."""
         with self._requested:
             now_s = self._pace.now()
             if self._pending.seek_ns is None:
@@ -576,8 +576,8 @@ class PlaybackThinning:
     """Drops messages above the rate limits, turn by turn, on the player's thread.
 
     Topics that the layout draws send at most `MOST_DRAWN_A_SECOND` messages per second of wall time, and
-    fewer than 60 in any one second. Other topics send the messages of `MOST_A_SECOND` samples per second.
-    The last message of each turn and all events are sent.
+    fewer than 60 in any one second. Other topics send the messages of at most `MOST_A_SECOND` samples per
+    second. The last message of each turn and all events are sent.
     """
 
     def __init__(self) -> None:
@@ -663,7 +663,7 @@ PERIOD_S: Final = 1 / 30
 """Time between two turns, seconds."""
 
 _CURVES_EVERY: Final = 60
-"""Turns between two messages with the curves; some viewers drop the curves while they open their panels."""
+"""Turns between two messages with the curves; some viewers drop the curves while their panels open."""
 
 _PLAYBACK_EVERY: Final = 15
 """Turns between two updates of the playback's parameters."""

@@ -760,7 +760,7 @@ class Serving:
         return self._session.edited
 
     def show_specifications(self, files: Sequence[Specification]) -> Evaluated:
-        """Evaluate saved specifications, show viewers the evaluation, and return it.
+        """Evaluate saved specifications, show the evaluation to viewers, and return it.
 
         A constant that a viewer changed keeps the viewer's value, unless its file changed, too. After an
         error, viewers keep the former evaluation and see the error.
@@ -794,7 +794,7 @@ def open_server(
     play: bool = False,
     origins: Sequence[str] = (),
 ) -> Iterator[Serving]:
-    """Serve a log to viewers, which play it and change the constants of its specifications.
+    """Serve a log to viewers. Viewers play the log and change the constants of its specifications.
 
     Args:
         evaluated: the evaluation to show first, with the constants of the files.

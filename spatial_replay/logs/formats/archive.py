@@ -190,7 +190,7 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
     """Read an array as (T,) or (T, W) float64.
 
     Raises:
-        LogError: the array holds no numbers, `row_count` refuses it, or it cannot be read.
+        LogError: the array holds no numbers, is refused by `row_count`, or cannot be read.
     """
     row_count(array)
     if width_of(array) == 0:
@@ -204,7 +204,7 @@ def numbers(array: Any, rows: slice = slice(None)) -> Floats:
 
 
 def row_count(array: Any) -> int:
-    """Return the number of rows of an array after checking that reading it is safe.
+    """Check that reading an array is safe; return the array's number of rows.
 
     Raises:
         LogError: the array is in another file, larger than its own file, or needs a missing filter.

@@ -503,7 +503,7 @@ def _center(element: Element) -> tuple[float, float]:
 
 
 def _refuse_unknown(element: Element, *names: str) -> None:
-    """Refuse children with other names, because they could move the outline."""
+    """Refuse children with other names, because such children could move the outline."""
     for child in element.children:
         if child.name not in names:
             children = ", ".join(f"<{name}>" for name in names)

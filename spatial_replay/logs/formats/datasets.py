@@ -52,7 +52,7 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
 
 
 def open_data_set(path: str | PathLike[str]) -> DataSet | None:
-    """Open the data set in a folder or a file; None if it is not a data set.
+    """Open the data set in a folder or a file; None for a path without a data set.
 
     The last four data sets are cached until their files change.
 

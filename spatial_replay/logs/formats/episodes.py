@@ -65,7 +65,7 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A body that the data set names, so that it needs no mapping.
+    """A body that the data set names, so that no mapping is needed.
 
     Attributes:
         positions: (T, 3) float64.
@@ -228,7 +228,7 @@ class DataSet:
             yield Run(episode, group, arrays, reading, label_name)
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[Any]:
-        """Open an episode as a context; its value is the `group` of `read`.
+        """Open an episode as a context; the context's value is the `group` of `read`.
 
         Raises:
             LogError: the episode cannot be read.

@@ -220,7 +220,7 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
     projections = FootprintBatch.concatenate(
         [_projection(geom, centres + rotations @ geom.position, rotations @ geom.rotation) for geom in geoms]
     )
-    # the rows are sorted by geom and state; they become sorted by state and geom
+    # the rows, which are sorted by geom and state, are sorted by state and geom
     state_order = np.arange(len(geoms) * state_count).reshape(len(geoms), state_count).T.reshape(-1)
     sorted_projections = projections.select(state_order)
     merged = replace(
@@ -538,7 +538,7 @@ def _strip(root: ElementTree.Element, folder: _Folder, directory: str) -> dict[s
 
 
 def _has_content(mesh: ElementTree.Element, folder: _Folder, directory: str, files: dict[str, bytes]) -> bool:
-    """Return whether a mesh has its vertices in the XML or in the folder; add its file to `files`."""
+    """Return whether a mesh has vertices in the XML or in the folder; add the mesh's file to `files`."""
     name = mesh.attrib.pop("file", None)
     if name is None:
         return "vertex" in mesh.attrib or "builtin" in mesh.attrib

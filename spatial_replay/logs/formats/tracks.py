@@ -34,7 +34,7 @@ LONGEST_LINE = 16 * 2**20
 """Longest line, bytes; a longer line is damage, or in a file of another kind."""
 
 MOST_BLANK_LINES = 10_000_000
-"""Maximum number of blank lines in a file; the lines after them are not read."""
+"""Maximum number of blank lines in a file; further lines are not read."""
 
 
 def open_text(path: Path) -> BinaryIO:

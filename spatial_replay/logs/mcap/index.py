@@ -66,9 +66,9 @@ class ChunkPlace(NamedTuple):
 
     Attributes:
         offset, length: place of the record with its head, bytes.
-        start_ns, end_ns: log times of its first and last message.
-        compressed: whether it is a chunk; False for messages outside chunks.
-        channels: channels of its messages, from the index; None if the index lists none.
+        start_ns, end_ns: log times of the first and the last message.
+        compressed: whether the place is a chunk; False for messages outside chunks.
+        channels: channels of the messages, from the index; None if the index lists no channels.
         has_checksum: whether the chunk must have a checksum, as in our own logs.
         size: decompressed size of a chunk, from the index or its head, bytes; 0 outside chunks.
     """
@@ -144,7 +144,7 @@ class Directory:
     """Places of records in a file, and its declarations outside chunks.
 
     Attributes:
-        header: header record; None if it cannot be read.
+        header: header record; None for an unreadable header.
         schemas, channels: declarations outside chunks, by number.
         chunks: places of chunks, in file order.
         attachments, metadata: offset and length of each record with its head, bytes.
@@ -311,7 +311,7 @@ def _check_complete(directory: Directory, data_end: int) -> None:
 
 
 class _Scan:
-    """A scan of the records of a file, which skips their contents.
+    """A scan of the records of a file, without the contents of the records.
 
     The records in an uncompressed chunk that breaks off are read as records outside chunks.
     """
@@ -349,7 +349,7 @@ class _Scan:
         return self._directory
 
     def _lose(self, position: int, next_chunk: ChunkPlace | None, damage: DamageError) -> None:
-        """Report the bytes from a position to the next chunk as lost, with the times around them."""
+        """Report the bytes from a position to the next chunk as lost, with the times around these bytes."""
         lost_bytes = max(0, (next_chunk.offset if next_chunk else self._end) - position)
         readable_ends_ns = [place.end_ns for place in (*self._directory.chunks, self._loose) if place]
         ends_before = [Instant(max(readable_ends_ns), 0)] if readable_ends_ns else []
@@ -418,7 +418,7 @@ class _Scan:
         """Count a record with a reserved opcode.
 
         Raises:
-            DamageError: no record follows it, or the bytes are a chunk with a damaged opcode.
+            DamageError: no record follows the record, or the bytes are a chunk with a damaged opcode.
         """
         self._stream.seek(next_position)
         head = self._stream.read(RECORD_HEAD.size)
@@ -437,7 +437,7 @@ class _Scan:
         self._directory.skipped += 1
 
     def _message(self, position: int, beginning: bytes, next_position: int) -> None:
-        """Add a message outside chunks to the place of the messages before it."""
+        """Add a message outside chunks to the place of the previous messages."""
         if len(beginning) < RECORD_HEAD.size + 22 or next_position - position < RECORD_HEAD.size + 22:
             raise DamageError("a message breaks off")
         time_ns = int.from_bytes(beginning[RECORD_HEAD.size + 6 : RECORD_HEAD.size + 14], "little")
@@ -528,7 +528,7 @@ def iter_metadata(
 
 
 def check_attachments(stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
-    """Report damaged attachments and metadata to `faults`, because copies of the log lose them."""
+    """Report damaged attachments and metadata to `faults`, because copies of the log lose these records."""
     for iter_records in (iter_attachments, iter_metadata):
         for _ in iter_records(stream, directory, faults, name):
             pass

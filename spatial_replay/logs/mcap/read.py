@@ -3,8 +3,8 @@
 The reader is our own for two reasons. The MCAP library fails 112 of the 416 files of the format's conformance
 suite. It gives up on truncated and unindexed files, which crashed recorders leave behind.
 
-Chunks may overlap in time. So they are read in the order of their start times, and a message is yielded only
-when no later chunk can hold an earlier message.
+Chunks may overlap in time. So chunks are read in the order of their start times, and a message is yielded
+only when no later chunk can hold an earlier message.
 """
 
 from __future__ import annotations
@@ -441,7 +441,7 @@ class McapSource(FileSource):
     def open_walk(
         self, renamed: Callable[[Channel], Channel] = lambda channel: channel
     ) -> Iterator[ChunkWalk]:
-        """Open the file for a walk over its chunks; its faults begin with the faults of the index."""
+        """Open the file for a walk over its chunks; the walk's faults begin with the faults of the index."""
         directory, faults = self._index
         with open_file(self.path) as stream:
             # a copy, because every walk reports the faults of the index again
@@ -617,7 +617,7 @@ class _BlockDecoder:
         )
         self._latest_ns = int(wanted_messages.log_time_ns[sample_places].max(initial=self._latest_ns))
         if len(valid_places) < len(sample_places):
-            # a copy must be readable, so it gets only the valid samples
+            # a copy must be readable, so a copy gets only the valid samples
             wanted_messages = select(wanted_messages, without(wanted_messages, sample_places, valid_places))
         self.any_sample = self.any_sample or len(trace) > 0
         new_faults = self._walk.faults.take()

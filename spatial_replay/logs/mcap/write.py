@@ -95,10 +95,10 @@ class _Lane:
 
     Attributes:
         is_own: whether the topics are ours; our messages resemble their predecessors.
-        records: records of its messages.
+        records: records of the messages.
         first_ns: time of the first message.
         size: size of all records, bytes.
-        began_s: clock time of its beginning, seconds.
+        began_s: clock time at which the chunk was opened, seconds.
     """
 
     is_own: bool
@@ -334,7 +334,7 @@ class LogWriter:
             begin = end
 
     def _write_part(self, messages: Messages, numbers: Integers, lanes: Integers) -> None:
-        """Add a part of messages; `numbers` (M,) are their channel numbers, `lanes` (M,) their lanes."""
+        """Add messages with their channel numbers in `numbers` (M,) and their lanes in `lanes` (M,)."""
         payloads = Payloads.of(messages.payloads)
         sizes = payloads.size + _HEAD_BYTES
         heads = np.zeros(len(messages), _HEAD)
