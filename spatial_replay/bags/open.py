@@ -268,7 +268,6 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _unpacked_files(self) -> Path:
-        """Temporary folder for decompressed files."""
         return temporary_folder(self)
 
     @cached_property

@@ -308,7 +308,6 @@ class MessageReader(ABC):
         return {rank: self._declared[number] for rank, number in enumerate(self._numbers.tolist())}
 
     def _channel_numbers(self, topics: Collection[str]) -> list[int]:
-        """Return the channel numbers that the log has for some topics."""
         return [number for number, channel in self._declared.items() if channel.topic in topics]
 
     def _make_columns(

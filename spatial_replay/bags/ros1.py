@@ -553,7 +553,6 @@ class Ros1Bag(MessageReader):
         first_ns: int,
         end_ns: int,
     ) -> MessageColumns:
-        """Read the messages of a chunk; report losses."""
         span = Sentence("messages between ", Instant(chunk.start_ns, 0), " and ", Instant(chunk.end_ns, 0))
         try:
             content = read_chunk(stream, chunk.offset)

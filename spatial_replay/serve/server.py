@@ -610,7 +610,6 @@ def _json_service(
     response: Mapping[str, Any],
     handle: Callable[[ServiceRequest], bytes],
 ) -> Service:
-    """Return a service with requests and responses in JSON."""
     request_schema, response_schema = (
         foxglove.MessageSchema(
             encoding="json",

@@ -578,7 +578,6 @@ def _occupied_states(occupancy: Element, report: ReportFault) -> Iterator[tuple[
 
 
 def _hull(parts: Sequence[OutlinePart]) -> OutlinePart:
-    """Return a convex outline around all parts."""
     # the hull of several parts is no polygon if one of the parts is a disc
     if len(parts) > 1 and any(part.radius for part in parts):
         x, y, radius = _around(parts)

@@ -183,7 +183,6 @@ class _LeRobot(DataSet):
         return row_ranges
 
     def _rows_of(self, file: Path) -> Mapping[int, _Rows]:
-        """Return the rows of each episode in a file."""
         if file not in self._rows:
             episode_numbers = _read_columns(file, {"episode_index"}).get("episode_index")
             if episode_numbers is None:
