@@ -158,7 +158,7 @@ _PIECE = 2**20
 _PACKED_PIECE = 2**12
 """Size of one read of compressed data, bytes; small, because one byte may decompress to 32,000 bytes."""
 _LEFT_FREE = 2**26
-"""Space that is left free on a disk, bytes, or a tenth of the free space if that is less."""
+"""Disk space that is left free, bytes; a tenth of the free space is enough if that is less."""
 
 
 def temporary_folder(owner: object) -> Path:
@@ -224,7 +224,7 @@ def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
 
 
 def _decompress(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
-    """Yield the decompressed pieces of a file, each with whether it completes a frame."""
+    """Yield the decompressed pieces of a file, and whether each piece completes a frame."""
     frame, unused_bytes = None, b""
     while piece := unused_bytes or source.read(_PACKED_PIECE):
         frame = frame or zstandard.ZstdDecompressor().decompressobj()

@@ -680,7 +680,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
         _has(folder / below / _name(file), file.version.size) for file in files
     ):
         with suppress(OSError):
-            # the time of the last use, see `_make_room`
+            # a folder's time is the time of its last use, see `_make_room`
             os.utime(folder)
         return folder / below
     if size > limit_bytes:
