@@ -100,9 +100,9 @@ def _explain(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, A
 def _write_constants(evaluated: Evaluated, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Write constants from viewers and from the request into the specification files."""
     new_values = {**evaluated.edited.given, **_constants_in(request, evaluated)}
-    changed_names = evaluated.loaded.write_constants(new_values)
+    written_values = evaluated.loaded.write_constants(new_values)
     return {
-        "written": _in_seconds(changed_names),
+        "written": _in_seconds(written_values),
         "constants": _constants_of(evaluated) | _in_seconds(new_values),
     }
 
