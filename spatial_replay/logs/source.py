@@ -167,7 +167,7 @@ class MemorySource(Source):
 
     @property
     def axes(self) -> Axes:
-        """`OUR_AXES` with the units of the trace."""
+        """Axes of our samples, `OUR_AXES`, with the units of the trace."""
         return Axes.of_units(self.trace.units)
 
     @classmethod

@@ -59,7 +59,7 @@ ORIGINAL_PREFIX = "/original"
 
 
 def copied_channel(channel: Channel) -> Channel:
-    """Return the channel in a copy for messages of another program; our topics get `ORIGINAL_PREFIX`."""
+    """Return a copy's channel for messages of another program; on our topics, it gets `ORIGINAL_PREFIX`."""
     is_ours = channel.topic == OBJECTS or channel.topic in DERIVED
     return replace(channel, topic=ORIGINAL_PREFIX + channel.topic) if is_ours else channel
 
@@ -116,7 +116,7 @@ ENDING = "spatial_replay_ending"
 """The metadata record at the end of a recording: number of samples, and how it ended."""
 
 TRIGGER = "spatial_replay_trigger"
-"""The metadata record of a clip: its trigger and time, and the requested and available time around it."""
+"""The metadata record of a clip: trigger and its time, and the requested and the available durations."""
 
 CERTIFICATE = "spatial_replay_certificate"
 """The last metadata record: hashes of inputs and results."""

@@ -1,4 +1,4 @@
-"""Many messages of one layout at once.
+"""Encode and decode many messages of one layout at once.
 
 Messages with equal fields, texts and list lengths have a common layout: in protobuf, their numbers of fixed
 width have equal offsets, the slots. One message, encoded by the protobuf library, is the template of its

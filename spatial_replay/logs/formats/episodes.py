@@ -394,7 +394,7 @@ def quaternion_order(quaternions: Iterable[Floats]) -> str | None:
     """Return the order of quaternions (T, 4) of mostly upright bodies; None for an ambiguous order.
 
     A turn about the vertical axis is (0, 0, s, c) as x y z w, and (c, 0, 0, s) as w x y z. (0, 0, 0, 1) is
-    upright in both orders: no turn as x y z w, half a turn as w x y z. So this quaternion is no evidence.
+    upright in both orders: no turn as x y z w, half a turn as w x y z. So (0, 0, 0, 1) is no evidence.
     """
     is_zero = np.abs(np.concatenate([np.empty((0, 4)), *quaternions])) < 0.01
     begins_with_zeros = is_zero[:, 0] & is_zero[:, 1]

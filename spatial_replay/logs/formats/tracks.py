@@ -317,7 +317,7 @@ def _check_keys(entry: dict[str, Any], keys: set[str], subject: str) -> None:
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
-    """Return whether a text can be encoded as UTF-8; lone surrogates, which JSON can spell, cannot."""
+    """Return whether a text has an encoding in UTF-8. JSON can spell lone surrogates, which have none."""
     return is_encodable(text) if text else empty
 
 
