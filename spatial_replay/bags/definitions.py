@@ -73,7 +73,7 @@ Definitions: TypeAlias = Mapping[str, tuple[Field, ...]]
 
 
 def full_type_name(name: str) -> str:
-    """Insert the middle part of a ROS type's name: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
+    """Insert `msg` into the name of a ROS type: geometry_msgs/Pose becomes geometry_msgs/msg/Pose."""
     name_parts = name.split("/")
     return "/".join([name_parts[0], "msg", name_parts[1]]) if len(name_parts) == 2 else name
 

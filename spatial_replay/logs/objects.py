@@ -142,7 +142,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
 
 
 SAMPLES_PER_LAYOUT = 32
-"""Least mean number of messages per layout; a layout costs as much as reading that many by pieces."""
+"""Least mean number of messages per layout; the setup of a layout takes as long as 32 messages by pieces."""
 FIRST_LAYOUTS = 16
 """Number of layouts that are set up even if they serve few messages."""
 
@@ -247,9 +247,9 @@ def _group_by_layout(pieces: _Pieces, faults: dict[int, str], worth: int) -> tup
 def _first_group(
     first_piece: _Pieces, rows: Bytes, faults: dict[int, str]
 ) -> tuple[_Group | None, NDArray[np.bool_]]:
-    """Return the group of rows (n, L) with the first row's layout, and (n,) whether each row is done.
+    """Return the group of rows (n, L) with the first row's layout, and a mask (n,) of finished rows.
 
-    If the first row is not a valid message, the group is None, and only the first row is done.
+    If the first row is not a valid message, the group is None, and only the first row is finished.
     """
     is_first_row = np.zeros(len(rows), np.bool_)
     is_first_row[0] = True

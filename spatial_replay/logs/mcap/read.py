@@ -378,7 +378,7 @@ class McapSource(FileSource):
             for messages in _blocks(walk, window_ns, self.is_wanted):
                 yield decoder.block(messages)
             if not isinstance(self.path, RemoteFile) or window_ns == (0, AFTER_ALL_NS):
-                # a window of a remote log is not worth downloading all attachments
+                # for a window of a remote log, a download of all attachments would cost too much
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             last_faults = walk.faults.take(last=True)
             first_fault = decoder.first_fault or next(iter(last_faults), None)
