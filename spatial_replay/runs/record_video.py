@@ -293,8 +293,7 @@ def record_cameras(
         offsets_ns: offset of each camera's time stamps; empty for no offsets.
         hold_ns: time for which a hidden object keeps its position, with growing uncertainty. None for the
             value of the tags file.
-        keep: form of the videos in the log; With None, each video is copied if possible,
-            else encoded.
+        keep: form of the videos in the log. With None, each video is copied if possible, else encoded.
         inputs: input files, which the output must not overwrite.
         begin: called with the time of the first sample.
         show: called with each change of a verdict.
