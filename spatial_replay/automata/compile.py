@@ -466,11 +466,11 @@ class _Progression:
         """Return the diagram that maps propositions to the state after the state `node`."""
         if node not in self._moves:
             chain = self._obligations.chain(self._diagrams[node].variable)
-            *cases, (_, remainder) = self._obligations.cases(chain, node)
-            result = self._after(remainder)
-            for count_limit, remainder in reversed(cases):
+            *cases, (_, function) = self._obligations.cases(chain, node)
+            result = self._after(function)
+            for count_limit, function in reversed(cases):
                 condition = self._read(chain.members[count_limit - 1])
-                result = self._diagrams.choose(condition, self._after(remainder), result)
+                result = self._diagrams.choose(condition, self._after(function), result)
             self._moves[node] = result
         return self._moves[node]
 

@@ -73,9 +73,9 @@ def asked_colours(
     for spec_requirements, spec in zip(requirements, specs, strict=True):
         if spec.numbers is None:
             continue
-        series = spec.numbers[:, :, None]
+        node_values = spec.numbers[:, :, None]
         for requirement in spec_requirements:
-            rank = _RANKS[Standing(int(requirement.standing(series, sample_indices)[0]))]
+            rank = _RANKS[Standing(int(requirement.standing(node_values, sample_indices)[0]))]
             for name in _members(requirement, sample):
                 worst_ranks[name] = max(worst_ranks.get(name, 0), rank)
     return {name: _COLOURS[worst_ranks.get(name, 0)] for name in sample.objects}
@@ -408,7 +408,7 @@ class _Picture:
     """Writer of one camera's messages, such as `/camera2/video`: picture, annotations, calibration, pose."""
 
     def __init__(self, number: int, camera: FrameSource, keep_mode: KeepVideo) -> None:
-        self._frame = "camera" if number == 1 else f"camera{number}"
+        self._frame_id = "camera" if number == 1 else f"camera{number}"
         self._video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
         self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
         self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
@@ -432,9 +432,9 @@ class _Picture:
         self._write_frame(log, view.frame)
         log.write_payload(self._annotations, time_ns, encode_annotations(view, sample, colours))
         if camera is not None and self._is_due(CAMERA_CALIBRATION, time_ns):
-            log.write_payload(self._calibration, time_ns, encode_calibration(time_ns, camera, self._frame))
+            log.write_payload(self._calibration, time_ns, encode_calibration(time_ns, camera, self._frame_id))
         if isinstance(view.plane, CameraPlane) and self._is_due(CAMERA_FRAMES, time_ns):
-            log.write_payload(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, self._frame))
+            log.write_payload(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, self._frame_id))
 
     def _write_frame(self, log: RunLog, frame: Frame) -> None:
         channel, data = self._copy_channel, frame.data
@@ -448,7 +448,7 @@ class _Picture:
         if channel is not None:
             log.write_payload(channel, frame.time_ns, data)
         elif data:
-            message = encode_video(frame.time_ns, data, self._frame)
+            message = encode_video(frame.time_ns, data, self._frame_id)
             log.write_payload(self._video, frame.time_ns, message)
 
     def _is_due(self, topic: str, time_ns: int) -> bool:

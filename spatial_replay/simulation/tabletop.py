@@ -209,10 +209,10 @@ class Tabletop:
         # the detection noise has a random stream of its own, so start poses do not depend on it
         scenario, generator = self._scenario, np.random.default_rng([seed, 0])
         for placement in scenario.placements:
-            dx, dy, turn = (generator.random(3) * 2 - 1).tolist()
+            x_share, y_share, yaw_share = (generator.random(3) * 2 - 1).tolist()
             body_height = placement.body.shape.height
-            x, y = placement.x + dx * scenario.scatter_m, placement.y + dy * scenario.scatter_m
-            yaw = placement.yaw + turn * scenario.scatter_rad
+            x, y = placement.x + x_share * scenario.scatter_m, placement.y + y_share * scenario.scatter_m
+            yaw = placement.yaw + yaw_share * scenario.scatter_rad
             if (start := self._starts.get(placement.body.name)) is not None:
                 x, y, yaw = start.x, start.y, yaw if start.turn is None else start.turn
             centre = (x, y, placement.bottom + body_height / 2 + 5e-4)
