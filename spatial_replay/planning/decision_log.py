@@ -62,7 +62,15 @@ from spatial_replay.planning.map_drawing import DEPTH, MapFrame, map_drawing, ma
 from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
-from spatial_replay.planning.targets import Ways, good_cells, least_room, room_cost, tried_cells, ways_of
+from spatial_replay.planning.targets import (
+    NOWHERE,
+    Ways,
+    good_cells,
+    least_room,
+    room_cost,
+    tried_cells,
+    ways_of,
+)
 from spatial_replay.text import json_number, plural, time_text
 from spatial_replay.trace.trace import Sample
 
@@ -201,6 +209,10 @@ def explain(
         ways: ways among which the candidate's target was chosen.
     """
     target = candidate.target
+    if candidate.rejected.startswith(NOWHERE):
+        limiting = layers.limiting.flat[candidate.map.robustness.argmax()]
+        demand = demand_of(layers.conjuncts[limiting], bans, is_required=layers.required[limiting])
+        message.rejected += f", and the best place is limited by {plain(demand)}"
     free_limits = layers.limiting[layers.blocked_by < 0]
     limit_counts = np.bincount(free_limits[free_limits >= 0], minlength=len(layers.conjuncts)).tolist()
     target_cell = None if target is None else candidate.map.cell_of(target.x, target.y, target.turn)
@@ -693,11 +705,7 @@ def _rival_texts(candidates: Sequence[PlanCandidate]) -> Iterator[str]:
     names_by_reason: dict[str, list[str]] = {}
     for candidate in candidates:
         if candidate.rejected:
-            limits = limiting_conjuncts(candidate)[:1]
-            limit_text = "".join(
-                f", mostly limited by {plain(demand_words(conjunct))}" for conjunct in limits
-            )
-            names_by_reason.setdefault(f"{candidate.rejected}{limit_text}", []).append(candidate.object)
+            names_by_reason.setdefault(candidate.rejected, []).append(candidate.object)
         else:
             yield f"{place_text(candidate.target)}, robustness {candidate.target.robustness:.4g}"
     yield from (f"{', '.join(objects)}: {reason}" for reason, objects in names_by_reason.items())

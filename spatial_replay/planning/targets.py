@@ -60,6 +60,8 @@ _SWEPT: Final = math.radians(10.0)
 Measured = Callable[[Grid, tuple[float, ...]], tuple[GradientMap, Floats]]
 """Function from a grid and orientations (yaws) to an object's map and its room."""
 
+NOWHERE: Final = "no place is good enough"
+"""Beginning of the reason if all places are below the margin."""
 _EQUAL: Final = 1e-9
 """Difference of robustness up to which cells count as equally robust."""
 
@@ -426,7 +428,7 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
             return size_text
         subject = gradient.made_of.then.about
         formulas = [subject.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
-        sentence = f"no place is good enough: {best_robustness:.4g} at best, {settings.margin:.4g} needed"
+        sentence = f"{NOWHERE}: {best_robustness:.4g} at best, {settings.margin:.4g} needed"
         return "; ".join([sentence, *seam_texts(formulas, subject.regions)])
     counts_by_reason = np.bincount(gradient.blocked[is_enough], minlength=len(REASONS))
     if counts_by_reason[FREE] and has_failed:

@@ -185,7 +185,7 @@ def test_one_decision_is_shown_in_five_lines(tmp_path):
     assert first == "  instead  path 0 -> 3: no object can do it"
     assert second.startswith("blue to (")
     assert third.startswith("green: no place is good enough: ")
-    assert third.endswith(" needed, mostly limited by red above blue")
+    assert third.endswith(" needed, and the best place is limited by red above blue")
     assert lines[4].startswith("  done at ")
     whole = call("info", log, "--decisions")
     assert whole[0] == "run.mcap: 3 decisions for 'push', 2 motions"
