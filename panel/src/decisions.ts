@@ -54,8 +54,9 @@ export class DecisionsView implements View {
   /** Fields of all cells are read once. */
   private readonly drawn = new WeakMap<GridMessage, DrawnMap | null>();
   private readonly mapsByTime = new Map<number, GridMessage[]>();
-  /** The objects of the newest scene. */
+  /** The objects of the newest scene, and its time. */
   private outlines: DrawnOutline[] = [];
+  private sceneTime = -Infinity;
   /** The obstacles of the planner's workspace. */
   private obstacles: DrawnOutline[] = [];
   /** Whether the reader has unfolded the candidates; it stays so for other decisions. */
@@ -93,6 +94,7 @@ export class DecisionsView implements View {
   take(topic: string, time: number, message: unknown, isOfRange: boolean): void {
     if (topic === SCENE) {
       this.outlines = outlinesOf(message as SceneMessage);
+      this.sceneTime = time;
       return;
     }
     if (topic === DRAWING) {
@@ -123,9 +125,16 @@ export class DecisionsView implements View {
     this.showList(ordered);
     this.list.show(cursor.time);
     let here: Decision | undefined;
-    for (const each of ordered) if (each.time <= cursor.time + 1e-9) here = each;
+    let end = Infinity;
+    for (const each of ordered) {
+      if (each.time <= cursor.time + 1e-9) here = each;
+      else end = Math.min(end, each.time);
+    }
     const maps = here ? this.mapsOf(here) : [];
-    const shown = here ? JSON.stringify([here.message.number ?? 0, Boolean(here.message.outcome), maps.length]) : "";
+    // after a jump, the scene arrives later than the decision
+    const isSceneOfDecision = here !== undefined && this.sceneTime >= here.time - 1e-9 && this.sceneTime < end - 1e-9;
+    const shown = here
+      ? JSON.stringify([here.message.number ?? 0, Boolean(here.message.outcome), maps.length, isSceneOfDecision]) : "";
     if (shown === this.shown) return;
     this.shown = shown;
     this.body.dataset.decision = here ? String(here.message.number ?? 0) : "";
@@ -159,7 +168,10 @@ export class DecisionsView implements View {
     this.listed = ordered.length;
     this.shown = "";
     this.list.fill(ordered.map((each) => each.time), ordered.map((each) => element("button", {
-      type: "button", class: "event", onclick: () => this.clock.seek(each.time),
+      type: "button", class: "event", onclick: () => {
+        this.clock.seek(each.time);
+        this.card.scrollIntoView();
+      },
     }, element("span", {}), element("time", {}, secondsText(each.time)),
     element("span", { class: "sentence" }, `${each.message.number ?? 0}: ${inShort(drawnOf(each, []))}`))));
   }

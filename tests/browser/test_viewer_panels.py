@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 import spatial_replay as sr
 from browser.ticked import write_ticked_log
-from browser.viewer_page import differences, write_viewer_page
+from browser.viewer_page import TOPICS, differences, write_viewer_page
 from spatial_replay.cli import run
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.planning import read_decisions
@@ -307,6 +307,33 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")
     expect(live.locator("canvas")).to_have_count(maps)
     expect(live.get_by_text("Done at")).to_have_count(0)
+
+
+def test_a_map_has_the_objects_of_a_scene_that_arrives_after_its_decision(
+    open_panel: Open, logs: Mapping[str, Path], tmp_path: Path
+) -> None:
+    write_viewer_page(logs["push"], tmp_path / "push.html", topics=(*TOPICS, "scene"))
+    page = open_panel("push", "decisions", logs={"push": tmp_path / "push.mcap"})
+    first, second, *_ = read_decisions(logs["push"]).decisions
+    drawing = page.locator(".card > figure canvas")
+    seek(page, second.time_ns)
+    expect(page.locator(".decision-title")).to_contain_text("Decision 1")
+    page.evaluate("viewer.drawn()")
+    expected = drawing.evaluate("canvas => canvas.toDataURL()")
+    seek(page, first.time_ns)
+    expect(page.locator(".decision-title")).to_contain_text("Decision 0")
+    sec, nsec = divmod(second.time_ns, 10**9)
+    page.evaluate(
+        """async time => {
+          viewer.render({currentFrame: [], currentTime: time, didSeek: true});
+          for (let frame = 0; frame < 5; frame++) await viewer.drawn();
+          viewer.render({currentFrame: viewer.frameAt(time), currentTime: time, didSeek: false});
+        }""",
+        {"sec": sec, "nsec": nsec},
+    )
+    page.wait_for_function(
+        "expected => document.querySelector('.card > figure canvas').toDataURL() === expected", arg=expected
+    )
 
 
 def test_the_behaviour_tree_has_the_statuses_of_the_cursor(open_panel: Open, tmp_path: Path) -> None:

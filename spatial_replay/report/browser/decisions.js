@@ -1,5 +1,7 @@
 // The decisions of a planner: candidates with their gradient maps, the choice, and its outcome.
 
+const MOST_REJECTIONS = 3;
+
 function makeDecisions(clock) {
   const place = body("decisions");
   if (!place) return;
@@ -45,7 +47,7 @@ function makeDecision(clock, decision) {
   const meant = chosenMap(decision);
   const later = decision.edges.flatMap((edge) => (edge.aim ? edge.later : []));
   const heading = element("div", {}, title, element("p", {}, reasonWords(decision)),
-    ...decision.edges.filter(({aim}) => aim).map(demandsOf),
+    ...decision.edges.filter(({aim}) => aim).flatMap((edge) => [demandsOf(edge), rejectionsOf(edge)]),
     later.length ? element("p", {}, `Planned next: ${minusWords(later.join(", then "))}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card", "data-decision": decision.number},
@@ -98,6 +100,13 @@ function demandsOf({wanted, rules}) {
   const row = (head, sentences) => (sentences.length ? element("p", {class: "demands"}, element("b", {}, head), ...sentences.flatMap(
     (words, index) => [index ? "; " : " ", ...withCode(words)])) : null);
   return element("div", {}, row(wanted.length > 1 ? "Wanted, one of" : "Wanted", wanted), row("On the way", rules));
+}
+
+// The objects that cannot do what an edge wants, with their reasons.
+function rejectionsOf({candidates}) {
+  const texts = candidates.filter(({status}) => status === "rejected").map(({object, rejected}) => `${object} (${minusWords(rejected)})`);
+  const more = texts.length > MOST_REJECTIONS ? ` and ${texts.length - MOST_REJECTIONS} more` : "";
+  return texts.length ? element("p", {}, element("b", {}, "Cannot do it"), ` ${texts.slice(0, MOST_REJECTIONS).join(", ")}${more}`) : null;
 }
 
 function makeEdge(clock, decision, edge, number) {

@@ -8,7 +8,7 @@ const MAP_COLOURS = MAP.map(rgb);
 const MAP_INK = "#24292f", MAP_GROUND = "#e4e4e4", MAP_HATCH = "#9a9a9a";
 const OBSTACLE_GREY = "rgb(110 110 110 / 0.6)", REGION_DASH = [6, 4];
 // Room in pixels for the axes, and for the scale and its numbers.
-const FRAME = {left: 42, right: 66, top: 8, bottom: 22};
+const FRAME = {left: 42, right: 72, top: 8, bottom: 22};
 const SCALE_WIDTH = 10;
 const NARROWEST = 300;
 
@@ -69,7 +69,7 @@ function whyThere(run, map, {margin}) {
     : ` The target lies between cells and has ${numberText(target)}; demands are those in the middle of its cell, which has ${numberText(inCell)}.`;
   return element("p", {class: "why"},
     `Why there? ${countText(enough)} of ${countText(values.length)} cells will do, ${higher ? countText(higher) : "none"} `
-    + `with a higher robustness than the target.${map.rule ? ` ${map.rule[0].toUpperCase()}${map.rule.slice(1)}.` : ""}${between}`);
+    + `with a higher robustness than the target.${map.rule ? ` ${map.rule[0].toUpperCase()}${minusWords(map.rule.slice(1))}.` : ""}${between}`);
 }
 
 function countText(count) {
@@ -147,14 +147,15 @@ function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target
     ...numbers.slice(0, map.target ? 2 : 1).map((number) => element("td", {class: number < 0 ? "number fails" : "number"},
       number === null ? "–" : numberText(number)))));
   (map.limits ?? []).forEach((words, index) => {
-    const layer = map.layers?.find(({number}) => number === index + 1);
-    const [isLimit, isLimitAtTarget] = [!cause && limit === index + 1, limitAtTarget === index + 1];
-    if (!layer && !isLimit && !isLimitAtTarget) return;
+    const here = layerValue(run, map, index + 1, place);
+    // in a blocked cell, only a demand that fails matters
+    const [isLimit, isLimitAtTarget] = [limit === index + 1 && !(cause && !(here < 0)), limitAtTarget === index + 1];
+    if (here === undefined && !isLimit && !isLimitAtTarget) return;
     const atTarget = map.at_target?.[index] ?? null;
     const limits = isLimit && isLimitAtTarget ? "limits here and at the target" : isLimit ? "limits"
       : isLimitAtTarget ? "limits at the target" : null;
     // without a layer, it is the same in all cells
-    add(withCode(words), limits, [layer ? run.numbers(layer.values)[place] : isLimit ? value : atTarget, atTarget]);
+    add(withCode(words), limits, [here ?? (isLimit ? value : atTarget), atTarget]);
   });
   if (!cause) {
     add(["all that has to hold"], null, [value, target]);
@@ -170,7 +171,7 @@ function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target
 
 function cellWords(run, map, decision, facts) {
   const {place, value, cause, limit, target, isAim} = facts;
-  if (cause) return ["Blocked: ", ...withCode(map.blocks[cause - 1] ?? ["something else"]), "."];
+  if (cause) return ["Blocked: ", ...withCode(map.blocks[cause - 1] ?? ["something else"]), ".", ...alsoFailing(run, map, facts)];
   if (Number.isNaN(value)) return ["Blocked, or not known."];
   const demand = withCode(map.limits?.[limit - 1] ?? ["what has to hold"]);
   const {margin} = decision;
@@ -183,10 +184,22 @@ function cellWords(run, map, decision, facts) {
   return [...demand, `${by}, and limits this cell. All that has to hold: ${here} in this cell, ${there} at the target. ${would}`];
 }
 
+// The demand that fails in a blocked cell, if one does.
+function alsoFailing(run, map, {place, limit}) {
+  const value = layerValue(run, map, limit, place);
+  return value < 0 ? [" ", ...withCode(map.limits[limit - 1]), ` fails there, too: short by ${numberText(-value)}${spaced(run.lengths)}.`] : [];
+}
+
+// The robustness of a demand in a cell; undefined if it is the same in all cells.
+function layerValue(run, map, number, place) {
+  const layer = map.layers?.find((other) => other.number === number);
+  return layer && run.numbers(layer.values)[place];
+}
+
 // Why the target is not in a cell that would do, by the rule that chose the target.
 function whyNotHere(run, map, {place, value, target, centre}) {
   const length = (number) => `${numberText(number)}${spaced(run.lengths)}`;
-  if (map.joint) return `That counts the other objects at their planned places; ${map.rule}.`;
+  if (map.joint) return `That counts the other objects at their planned places; ${minusWords(map.rule)}.`;
   if (map.way) {
     const way = run.numbers(map.way)[place];
     if (Number.isNaN(way)) return "No free way over cells leads there.";
@@ -257,7 +270,8 @@ function drawFigure(context, run, {map, layer, cell, decision}, width, height) {
     drawTarget(context, map.target.at, at, MAP_INK);
   }
   if (cell) drawCell(context, map, cell, at);
-  drawNames(context, [...of("object"), ...of("obstacle"), ...of("region")], at, [left, top, right, bottom]);
+  const objects = of("object").toSorted((one, other) => (other.name === map.object) - (one.name === map.object));
+  drawNames(context, [...objects, ...of("obstacle"), ...of("region")], at, [left, top, right, bottom]);
   context.restore();
   context.strokeStyle = colour("line");
   context.lineWidth = 1;
@@ -305,31 +319,59 @@ function movedOutline({rings}, {at: [x, y], turn, way}) {
   }))};
 }
 
-// Names at the upper right of outlines, in a region at its lower left; one that would cover another is left out.
-function drawNames(context, outlines, at, [left, top, right, bottom]) {
-  context.font = FONT;
+// Names of outlines, each at the first side where it covers neither an outline nor a name, else no name. One without
+// room is left out.
+function drawNames(context, outlines, at, frame) {
   context.textBaseline = "middle";
-  context.textAlign = "left";
-  const boxes = [];
-  for (const {kind, name, rings} of outlines) {
+  context.textAlign = "center";
+  const inFrame = outlines.map((outline) => ({...outline, box: boxOf(outline, at)})).filter(({box}) => meets(box, frame));
+  const outlineBoxes = inFrame.filter(({kind}) => kind !== "region").map(({box}) => box);
+  const nameBoxes = [];
+  for (const {kind, name, box} of inFrame) {
     context.font = kind === "region" ? `italic ${FONT}` : FONT;
-    const points = rings.flat();
-    const xs = points.filter((_, i) => i % 2 === 0).map(at.x), ys = points.filter((_, i) => i % 2).map(at.y);
-    if (Math.max(...xs) < left || Math.min(...xs) > right || Math.max(...ys) < top || Math.min(...ys) > bottom) continue;
-    const text = shortened(name, 24), width = context.measureText(text).width;
-    const [column, line] = kind === "region" ? [Math.min(...xs) + 4, Math.max(...ys) - 8] : [Math.max(...xs) + 3, Math.min(...ys) - 7];
-    const x = Math.max(Math.min(column, right - width - 2), left + 2);
-    const y = Math.min(Math.max(line, top + 8), bottom - 8);
-    const box = [x, y - 7, x + width, y + 7];
-    if (boxes.some((placed) => overlapOf(placed, box) > 0)) continue;
-    boxes.push(box);
+    const text = shortened(name, 24), half = context.measureText(text).width / 2 + 1;
+    const corner = kind === "region" ? [[Math.max(box[0], frame[0]) + 4 + half, Math.min(box[3], frame[3]) - HALF_LINE]] : [];
+    const places = [...corner, ...sidesOf(box, half)].filter((middle) => isWithin(boxAround(middle, half), frame));
+    const free = places.filter((middle) => !nameBoxes.some((other) => meets(boxAround(middle, half), other)));
+    const middle = free.find((place) => !outlineBoxes.some((other) => meets(boxAround(place, half), other))) ?? free[0];
+    if (!middle) continue;
+    nameBoxes.push(boxAround(middle, half));
     context.lineWidth = 3;
     context.lineJoin = "round";
     context.strokeStyle = "rgb(255 255 255 / 0.8)";
-    context.strokeText(text, x, y);
+    context.strokeText(text, ...middle);
     context.fillStyle = MAP_INK;
-    context.fillText(text, x, y);
+    context.fillText(text, ...middle);
   }
+}
+
+// The sides of an outline on which its name may stand, in the order in which they are tried.
+const SIDES = [[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]];
+const HALF_LINE = 8;
+
+// The middles of a name on each side of an outline's box.
+function sidesOf([left, top, right, bottom], half) {
+  return SIDES.map(([across, down]) => [
+    (left + right) / 2 + across * ((right - left) / 2 + half + 4), (top + bottom) / 2 + down * ((bottom - top) / 2 + HALF_LINE + 3),
+  ]);
+}
+
+function boxAround([x, y], half) {
+  return [x - half, y - HALF_LINE, x + half, y + HALF_LINE];
+}
+
+function boxOf({rings}, at) {
+  const points = rings.flat();
+  const xs = points.filter((_, index) => index % 2 === 0).map(at.x), ys = points.filter((_, index) => index % 2).map(at.y);
+  return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+}
+
+function meets(one, other) {
+  return one[0] < other[2] && other[0] < one[2] && one[1] < other[3] && other[1] < one[3];
+}
+
+function isWithin(box, frame) {
+  return box[0] >= frame[0] && box[1] >= frame[1] && box[2] <= frame[2] && box[3] <= frame[3];
 }
 
 function overlapOf([left, top, right, bottom], [l, t, r, b]) {
@@ -422,8 +464,10 @@ function drawScale(context, scale, margin, [left, top, bottom]) {
     const height = y(number), nearest = Math.min(Math.max(height, top + 5), bottom - 5);
     // a small margin is written above 0
     const row = number === margin && Math.abs(nearest - rows[0]) < 12 ? rows[0] - 12 : nearest;
+    context.fillStyle = MAP_INK;
+    context.fillRect(left, height - 0.5, SCALE_WIDTH, 1);
     context.fillStyle = number === margin ? colour("ink") : colour("quiet");
-    context.fillRect(left, height - 0.5, SCALE_WIDTH + 3, 1);
+    context.fillRect(left + SCALE_WIDTH, height - 0.5, 3, 1);
     if (rows.some((other) => Math.abs(other - row) < 12)) continue;
     rows.push(row);
     context.fillText(numberText(number), left + SCALE_WIDTH + 5, row);

@@ -177,10 +177,7 @@ function drawScene(context, clock, scene, layers, width, height) {
 // Draws an obstacle; returns its label.
 function obstacleLabel(context, {name, rings}, at) {
   drawObstacle(context, {rings}, at, colour("quiet"));
-  const points = rings.flat();
-  const xs = points.filter((_, index) => index % 2 === 0).map(at.x), ys = points.filter((_, index) => index % 2).map(at.y);
-  const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-  return {id: `obstacle/${name}`, text: name, box, isRegion: true};
+  return {id: `obstacle/${name}`, text: name, box: boxOf({rings}, at), isRegion: true};
 }
 
 // The objects that the chosen result was violated by, from then on.
@@ -287,36 +284,26 @@ function drawLabels(context, labels, width) {
   return taken;
 }
 
-const SIDES = [[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]];
-const HALF_LINE = 8;
-
 // Names of what an arrow is about, each at the first free side; like place_names of the annotated scene.
 function drawDeciding(context, labels, [x0, y0, x1, y1], at, [width, height]) {
   const xs = [at.x(x0), at.x(x1)], ys = [at.y(y0), at.y(y1)];
   const blocked = labels.filter(({isRegion}) => !isRegion).map(({box}) => box);
   blocked.push([Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]);
-  return labels.map(({text, box: [left, top, right, bottom], isRegion}) => {
+  return labels.map(({text, box, isRegion}) => {
     context.font = `${isRegion ? "italic " : "600 "}${FONT}`;
     const half = context.measureText(text).width / 2 + 2;
-    const places = SIDES.map(([across, down]) => [
-      (left + right) / 2 + across * ((right - left) / 2 + half + 4), (top + bottom) / 2 + down * ((bottom - top) / 2 + HALF_LINE + 3),
-    ]);
-    const above = Math.min(...blocked.map((box) => box[1])), below = Math.max(...blocked.map((box) => box[3]));
-    const middle = Math.min(Math.max((left + right) / 2, half), width - half);
+    const places = sidesOf(box, half);
+    const above = Math.min(...blocked.map((other) => other[1])), below = Math.max(...blocked.map((other) => other[3]));
+    const middle = Math.min(Math.max((box[0] + box[2]) / 2, half), width - half);
     places.push([middle, above - HALF_LINE - 3], [middle, below + HALF_LINE + 3]);
-    const boxes = places.map(([x, y]) => [x - half, y - HALF_LINE, x + half, y + HALF_LINE]);
+    const boxes = places.map((place) => boxAround(place, half));
     const isFree = (own) => !blocked.some((other) => meets(own, other));
-    const isInside = (own) => own[0] >= 0 && own[1] >= 0 && own[2] <= width && own[3] <= height;
-    const index = Math.max(boxes.findIndex((own) => isFree(own) && isInside(own)), 0);
+    const index = Math.max(boxes.findIndex((own) => isFree(own) && isWithin(own, [0, 0, width, height])), 0);
     const place = places[index];
     blocked.push(boxes[index]);
     outlined(context, text, ...place, colour(isRegion ? "quiet" : "ink"));
     return [place[0] - half, place[0] + half, place[1]];
   });
-}
-
-function meets(one, other) {
-  return one[0] < other[2] && other[0] < one[2] && one[1] < other[3] && other[1] < one[3];
 }
 
 // Whether a text around a place would cover one that is there.
