@@ -164,7 +164,7 @@ class PackedPlan(NamedTuple):
 
     @classmethod
     def of(cls, extent: PlanExtent, arrays: PlanArrays) -> PackedPlan:
-        places = extent._asdict() | {
+        fields = extent._asdict() | {
             "parts": len(arrays.region_radius),
             "corners": len(arrays.region_vertices) // 2,
             "operands": len(arrays.enlargement),
@@ -173,20 +173,20 @@ class PackedPlan(NamedTuple):
             "pairs": len(arrays.closest_enlargement),
             "groups": len(arrays.is_group),
         }
-        head = np.zeros(len(PlanPlaces._fields), np.int64)
-        whole, real = [head], [np.zeros(0)]
+        header = np.zeros(len(PlanPlaces._fields), np.int64)
+        integer_arrays, float_arrays = [header], [np.zeros(0)]
         for name, array in arrays._asdict().items():
-            column = whole if array.dtype == np.int64 else real
-            places[name] = sum(map(len, column))
-            places[f"{name}_end"] = places[name] + array.size
-            column.append(array.ravel())
-        head[:] = [places[name] for name in PlanPlaces._fields]
-        operands = places["operands"]
-        room = 3 * (places["geometric_count"] + places["yaw_count"]) + 4 * places["pairs"] + places["groups"]
-        room += 3 * operands + 2 + int(arrays.listed_start[operands])
+            joined_arrays = integer_arrays if array.dtype == np.int64 else float_arrays
+            fields[name] = sum(map(len, joined_arrays))
+            fields[f"{name}_end"] = fields[name] + array.size
+            joined_arrays.append(array.ravel())
+        header[:] = [fields[name] for name in PlanPlaces._fields]
+        operand_count = fields["operands"]
+        room = 3 * (fields["geometric_count"] + fields["yaw_count"]) + 4 * fields["pairs"] + fields["groups"]
+        room += 3 * operand_count + 2 + int(arrays.listed_start[operand_count])
         room += 6 * (extent.samples + extent.regions + extent.places) + 2
-        room += 2 * places["parts"] + 6 * places["corners"]
-        return cls(np.concatenate(whole), np.concatenate(real), room)
+        room += 2 * fields["parts"] + 6 * fields["corners"]
+        return cls(np.concatenate(integer_arrays), np.concatenate(float_arrays), room)
 
 
 class PlanPlaces(NamedTuple):
@@ -281,10 +281,10 @@ def _rows_at(plan: PlanPlaces, sample: Floats, begin: int) -> RowPlaces:
     rows = plan.samples + plan.regions + plan.places
     parts, corners, cursor = plan.parts, plan.corners, plan.samples + plan.signals + plan.coded
     for _ in range(plan.places):
-        number = max(int(sample[cursor + PARTS]), 0)
+        part_count = max(int(sample[cursor + PARTS]), 0)
         cursor += _OF_OBJECT
-        parts += number
-        for _ in range(number):
+        parts += part_count
+        for _ in range(part_count):
             vertex_count = int(sample[cursor])
             cursor += _OF_PART + 2 * vertex_count
             corners += vertex_count
@@ -314,42 +314,44 @@ def _fill_rows(
     """Copy the regions of a plan and the objects of a sample into rows."""
     samples, object_begin = plan.samples, plan.samples + plan.regions
     lists[rows.part_start] = lists[rows.vertex_start] = 0
-    for k in range(object_begin):
-        lists[rows.classes + k] = int(sample[k]) if k < samples else 0
-        parts = 0 if k < samples else whole[plan.region_parts + k - samples]
-        lists[rows.part_start + k + 1] = lists[rows.part_start + k] + parts
-        height = plan.region_heights + 2 * (k - samples)
-        sample[rows.bottom + k] = np.nan if k < samples else real[height]
-        sample[rows.top + k] = np.nan if k < samples else real[height + 1]
-        sample[rows.yaw + k], sample[rows.uncertainty + k] = np.nan, 0.0
-    for p in range(plan.parts):
-        lists[rows.vertex_start + p + 1] = lists[rows.vertex_start + p] + whole[plan.region_sizes + p]
-        sample[rows.radius + p] = real[plan.region_radius + p]
-    for k in range(2 * plan.corners):
-        sample[rows.vertices + k] = real[plan.region_vertices + k]
-    part, codes_at = plan.parts, samples + plan.signals
-    cursor = codes_at + plan.coded
+    for index in range(object_begin):
+        lists[rows.classes + index] = int(sample[index]) if index < samples else 0
+        region_part_count = 0 if index < samples else whole[plan.region_parts + index - samples]
+        lists[rows.part_start + index + 1] = lists[rows.part_start + index] + region_part_count
+        height_index = plan.region_heights + 2 * (index - samples)
+        sample[rows.bottom + index] = np.nan if index < samples else real[height_index]
+        sample[rows.top + index] = np.nan if index < samples else real[height_index + 1]
+        sample[rows.yaw + index], sample[rows.uncertainty + index] = np.nan, 0.0
+    for part_index in range(plan.parts):
+        lists[rows.vertex_start + part_index + 1] = (
+            lists[rows.vertex_start + part_index] + whole[plan.region_sizes + part_index]
+        )
+        sample[rows.radius + part_index] = real[plan.region_radius + part_index]
+    for index in range(2 * plan.corners):
+        sample[rows.vertices + index] = real[plan.region_vertices + index]
+    first_part, codes_begin = plan.parts, samples + plan.signals
+    cursor = codes_begin + plan.coded
     for row in range(object_begin, rows.rows):
-        number = max(int(sample[cursor + PARTS]), 0)
-        lists[rows.classes + row] = int(sample[codes_at + row - object_begin]) if plan.coded > 0 else 0
+        part_count = max(int(sample[cursor + PARTS]), 0)
+        lists[rows.classes + row] = int(sample[codes_begin + row - object_begin]) if plan.coded > 0 else 0
         if sample[cursor + PARTS] == 0.0:
             lists[rows.classes + row] = ABSENT
-        lists[rows.part_start + row + 1] = part + number
+        lists[rows.part_start + row + 1] = first_part + part_count
         sample[rows.bottom + row], sample[rows.top + row] = sample[cursor + BOTTOM], sample[cursor + TOP]
         sample[rows.yaw + row], sample[rows.uncertainty + row] = (
             sample[cursor + YAW],
             sample[cursor + UNCERTAINTY],
         )
         cursor += _OF_OBJECT
-        for p in range(part, part + number):
-            start, count = lists[rows.vertex_start + p], int(sample[cursor])
-            sample[rows.radius + p] = sample[cursor + 1]
+        for part_index in range(first_part, first_part + part_count):
+            first_vertex, vertex_count = lists[rows.vertex_start + part_index], int(sample[cursor])
+            sample[rows.radius + part_index] = sample[cursor + 1]
             cursor += _OF_PART
-            for k in range(2 * count):
-                sample[rows.vertices + 2 * start + k] = sample[cursor + k]
-            cursor += 2 * count
-            lists[rows.vertex_start + p + 1] = start + count
-        part += number
+            for index in range(2 * vertex_count):
+                sample[rows.vertices + 2 * first_vertex + index] = sample[cursor + index]
+            cursor += 2 * vertex_count
+            lists[rows.vertex_start + part_index + 1] = first_vertex + vertex_count
+        first_part += part_count
 
 
 @inlined
@@ -374,30 +376,30 @@ def _measure(
     Args:
         begin: begin of the work space for operands.
     """
-    operands, count = plan.operands, plan.geometric_count + plan.yaw_count
-    spreads, starts = values + count, plan.listed_start
-    of_operands, measured_at = begin, begin + operands + 1
-    widths = measured_at + plan.geometric_count
-    hidden, members = widths + operands, widths + 2 * operands + 1
-    sample[of_operands + operands], lists[hidden + operands] = (
+    operand_count, measurement_count = plan.operands, plan.geometric_count + plan.yaw_count
+    spreads, list_starts = values + measurement_count, plan.listed_start
+    operand_spreads, measured_begin = begin, begin + operand_count + 1
+    widths = measured_begin + plan.geometric_count
+    hidden, members = widths + operand_count, widths + 2 * operand_count + 1
+    sample[operand_spreads + operand_count], lists[hidden + operand_count] = (
         0.0,
         0,
     )  # entry of the missing second operand of a measurement
-    for operand in range(operands):
-        first, last = whole[starts + operand], whole[starts + operand + 1]
-        lists[widths + operand], lists[hidden + operand], spread = last - first, 0, 0.0
-        for k in range(first, last):
-            row, lists[members + k] = whole[plan.listed_rows + k], ABSENT
-            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + k]):
+    for operand in range(operand_count):
+        list_begin, list_end = whole[list_starts + operand], whole[list_starts + operand + 1]
+        lists[widths + operand], lists[hidden + operand], spread = list_end - list_begin, 0, 0.0
+        for index in range(list_begin, list_end):
+            row, lists[members + index] = whole[plan.listed_rows + index], ABSENT
+            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + index]):
                 continue
             if _is_hidden(plan, rows, lists, row):
                 lists[hidden + operand] = 1
             else:
-                lists[members + k] = row
+                lists[members + index] = row
                 spread = max(spread, sample[rows.uncertainty + row])
-        sample[of_operands + operand] = spread
+        sample[operand_spreads + operand] = spread
     # numba gives a literal 0 a type of its own, and would compile `measure_rows` once more for it
-    zero = min(operands, 0)
+    zero = min(operand_count, 0)
     measure_rows(
         lists[rows.part_start : rows.part_start + rows.rows + 1],
         lists[rows.vertex_start : rows.vertex_start + rows.parts + 1],
@@ -405,34 +407,45 @@ def _measure(
         sample[rows.radius : rows.vertices],
         sample[rows.bottom : rows.top],
         sample[rows.top : rows.yaw],
-        lists[members : members + whole[starts + operands]],
-        whole[starts : starts + operands + 1],
+        lists[members : members + whole[list_starts + operand_count]],
+        whole[list_starts : list_starts + operand_count + 1],
         lists[widths:hidden],
-        real[plan.enlargement : plan.enlargement + operands],
+        real[plan.enlargement : plan.enlargement + operand_count],
         whole[plan.quantity : plan.quantity + plan.geometric_count],
         whole[plan.first : plan.first + plan.geometric_count],
         whole[plan.second : plan.second + plan.geometric_count],
         sample[rows.edges : rows.classes].reshape((-1, 4)),
-        sample[measured_at:widths].reshape((-1, 1)),
+        sample[measured_begin:widths].reshape((-1, 1)),
         zero,
         zero + 1,
     )
-    for g in range(plan.geometric_count):
-        k, a, b = whole[plan.geometric + g], whole[plan.first + g], whole[plan.second + g]
-        a, b = (a, b if b >= 0 else operands)
-        is_hidden = lists[hidden + a] != 0 or lists[hidden + b] != 0
-        sample[values + k] = np.nan if is_hidden else sample[measured_at + g]
-        sample[spreads + k] = sample[of_operands + a] + sample[of_operands + b]
-    for y in range(plan.yaw_count):
-        at = plan.yaws + 3 * y
-        k, a, b = whole[at], whole[at + 1], whole[at + 2]
-        sample[values + k] = misalignment_of(sample[rows.yaw + a], sample[rows.yaw + b])
-        sample[spreads + k] = 0.0
-    required_starts = starts + operands + plan.pairs + plan.groups
-    for k in range(count):
-        for at in range(whole[required_starts + k], whole[required_starts + k + 1]):
-            if lists[rows.classes + whole[plan.listed_rows + at]] == ABSENT:
-                sample[values + k] = np.nan
+    for geometric_index in range(plan.geometric_count):
+        index, first_operand, second_operand = (
+            whole[plan.geometric + geometric_index],
+            whole[plan.first + geometric_index],
+            whole[plan.second + geometric_index],
+        )
+        first_operand, second_operand = (
+            first_operand,
+            second_operand if second_operand >= 0 else operand_count,
+        )
+        is_hidden = lists[hidden + first_operand] != 0 or lists[hidden + second_operand] != 0
+        sample[values + index] = np.nan if is_hidden else sample[measured_begin + geometric_index]
+        sample[spreads + index] = (
+            sample[operand_spreads + first_operand] + sample[operand_spreads + second_operand]
+        )
+    for yaw_index in range(plan.yaw_count):
+        entry = plan.yaws + 3 * yaw_index
+        index, first_operand, second_operand = whole[entry], whole[entry + 1], whole[entry + 2]
+        sample[values + index] = misalignment_of(
+            sample[rows.yaw + first_operand], sample[rows.yaw + second_operand]
+        )
+        sample[spreads + index] = 0.0
+    required_starts = list_starts + operand_count + plan.pairs + plan.groups
+    for index in range(measurement_count):
+        for entry in range(whole[required_starts + index], whole[required_starts + index + 1]):
+            if lists[rows.classes + whole[plan.listed_rows + entry]] == ABSENT:
+                sample[values + index] = np.nan
 
 
 @inlined
@@ -441,21 +454,21 @@ def _closest(
     closest: int,
 ) -> None:  # fmt: skip
     """Write the ends (K, 4) of the closest pairs at `closest`, as `leaf_values` computes them."""
-    nearest = np.empty((1, 3))
-    for k in range(plan.pairs):
-        start = plan.listed_start + plan.operands + k
-        begin, end = whole[start], whole[start + 1]
-        members = np.empty((1, end - begin), np.int64)
-        present = hidden = 0
-        for m in range(begin, end):
-            row, members[0, m - begin] = whole[plan.listed_rows + m], ABSENT
-            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + m]):
+    nearest_distances = np.empty((1, 3))
+    for pair in range(plan.pairs):
+        list_index = plan.listed_start + plan.operands + pair
+        begin, end = whole[list_index], whole[list_index + 1]
+        member_rows = np.empty((1, end - begin), np.int64)
+        present_count = hidden_count = 0
+        for index in range(begin, end):
+            row, member_rows[0, index - begin] = whole[plan.listed_rows + index], ABSENT
+            if not _is_there(lists, rows.classes, row, whole[plan.listed_classes + index]):
                 continue
-            present += 1
+            present_count += 1
             if _is_hidden(plan, rows, lists, row):
-                hidden += 1
+                hidden_count += 1
             else:
-                members[0, m - begin] = row
+                member_rows[0, index - begin] = row
         closest_rows(
             lists[rows.part_start : rows.part_start + rows.rows + 1],
             lists[rows.vertex_start : rows.vertex_start + rows.parts + 1],
@@ -463,30 +476,30 @@ def _closest(
             sample[rows.radius : rows.vertices],
             sample[rows.bottom : rows.top],
             sample[rows.top : rows.yaw],
-            members,
+            member_rows,
             sample[rows.uncertainty : rows.radius],
-            real[plan.closest_enlargement + k],
+            real[plan.closest_enlargement + pair],
             sample[rows.edges : rows.classes].reshape((-1, 4)),
-            nearest,
+            nearest_distances,
         )
-        pair_at = closest + 4 * k
-        sample[pair_at] = sample[pair_at + 1] = nearest[0, 0]
-        sample[pair_at + 2], sample[pair_at + 3] = nearest[0, 1], nearest[0, 2]
-        if hidden > 0 and present > 1:  # a hidden member may belong to the closest pair
-            sample[pair_at] = sample[pair_at + 2] = -np.inf
+        pair_begin = closest + 4 * pair
+        sample[pair_begin] = sample[pair_begin + 1] = nearest_distances[0, 0]
+        sample[pair_begin + 2], sample[pair_begin + 3] = nearest_distances[0, 1], nearest_distances[0, 2]
+        if hidden_count > 0 and present_count > 1:  # a hidden member may belong to the closest pair
+            sample[pair_begin] = sample[pair_begin + 2] = -np.inf
 
 
 @inlined
 def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, members: int) -> None:
     """Write at `members` whether all objects of each binding are members: 1, 0, or -1 if unknown."""
-    first = plan.listed_start + plan.operands + plan.pairs
-    for m in range(plan.groups):
-        is_group = whole[plan.is_group + m] != 0
-        lists[members + m] = 0 if is_group else 1
-        for k in range(whole[first + m], whole[first + m + 1]):
-            row, class_code = whole[plan.listed_rows + k], whole[plan.listed_classes + k]
+    first_list = plan.listed_start + plan.operands + plan.pairs
+    for binding in range(plan.groups):
+        is_group = whole[plan.is_group + binding] != 0
+        lists[members + binding] = 0 if is_group else 1
+        for index in range(whole[first_list + binding], whole[first_list + binding + 1]):
+            row, class_code = whole[plan.listed_rows + index], whole[plan.listed_classes + index]
             if not _is_there(lists, classes, row, class_code):
-                lists[members + m] = -1 if is_group else 0
+                lists[members + binding] = -1 if is_group else 0
 
 
 @inlined
@@ -494,27 +507,27 @@ def _channels_of(
     values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Integers, constants: Floats
 ) -> int:
     """Return the number of channels: 4 with an uncertain value, 2 with an unknown value, else 1."""
-    channels = 1
-    for k in range(len(constants)):
-        if -np.inf < constants[k] <= TEXTS:
-            channels = max(channels, 2)
-    for k in range(0, len(closest), 4):
-        if closest[k + 2] != closest[k] or closest[k + 3] != closest[k + 1]:
-            channels = 4
-        elif closest[k] != closest[k + 1]:
-            channels = max(channels, 2)
-    for k in range(len(values)):
-        if spreads[k] != 0.0:
-            channels = 4
-        elif not np.isfinite(values[k]):
-            channels = max(channels, 2)
-    for k in range(len(signals)):
-        if not np.isfinite(signals[k]) or signals[k] <= TEXTS:
-            channels = max(channels, 2)
-    for k in range(len(members)):
-        if members[k] < 0:
-            channels = max(channels, 2)
-    return channels
+    channel_count = 1
+    for index in range(len(constants)):
+        if -np.inf < constants[index] <= TEXTS:
+            channel_count = max(channel_count, 2)
+    for index in range(0, len(closest), 4):
+        if closest[index + 2] != closest[index] or closest[index + 3] != closest[index + 1]:
+            channel_count = 4
+        elif closest[index] != closest[index + 1]:
+            channel_count = max(channel_count, 2)
+    for index in range(len(values)):
+        if spreads[index] != 0.0:
+            channel_count = 4
+        elif not np.isfinite(values[index]):
+            channel_count = max(channel_count, 2)
+    for index in range(len(signals)):
+        if not np.isfinite(signals[index]) or signals[index] <= TEXTS:
+            channel_count = max(channel_count, 2)
+    for index in range(len(members)):
+        if members[index] < 0:
+            channel_count = max(channel_count, 2)
+    return channel_count
 
 
 @kernel
@@ -534,33 +547,33 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
     """
     # the work space holds floats and integers in one buffer
     plan, lists = plan_at(whole), sample.view(np.int64)
-    count = plan.geometric_count + plan.yaw_count
+    measurement_count = plan.geometric_count + plan.yaw_count
     # work space for results, operands and rows: allocating arrays would take as long as the distances
-    closest, members = end + 2 * count, end + 2 * count + 4 * plan.pairs
-    begin = members + plan.groups
-    if count + plan.groups + plan.pairs > 0:  # else there are only signals
-        operands = 3 * plan.operands + 2 + plan.geometric_count + whole[plan.listed_start + plan.operands]
-        rows = _rows_at(plan, sample, begin + operands)
+    closest_begin, members_begin = end + 2 * measurement_count, end + 2 * measurement_count + 4 * plan.pairs
+    work_begin = members_begin + plan.groups
+    if measurement_count + plan.groups + plan.pairs > 0:  # else there are only signals
+        operand_room = 3 * plan.operands + 2 + plan.geometric_count + whole[plan.listed_start + plan.operands]
+        rows = _rows_at(plan, sample, work_begin + operand_room)
         _fill_rows(plan, rows, whole, real, sample, lists)
-        _members(plan, rows.classes, whole, lists, members)
+        _members(plan, rows.classes, whole, lists, members_begin)
         if plan.pairs > 0:
-            _closest(plan, rows, whole, real, sample, lists, closest)
-        if count > 0:
-            _measure(plan, rows, whole, real, sample, lists, end, begin)
-    values, spreads = sample[end : end + count], sample[end + count : closest]
+            _closest(plan, rows, whole, real, sample, lists, closest_begin)
+        if measurement_count > 0:
+            _measure(plan, rows, whole, real, sample, lists, end, work_begin)
+    values, spreads = sample[end : end + measurement_count], sample[end + measurement_count : closest_begin]
     signals = sample[plan.samples : plan.samples + plan.signals]
-    of_pairs, of_members, constants = (
-        sample[closest:members],
-        lists[members:begin],
+    pair_ends, memberships, constants = (
+        sample[closest_begin:members_begin],
+        lists[members_begin:work_begin],
         real[plan.constants : plan.constants_end],
     )
-    channels = _channels_of(values, spreads, signals, of_pairs, of_members, constants)
-    zero = min(count, 0)  # as in `_measure`
+    channel_count = _channels_of(values, spreads, signals, pair_ends, memberships, constants)
+    zero = min(measurement_count, 0)  # as in `_measure`
     run_instructions(
-        whole[plan.code : plan.code_end], constants, values, spreads, signals, of_pairs, of_members,
-        whole[plan.outputs : plan.outputs_end], leaves[:channels], zero, zero + 1,
+        whole[plan.code : plan.code_end], constants, values, spreads, signals, pair_ends, memberships,
+        whole[plan.outputs : plan.outputs_end], leaves[:channel_count], zero, zero + 1,
     )  # fmt: skip
-    return channels
+    return channel_count
 
 
 class SampleRoom:
@@ -572,34 +585,40 @@ class SampleRoom:
         channels: number of channels in use; 0 before the leaves are measured.
     """
 
-    __slots__ = ("_bytes", "_length", "_numbers", "_plan", "arguments", "channels", "leaves")
+    __slots__ = ("_bytes", "_numbers", "_objects_length", "_plan", "arguments", "channels", "leaves")
 
     def __init__(self, leaves: int) -> None:
         self.leaves, self.channels = np.empty((MOST_CHANNELS, leaves, 1)), 0
         self.arguments: tuple[Integers, Floats, Floats, int, Floats]
         self._plan: PackedPlan | None = None
-        self._length = -1
+        self._objects_length = -1
         self._bytes, self._numbers = bytearray(), np.empty(0)
 
     def fill(self, plan: PackedPlan, layout: Struct, numbers: Sequence[float], objects: list[bytes]) -> None:
         """Store the next sample: its plan, its numbers, and the packed objects of its places."""
-        packed = b"".join(objects)
-        if plan is not self._plan or len(packed) != self._length:
-            self._fit(plan, layout.size, len(packed))
+        packed_objects = b"".join(objects)
+        if plan is not self._plan or len(packed_objects) != self._objects_length:
+            self._fit(plan, layout.size, len(packed_objects))
         layout.pack_into(self._bytes, 0, *numbers)
-        if packed:
-            self._bytes[layout.size : layout.size + len(packed)] = packed
+        if packed_objects:
+            self._bytes[layout.size : layout.size + len(packed_objects)] = packed_objects
         self.channels = 0
 
-    def _fit(self, plan: PackedPlan, begin: int, length: int) -> None:
+    def _fit(self, plan: PackedPlan, objects_begin: int, objects_length: int) -> None:
         """Make room for packed objects of the given length in bytes."""
-        self._plan, self._length = plan, length
-        size = begin + 4 * length + 8 * plan.room
+        self._plan, self._objects_length = plan, objects_length
+        size = objects_begin + 4 * objects_length + 8 * plan.room
         if size > len(self._bytes):
             # doubled, because numbers of objects and vertices change from sample to sample
             self._bytes = bytearray(2 * size)
             self._numbers = np.frombuffer(self._bytes)
-        self.arguments = plan.whole, plan.real, self._numbers, (begin + length) // 8, self.leaves
+        self.arguments = (
+            plan.whole,
+            plan.real,
+            self._numbers,
+            (objects_begin + objects_length) // 8,
+            self.leaves,
+        )
 
     def measure(self) -> Floats:
         """Return the leaves of the sample, (C, A, 1)."""
@@ -660,54 +679,59 @@ class PlanRows:
     def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
         self._frame = frame
         self._members = members
-        self._sample = {delay: number for number, delay in enumerate(frame.delays)}
-        self._region = {name: len(self._sample) + number for number, name in enumerate(frame.regions)}
+        self._row_of_sample = {delay: number for number, delay in enumerate(frame.delays)}
+        self._row_of_region = {
+            name: len(self._row_of_sample) + number for number, name in enumerate(frame.regions)
+        }
         self.places: dict[Place, int] = {}
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         base = open_group(group)
         class_code = self._required_class(base)
-        fitting = {name for name, code in self._members if class_code in (ANY, code)}
-        return tuple(sorted(fitting - left_out_of(base)))
+        fitting_names = {name for name, code in self._members if class_code in (ANY, code)}
+        return tuple(sorted(fitting_names - left_out_of(base)))
 
     def may_be_unknown(self, group: Group | Earlier) -> bool:
         return isinstance(group, Earlier)
 
     def of_membership(self, membership: Membership) -> list[Row]:
-        sample = self._sample_of(membership.group)
+        sample_row = self._sample_of(membership.group)
         if not membership.candidates:
-            return [Row(sample)]
-        names, class_code = (
+            return [Row(sample_row)]
+        candidate_names, class_code = (
             self.candidates(membership.group),
             self._required_class(open_group(membership.group)),
         )
-        return [Row(self._place(sample, names[candidate]), class_code) for candidate in membership.candidates]
+        return [
+            Row(self._place(sample_row, candidate_names[candidate]), class_code)
+            for candidate in membership.candidates
+        ]
 
     def of_term(self, term: Term) -> list[Row]:
         """Return the rows whose union is the term."""
         is_point, term = is_centre(term), standing(term)
         base = term.term if isinstance(term, Earlier) else term
         rate = term.rate if isinstance(term, Earlier) else ()
-        place = partial(self._place, self._sample_of(term), is_centre=is_point, rate=rate)
+        place_row = partial(self._place, self._sample_of(term), is_centre=is_point, rate=rate)
         if isinstance(base, RegionName):
-            return [Row(self._region[Centre(base) if is_point else base])]
+            return [Row(self._row_of_region[Centre(base) if is_point else base])]
         if not isinstance(base, Group):
-            return [Row(place(base.name))]
+            return [Row(place_row(base.name))]
         if base.members is None:
             class_code = self._required_class(base)
-            return [Row(place(name), class_code) for name in self.candidates(base)]
-        return [Row(place(name)) for name in named_members(base)]
+            return [Row(place_row(name), class_code) for name in self.candidates(base)]
+        return [Row(place_row(name)) for name in named_members(base)]
 
     def required_rows(self, term: Term) -> list[Row]:
         """Return the rows without which a term is unknown, with the row of its sample."""
         current_term, base = standing(term), base_of(term)
-        sample = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
+        sample_rows = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
-            return sample
-        return sample + self.of_term(term)
+            return sample_rows
+        return sample_rows + self.of_term(term)
 
     def _sample_of(self, term: Term) -> int:
-        return self._sample[Delay.of(term) if isinstance(term, Earlier) else NO_DELAY]
+        return self._row_of_sample[Delay.of(term) if isinstance(term, Earlier) else NO_DELAY]
 
     def _required_class(self, group: Group) -> int:
         if group.class_name == ANY_CLASS:
@@ -715,8 +739,8 @@ class PlanRows:
         return self._frame.classes[(group.class_name or "").casefold()]
 
     def _place(self, sample: int, name: str, *, is_centre: bool = False, rate: tuple[Term, ...] = ()) -> int:
-        first = len(self._sample) + len(self._region)
-        return self.places.setdefault(Place(sample, name, is_centre, rate), first + len(self.places))
+        first_row = len(self._row_of_sample) + len(self._row_of_region)
+        return self.places.setdefault(Place(sample, name, is_centre, rate), first_row + len(self.places))
 
 
 class LeafPlan:
@@ -747,21 +771,24 @@ class LeafPlan:
         )
         self.packed = PackedPlan.of(extent, arrays)
         self.placeholders = placeholders
-        terms = [place.rate for place in rows.places]
-        terms += [signal.terms for signal in code.signals if isinstance(signal, ReportStep)]
-        self._rates: tuple[tuple[Term, ...], ...] = tuple(filter(None, dict.fromkeys(terms)))
-        numbers = {rate: number for number, rate in enumerate(self._rates)}
-        self._places = tuple((*place[:3], numbers.get(place.rate)) for place in rows.places)
-        steps = (
-            numbers.get(signal.terms) if isinstance(signal, ReportStep) else None for signal in code.signals
+        rate_terms = [place.rate for place in rows.places]
+        rate_terms += [signal.terms for signal in code.signals if isinstance(signal, ReportStep)]
+        self._rates: tuple[tuple[Term, ...], ...] = tuple(filter(None, dict.fromkeys(rate_terms)))
+        number_of_rate = {rate: number for number, rate in enumerate(self._rates)}
+        self._places = tuple((*place[:3], number_of_rate.get(place.rate)) for place in rows.places)
+        step_numbers = (
+            number_of_rate.get(signal.terms) if isinstance(signal, ReportStep) else None
+            for signal in code.signals
         )
         self._signals = tuple(
-            (signal.name if type(signal) is Signal else None, signal, step)
-            for signal, step in zip(code.signals, steps, strict=True)
+            (signal.name if type(signal) is Signal else None, signal, step_number)
+            for signal, step_number in zip(code.signals, step_numbers, strict=True)
         )
         self._has_classes = bool(frame.classes)
-        count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
-        self._layout = Struct(f"={count}d")
+        number_count = (
+            len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
+        )
+        self._layout = Struct(f"={number_count}d")
 
     def fill(
         self,
@@ -780,49 +807,53 @@ class LeafPlan:
             code_of: returns the code of a class.
             reports: reports of the newest sample.
         """
-        newest: Any = samples[0]
+        newest_sample: Any = samples[0]
         numbers = [0.0]
         if len(samples) > 1:
             numbers = [0.0 if sample else ABSENT for sample in samples]
-        steps = [_step(rate, newest, reports, stands_for) for rate in self._rates] if self._rates else []
+        step_seconds = (
+            [_step(rate, newest_sample, reports, stands_for) for rate in self._rates] if self._rates else []
+        )
         for plain_name, signal, rate in self._signals:
             if plain_name is not None:
-                numbers.append(newest.signals.get(plain_name, nan))
+                numbers.append(newest_sample.signals.get(plain_name, nan))
             elif rate is not None:
-                numbers.append(steps[rate])
+                numbers.append(step_seconds[rate])
             elif isinstance(signal, Present):
                 name = stands_for.get(signal.term.name, signal.term.name)
-                numbers.append(name in newest.objects or name in newest.unknown)
+                numbers.append(name in newest_sample.objects or name in newest_sample.unknown)
             else:
-                numbers.append(_signal(signal, newest, reports))
-        packed: list[bytes] = []
+                numbers.append(_signal(signal, newest_sample, reports))
+        packed_objects: list[bytes] = []
         if not self._places:
-            room.fill(self.packed, self._layout, numbers, packed)
+            room.fill(self.packed, self._layout, numbers, packed_objects)
             return
-        lookups = [newest.objects.get]
+        lookups = [newest_sample.objects.get]
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
-        for place, name, is_point, rate in self._places:
+        for sample_index, name, is_point, rate in self._places:
             name = stands_for.get(name, name) if stands_for else name
-            tracked: Any = lookups[place](name)
+            tracked: Any = lookups[sample_index](name)
             if rate is not None and tracked is not None:
                 class_name = tracked.class_name
-                tracked = reports.moved_back(name, newest, steps[rate])
+                tracked = reports.moved_back(name, newest_sample, step_seconds[rate])
                 if tracked is None:
-                    packed.append(_HIDDEN)
+                    packed_objects.append(_HIDDEN)
                     if self._has_classes:
                         numbers.append(code_of(class_name))
                     continue
             if tracked is not None:
-                packed += reports.packed_centre(name, tracked) if is_point else tracked.packed
+                packed_objects += reports.packed_centre(name, tracked) if is_point else tracked.packed
                 if self._has_classes:
                     numbers.append(code_of(tracked.class_name))
                 continue
-            unknown: Any = _NOTHING if samples[place] is None else cast(Sample, samples[place]).unknown
-            packed.append(_HIDDEN if name in unknown else _NOT_THERE)
+            unknown_classes: Any = (
+                _NOTHING if samples[sample_index] is None else cast(Sample, samples[sample_index]).unknown
+            )
+            packed_objects.append(_HIDDEN if name in unknown_classes else _NOT_THERE)
             if self._has_classes:
-                numbers.append(code_of(unknown[name]) if name in unknown else 0.0)
-        room.fill(self.packed, self._layout, numbers, packed)
+                numbers.append(code_of(unknown_classes[name]) if name in unknown_classes else 0.0)
+        room.fill(self.packed, self._layout, numbers, packed_objects)
 
 
 def _signal(signal: Signal, sample: Sample, reports: RecentReports) -> float:
@@ -854,21 +885,21 @@ _NOT_THERE, _HIDDEN = (Struct("=5d").pack(parts, nan, nan, nan, 0.0) for parts i
 
 def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
     measurements = list(code.measurements)
-    operands: dict[Term, int] = {}
-    geometric = [
+    operand_of_term: dict[Term, int] = {}
+    geometric_numbers = [
         number for number, measurement in enumerate(measurements) if not measurement.needs_orientation
     ]
-    pairs = [
-        [operands.setdefault(term, len(operands)) for term in measurements[number].terms]
-        for number in geometric
+    operand_pairs = [
+        [operand_of_term.setdefault(term, len(operand_of_term)) for term in measurements[number].terms]
+        for number in geometric_numbers
     ]
-    yaws = [
+    yaw_rows = [
         [number, *(rows.of_term(term)[0].row for term in measurement.terms)]
         for number, measurement in enumerate(measurements)
         if measurement.needs_orientation
     ]
-    row_lists = [rows.of_term(term) for term in operands]
-    row_lists += [rows.of_term(pair.group) for pair in code.closest]
+    row_lists = [rows.of_term(term) for term in operand_of_term]
+    row_lists += [rows.of_term(operand_pair.group) for operand_pair in code.closest]
     row_lists += [rows.of_membership(membership) for membership in code.members]
     row_lists += [
         [row for term in measurement.terms for row in rows.required_rows(term)]
@@ -887,13 +918,13 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         listed_start=starts_from_counts(list(map(len, row_lists))),
         listed_rows=_whole(row.row for row_list in row_lists for row in row_list),
         listed_classes=_whole(row.class_code for row_list in row_lists for row in row_list),
-        enlargement=np.array([_enlargement(term) for term in operands], np.float64),
-        geometric=_whole(geometric),
-        quantity=_whole(QUANTITY_CODES[measurements[number].quantity] for number in geometric),
-        first=_whole(pair[0] for pair in pairs),
-        second=_whole(pair[1] if len(pair) > 1 else ABSENT for pair in pairs),
-        yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),
-        closest_enlargement=np.array([pair.enlargement for pair in code.closest], np.float64),
+        enlargement=np.array([_enlargement(term) for term in operand_of_term], np.float64),
+        geometric=_whole(geometric_numbers),
+        quantity=_whole(QUANTITY_CODES[measurements[number].quantity] for number in geometric_numbers),
+        first=_whole(operand_pair[0] for operand_pair in operand_pairs),
+        second=_whole(operand_pair[1] if len(operand_pair) > 1 else ABSENT for operand_pair in operand_pairs),
+        yaws=np.array(yaw_rows, np.int64).reshape(len(yaw_rows), 3),
+        closest_enlargement=np.array([operand_pair.enlargement for operand_pair in code.closest], np.float64),
         is_group=_whole(not membership.candidates for membership in code.members),
         code=np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
         constants=np.array(list(code.constants), np.float64),
@@ -940,23 +971,25 @@ class SampleLeaves:
         terms = list(iter_terms(formulas))
         bases = [base_of(term) for term in terms]
         open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
-        named = {name: _region(outline) for name, outline in regions.items() if RegionName(name) in bases}
+        region_objects = {
+            name: _region(outline) for name, outline in regions.items() if RegionName(name) in bases
+        }
         classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
         self._frame = PlanContext(
             leaves,
             tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
             {name: code for code, name in enumerate(classes, start=1)},
             {
-                **{RegionName(name): region for name, region in named.items()},
+                **{RegionName(name): region for name, region in region_objects.items()},
                 **{
-                    Centre(base): centre_object(named[base.name])
+                    Centre(base): centre_object(region_objects[base.name])
                     for base in map(base_of, filter(is_centre, terms))
                     if isinstance(base, RegionName)
                 },
             },
         )
         self._regions = regions
-        self._recent = RecentSamples(self._frame.delays)
+        self._recent_samples = RecentSamples(self._frame.delays)
         self._reports = _empty_reports(formulas)
         self._takes_any = ANY_CLASS in open_classes
         self._spec_names = _names(bases)
@@ -979,7 +1012,7 @@ class SampleLeaves:
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)
-        return self._recent.add(sample)
+        return self._recent_samples.add(sample)
 
     def fill_room(self, sample: Sample) -> SampleRoom:
         """Add the next sample and copy it, with earlier samples that terms read, into memory for kernels.
@@ -996,15 +1029,15 @@ class SampleLeaves:
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in the samples, and the object of each placeholder."""
-        unnamed = self._unnamed_members(samples)
-        counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
+        names_by_classes = self._unnamed_members(samples)
+        placeholder_counts = {classes: _room(len(names)) for classes, names in names_by_classes.items()}
         try:
-            plan = self._plan_for(counts)
+            plan = self._plan_for(placeholder_counts)
         except UsageError:  # the rounded-up counts exceed the limit of bindings; the exact ones may not
-            counts = {classes: len(names) for classes, names in unnamed.items()}
-            plan = self._plan_for(counts)
+            placeholder_counts = {classes: len(names) for classes, names in names_by_classes.items()}
+            plan = self._plan_for(placeholder_counts)
         stands_for: dict[str, str] = {}
-        for classes, names in unnamed.items():
+        for classes, names in names_by_classes.items():
             # spare placeholders stand for a name that no sample has
             stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
         return plan, stands_for
@@ -1043,8 +1076,11 @@ class SampleLeaves:
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)
-            room = _MOST_BYTES - plan.packed.nbytes
-            while plans and (len(plans) >= MOST_PLANS or sum(p.packed.nbytes for p in plans.values()) > room):
+            byte_limit = _MOST_BYTES - plan.packed.nbytes
+            while plans and (
+                len(plans) >= MOST_PLANS
+                or sum(other_plan.packed.nbytes for other_plan in plans.values()) > byte_limit
+            ):
                 del plans[next(iter(plans))]
         plans[key] = plan
         return plan
@@ -1059,16 +1095,16 @@ def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
     return RecentReports(None if is_any else _names(bases), signals)
 
 
-def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:
+def _plan(frame: PlanContext, prefix: str, spec_members: frozenset[Member], counts: _Counts) -> LeafPlan:
     """Create the plan for the given numbers of unnamed members."""
     # no name of the specification begins with the prefix
     placeholders = {
         classes: [f"{prefix}{classes} {number}" for number in range(count)] for classes, count in counts
     }
-    unnamed = {
+    placeholder_members = {
         Member(name, code) for classes, names in placeholders.items() for name in names for code in classes
     }
-    return LeafPlan(frame, own_members | unnamed, placeholders)
+    return LeafPlan(frame, spec_members | placeholder_members, placeholders)
 
 
 def _class_code(classes: Mapping[str, int], name: str | None) -> int:
@@ -1076,10 +1112,16 @@ def _class_code(classes: Mapping[str, int], name: str | None) -> int:
     return classes.get((name or "").casefold(), 0)
 
 
-def _room(count: int) -> int:
+def _room(member_count: int) -> int:
     """Round a number of members up to 1, 2, 3, 4, 6, 8, 12, 16, …, so that few plans are needed."""
-    power = 1 << (count - 1).bit_length()
-    return count if count < 4 else power * 3 // 4 if count <= power * 3 // 4 else power
+    power_of_two = 1 << (member_count - 1).bit_length()
+    return (
+        member_count
+        if member_count < 4
+        else power_of_two * 3 // 4
+        if member_count <= power_of_two * 3 // 4
+        else power_of_two
+    )
 
 
 def _names(bases: Sequence[Term]) -> frozenset[str]:

@@ -115,11 +115,11 @@ def distinct_channels(numbers: Floats) -> Floats:
 
 def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
     """Concatenate arrays (C, …) into a `roomy` array with the largest number of channels among them."""
-    channels = max(map(len, parts))
-    return join_arrays([in_channels(part, channels) for part in parts], axis)
+    channel_count = max(map(len, parts))
+    return join_arrays([in_channels(part, channel_count) for part in parts], axis)
 
 
 def low_and_high(channels: int, *, wide: bool) -> tuple[int, int]:
     """Return the channels of the low and high ends, nominal or with uncertainty."""
-    stands_for = _STANDS_FOR[channels]
-    return (stands_for[2], stands_for[3]) if wide else (stands_for[0], stands_for[1])
+    stored_channels = _STANDS_FOR[channels]
+    return (stored_channels[2], stored_channels[3]) if wide else (stored_channels[0], stored_channels[1])

@@ -58,16 +58,16 @@ def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
     """Return rows as an array (R, width); shorter rows are padded with zeros."""
-    padded = [(*row, *(0,) * (width - len(row))) for row in rows]
-    return np.array(padded, np.int64).reshape(len(rows), width)
+    padded_rows = [(*row, *(0,) * (width - len(row))) for row in rows]
+    return np.array(padded_rows, np.int64).reshape(len(rows), width)
 
 
 def _operands_of_row(row: Row) -> tuple[int, ...]:
     """Return the operand rows of a row in a `SignalTable`."""
-    code, a, b, *_ = row
+    code, first_operand, second_operand, *_ = row
     if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
         return ()
-    return (a, b) if code in (codes.AND, codes.OR, codes.SINCE) else (a,)
+    return (first_operand, second_operand) if code in (codes.AND, codes.OR, codes.SINCE) else (first_operand,)
 
 
 class SignalTable:
@@ -107,13 +107,13 @@ class SignalTable:
         Args:
             kept_rows: rows that parts read at earlier samples.
         """
-        rings = [row for row in self._rows if row[0] in codes.RINGS]
-        looked_at = set(kept_rows)
+        ring_rows = [row for row in self._rows if row[0] in codes.RINGS]
+        history_rows = set(kept_rows)
         for row in self._rows:
             if row[0] in (*codes.RINGS, codes.DELAY):
-                looked_at.update(_operands_of_row(row))
+                history_rows.update(_operands_of_row(row))
         rows = [
-            (*row, rings.index(row) if row in rings else NOTHING, int(number in looked_at))
+            (*row, ring_rows.index(row) if row in ring_rows else NOTHING, int(number in history_rows))
             for number, row in enumerate(self._rows)
         ]
         return array_of_rows(rows, codes.SIGNAL_WIDTH)
@@ -150,12 +150,12 @@ class SignalTable:
         return self._leaf_numbers[key]
 
     def _boolean(self, operator: str, operands: list[int]) -> int:
-        first, *other_operands = operands
+        joined_row, *other_operands = operands
         if operator == "not":
-            return self.row(codes.NOT, first)
+            return self.row(codes.NOT, joined_row)
         for operand in other_operands:
-            first = self.row(codes.AND if operator == "and" else codes.OR, first, operand)
-        return first
+            joined_row = self.row(codes.AND if operator == "and" else codes.OR, joined_row, operand)
+        return joined_row
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
         """Add a past operator; with `codes.AHEAD`, the future operator that it equals in reversed time."""
@@ -170,8 +170,8 @@ class SignalTable:
         if high is not None:
             code = codes.WINDOW_MIN if is_weak else codes.WINDOW_MAX
             return self.row(code + ahead, operands[0], 0, unit, low, high)
-        running = self.row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
-        return running if low == 0 else self.delay(running, unit, low, ahead, is_weak=is_weak)
+        unbounded_row = self.row((codes.HISTORICALLY if is_weak else codes.ONCE) + ahead, operands[0])
+        return unbounded_row if low == 0 else self.delay(unbounded_row, unit, low, ahead, is_weak=is_weak)
 
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
         """Add a since over a window, phi S[a,b] psi.
@@ -181,9 +181,9 @@ class SignalTable:
         """
         row = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
-            delayed = self.delay(row, unit, low, ahead)
-            since = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
-            row = self.row(codes.AND, since, delayed)
+            delayed_row = self.delay(row, unit, low, ahead)
+            left_row = self.row(codes.WINDOW_MIN + ahead, left, 0, unit, 0, low - 1)
+            row = self.row(codes.AND, left_row, delayed_row)
         if high is not None:
             window_row = self.row(codes.WINDOW_MAX + ahead, right, 0, unit, low, high)
             row = self.row(codes.AND, window_row, row)
@@ -247,8 +247,8 @@ class PartRows:
 
     def rows(self) -> tuple[Row, ...]:
         """Return the rows, each with its variable and table, and whether it depends on any of them."""
-        variable = 0
-        table = 1  # 0 is the part's own table
+        next_variable = 0
+        next_table = 1  # 0 is the part's own table
         numbered_rows: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
@@ -256,28 +256,28 @@ class PartRows:
             numbered_rows.append(
                 (
                     *fields,
-                    variable if is_variable else NOTHING,
-                    table if has_table else NOTHING,
+                    next_variable if is_variable else NOTHING,
+                    next_table if has_table else NOTHING,
                     int(is_variable or has_table or depends_below),
                 )
             )
-            variable += is_variable
-            table += has_table
+            next_variable += is_variable
+            next_table += has_table
         return tuple(numbered_rows)
 
     @property
     def is_flat(self) -> bool:
         """Whether the part has no window, shift or past operator, so that only variables are pending."""
-        flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
+        flat_codes = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
         # all rows of `H[0,5] G G x` are flat, but a past root also reports its value at the newest sample
-        is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
+        is_flat = all(row[0] in flat_codes or (row[0] in _RUNNING and row[-1]) for row in self._rows)
         return is_flat and not self._is_past
 
     @property
     def end_corner(self) -> int:
         """The corner of the table that ends a run: +inf for weak operators, -inf for strong ones."""
-        weak = [row[3] for row in self._rows if row[-1]]
-        return sum(1 << variable for variable, is_weak in enumerate(weak) if is_weak)
+        weak_flags = [row[3] for row in self._rows if row[-1]]
+        return sum(1 << variable for variable, is_weak in enumerate(weak_flags) if is_weak)
 
     def row(
         self,
@@ -298,76 +298,78 @@ class PartRows:
             self.tables += code in _RECURRENT_PAST
         return self._rows[key]
 
-    def _add(self, formula: Formula, positive: bool) -> int:
+    def _add(self, formula: Formula, is_positive: bool) -> int:
         """Return the row of a formula, or of its negation, in negation normal form.
 
         Each of the two is built once, because the expansion of `xor` has its operands in both.
         """
         formula = expand(formula)
         while isinstance(formula, Boolean) and formula.operator == "not":
-            formula, positive = expand(formula.operands[0]), not positive
-        key = (id(formula), positive)
+            formula, is_positive = expand(formula.operands[0]), not is_positive
+        key = (id(formula), is_positive)
         if key not in self._row_by_id:
-            self._row_by_id[key] = formula, self._build(formula, positive)
+            self._row_by_id[key] = formula, self._build(formula, is_positive)
         return self._row_by_id[key][1]
 
-    def _build(self, formula: Formula, positive: bool) -> int:
+    def _build(self, formula: Formula, is_positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
-            operands = [self._add(operand, positive) for operand in formula.operands]
+            operands = [self._add(operand, is_positive) for operand in formula.operands]
             if isinstance(formula, Boolean):
-                is_both = (formula.operator == "and") == positive
+                is_both = (formula.operator == "and") == is_positive
                 return reduce(partial(self._join, is_both=is_both), operands)
             build = self._future if formula.operator in FUTURE_OPERATORS else self._past
-            return build(formula.operator, operands, formula.bound, positive)
-        return self.row(codes.LITERAL, self._signals.add(formula), 0 if positive else 1)
+            return build(formula.operator, operands, formula.bound, is_positive)
+        return self.row(codes.LITERAL, self._signals.add(formula), 0 if is_positive else 1)
 
     def _join(self, first: int, second: int, *, is_both: bool) -> int:
         return self.row(codes.PART_AND if is_both else codes.PART_OR, first, second)
 
-    def _future(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+    def _future(self, operator: str, operands: list[int], bound: Bound | None, is_positive: bool) -> int:
         left, right, bound = _as_until(operator, operands, bound)
         # negation turns an until into a release, and a release into an until
-        is_until = (operator != "G") == positive
+        is_until = (operator != "G") == is_positive
         return self._bounded_until(left, right, *window_of(bound), is_until=is_until)
 
     def _bounded_until(
         self, left: int, right: int, unit: int, low: int, high: int | None, *, is_until: bool
     ) -> int:
         """Add until or release over a window, by the identity of `SignalTable.since`."""
-        weak = int(not is_until)
+        is_weak = int(not is_until)
         right_code, left_code = _by_kind(codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN, is_until)
-        window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
+        window_row = None if high is None else self.row(right_code, right, 0, is_weak, unit, low, high)
         if window_row is not None and left == NOTHING:
             return window_row
         code = codes.UNTIL if is_until else codes.RELEASE
-        running = self.row(code, left, right, weak, variable=high is None)
+        until_row = self.row(code, left, right, is_weak, variable=high is None)
         if low > 0 or high is not None:
-            running = self.row(codes.SHIFT, running, 0, weak, unit, low, NOTHING if high is None else high)
+            until_row = self.row(
+                codes.SHIFT, until_row, 0, is_weak, unit, low, NOTHING if high is None else high
+            )
         if low > 0 and left != NOTHING:
-            lead_row = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
-            running = self._join(lead_row, running, is_both=is_until)
-        return running if window_row is None else self._join(window_row, running, is_both=is_until)
+            lead_row = self.row(left_code, left, 0, 1 - is_weak, unit, 0, low - 1)
+            until_row = self._join(lead_row, until_row, is_both=is_until)
+        return until_row if window_row is None else self._join(window_row, until_row, is_both=is_until)
 
-    def _past(self, operator: str, operands: list[int], bound: Bound | None, positive: bool) -> int:
+    def _past(self, operator: str, operands: list[int], bound: Bound | None, is_positive: bool) -> int:
         unit, low, high = window_of(bound)
         if operator == "Y":
-            return self.row(codes.PAST_DELAY, operands[0], 0, int(not positive), codes.SAMPLES, 1)
+            return self.row(codes.PAST_DELAY, operands[0], 0, int(not is_positive), codes.SAMPLES, 1)
         left, right = (NOTHING, operands[0]) if operator in ("O", "H") else operands
-        is_since = (operator in ("O", "S")) == positive
-        weak = int(not is_since)
+        is_since = (operator in ("O", "S")) == is_positive
+        is_weak = int(not is_since)
         right_code, left_code = _by_kind(codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, is_since)
-        window_row = None if high is None else self.row(right_code, right, 0, weak, unit, low, high)
+        window_row = None if high is None else self.row(right_code, right, 0, is_weak, unit, low, high)
         if window_row is not None and left == NOTHING:
             return window_row
-        since_row = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, weak)
+        since_row = self.row(codes.PAST_SINCE if is_since else codes.PAST_TRIGGER, left, right, is_weak)
         if low > 0:
-            since_row = self.row(codes.PAST_DELAY, since_row, 0, weak, unit, low)
+            since_row = self.row(codes.PAST_DELAY, since_row, 0, is_weak, unit, low)
             if left != NOTHING:
-                lead_row = self.row(left_code, left, 0, 1 - weak, unit, 0, low - 1)
+                lead_row = self.row(left_code, left, 0, 1 - is_weak, unit, 0, low - 1)
                 since_row = self._join(lead_row, since_row, is_both=is_since)
         return since_row if window_row is None else self._join(window_row, since_row, is_both=is_since)
 
-    def _ending(self, formula: Formula, positive: bool) -> int:
+    def _ending(self, formula: Formula, is_positive: bool) -> int:
         """Return the row of a bounded operator that is needed only at the first sample.
 
         Its window is a fixed interval of the run. In an until, positions outside the window are -inf. From
@@ -375,24 +377,26 @@ class PartRows:
         """
         formula = expand(formula)
         if isinstance(formula, Boolean) and formula.operator == "not":
-            return self._ending(formula.operands[0], not positive)
+            return self._ending(formula.operands[0], not is_positive)
         if not isinstance(formula, Temporal):
             # W expands to `U or G`
-            rows = [self._ending(operand, positive) for operand in operands_of(formula)]
-            return reduce(partial(self._join, is_both=not positive), rows)
-        operands = [self._add(operand, positive) for operand in formula.operands]
+            rows = [self._ending(operand, is_positive) for operand in operands_of(formula)]
+            return reduce(partial(self._join, is_both=not is_positive), rows)
+        operands = [self._add(operand, is_positive) for operand in formula.operands]
         left, right, bound = _as_until(formula.operator, operands, formula.bound)
         unit, low, high = window_of(bound)
-        is_until = (formula.operator != "G") == positive
-        sign = -1 if is_until else 1
+        is_until = (formula.operator != "G") == is_positive
+        outside_sign = -1 if is_until else 1
         if low > 0:
-            right = self._join(right, self._infinity_after(unit, low, -sign), is_both=is_until)
+            right = self._join(right, self._infinity_after(unit, low, -outside_sign), is_both=is_until)
         if high is not None:
-            after_end = self._infinity_after(unit, high, sign)
+            after_end = self._infinity_after(unit, high, outside_sign)
             left = after_end if left == NOTHING else self._join(left, after_end, is_both=is_until)
             # `high` + 1 has to fit 64 bits
             if high < LAST:
-                right = self._join(right, self._infinity_after(unit, high + 1, sign), is_both=is_until)
+                right = self._join(
+                    right, self._infinity_after(unit, high + 1, outside_sign), is_both=is_until
+                )
         code = codes.UNTIL if is_until else codes.RELEASE
         return self.row(code, left, right, int(not is_until), variable=True)
 
@@ -468,21 +472,23 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
     if direction is None:
         return 0
     # whether a node is infinite under the best continuation
-    outdone: list[bool] = []
-    for code, a, b, *_ in rows:
+    is_infinite: list[bool] = []
+    for code, first_operand, second_operand, *_ in rows:
         if code == direction.either:
-            outdone.append(outdone[a] or outdone[b])
+            is_infinite.append(is_infinite[first_operand] or is_infinite[second_operand])
         elif code == direction.both:
-            outdone.append(outdone[a] and outdone[b])
+            is_infinite.append(is_infinite[first_operand] and is_infinite[second_operand])
         elif code == direction.until:
-            outdone.append(a == NOTHING or outdone[a] or outdone[b])
+            is_infinite.append(
+                first_operand == NOTHING or is_infinite[first_operand] or is_infinite[second_operand]
+            )
         else:
-            outdone.append(code == direction.release and outdone[b])
-    variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    bounds = 1 << direction.worst if rows[-1][codes.NODE_A] == NOTHING else 0
-    if all(outdone[node] for node in variables):
-        bounds |= 1 << direction.best
-    return bounds
+            is_infinite.append(code == direction.release and is_infinite[second_operand])
+    variable_nodes = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
+    bound_bits = 1 << direction.worst if rows[-1][codes.NODE_A] == NOTHING else 0
+    if all(is_infinite[node] for node in variable_nodes):
+        bound_bits |= 1 << direction.best
+    return bound_bits
 
 
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
@@ -491,11 +497,13 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
     The numbers are those of a run that ends with the newest sample.
     """
     node_directions = list[tuple[bool, bool]]()
-    for code, a, b, weak, *_ in rows:
-        operand_directions = [node_directions[operand] for operand in operand_rows(code, a, b)]
+    for code, first_operand, second_operand, is_weak, *_ in rows:
+        operand_directions = [
+            node_directions[operand] for operand in operand_rows(code, first_operand, second_operand)
+        ]
         rises, falls = all(up for up, _ in operand_directions), all(down for _, down in operand_directions)
         if code in (codes.UNTIL, codes.RELEASE, codes.SHIFT):
-            rises, falls = rises and not weak, falls and bool(weak)
+            rises, falls = rises and not is_weak, falls and bool(is_weak)
         node_directions.append(
             (rises and code != codes.PART_WINDOW_MIN, falls and code != codes.PART_WINDOW_MAX)
         )
@@ -552,14 +560,14 @@ def compile_formula(formula: Formula) -> Program:
     reports: list[Row] = []
     operand_ids: list[int] = []
     for node, operands in nodes_with_operands(formula):
-        ends = (len(operand_ids), len(operand_ids) + len(operands))
+        operand_range = (len(operand_ids), len(operand_ids) + len(operands))
         operand_ids.extend(operands)
         if not looks_ahead(node):
-            reports.append((codes.REPORT_SIGNAL, signals.add(node), 0, *ends))
+            reports.append((codes.REPORT_SIGNAL, signals.add(node), 0, *operand_range))
         elif isinstance(node, Boolean):
-            reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
+            reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *operand_range))
         elif isinstance(node, Temporal):
-            reports.append((codes.REPORT_PART, parts.add(node, signals), _now_rule(node), *ends))
+            reports.append((codes.REPORT_PART, parts.add(node, signals), _now_rule(node), *operand_range))
     signal_rows, report_rows = signals.array(parts.literals), array_of_rows(reports, codes.REPORT_WIDTH)
     return Program(
         leaves=tuple(signals.leaves),
@@ -579,22 +587,25 @@ def _join_rows(
 ) -> Integers:
     """Return the rows of a program (see `Program`)."""
     width = codes.NODE_WIDTH
-    parts_at = 1 + len(signals)
-    reports_at = parts_at + len(parts)
-    operands_at = reports_at + len(reports)
+    parts_begin = 1 + len(signals)
+    reports_begin = parts_begin + len(parts)
+    operands_begin = reports_begin + len(reports)
     # ceiling division: operand ids fill rows of this width
-    first = operands_at + -(-len(operands) // width)
+    next_row = operands_begin + -(-len(operands) // width)
     # one array: each array argument of a kernel costs time at every sample
-    rows = np.zeros((first + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)
-    rows[0, :7] = 1, len(signals), parts_at, len(parts), reports_at, len(reports), operands_at
-    rows[1:parts_at, : codes.SIGNAL_WIDTH] = signals
-    rows[reports_at:operands_at, : codes.REPORT_WIDTH] = reports
-    rows[operands_at:first].reshape(-1)[: len(operands)] = operands
-    for number, part_rows in enumerate(parts):
-        rows[first : first + len(part_rows) - 1] = array_of_rows(part_rows[:-1], width)
-        rows[parts_at + number, : len(part_rows[-1])] = part_rows[-1]
-        rows[parts_at + number, [codes.PART_FIRST, codes.PART_END]] = first, first + len(part_rows) - 1
-        first += len(part_rows) - 1
+    rows = np.zeros((next_row + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)
+    rows[0, :7] = 1, len(signals), parts_begin, len(parts), reports_begin, len(reports), operands_begin
+    rows[1:parts_begin, : codes.SIGNAL_WIDTH] = signals
+    rows[reports_begin:operands_begin, : codes.REPORT_WIDTH] = reports
+    rows[operands_begin:next_row].reshape(-1)[: len(operands)] = operands
+    for part_number, part_rows in enumerate(parts):
+        rows[next_row : next_row + len(part_rows) - 1] = array_of_rows(part_rows[:-1], width)
+        rows[parts_begin + part_number, : len(part_rows[-1])] = part_rows[-1]
+        rows[parts_begin + part_number, [codes.PART_FIRST, codes.PART_END]] = (
+            next_row,
+            next_row + len(part_rows) - 1,
+        )
+        next_row += len(part_rows) - 1
     return rows
 
 
@@ -616,43 +627,43 @@ class _Parts:
     def add(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part for a node that looks ahead, and return the part's number."""
         part = part_of(signals, node)
-        nodes = tuple(_with_signal_row(row, signals) for row in part.rows())
+        node_rows = tuple(_with_signal_row(row, signals) for row in part.rows())
         has_now = node.operator not in FUTURE_OPERATORS
-        key = nodes, has_now
-        if key not in self._number_of:
-            self._number_of[key] = len(self.rows)
-            self.rows.append((*_with_times(nodes), self._own_row(nodes, part, has_now=has_now)))
-        return self._number_of[key]
+        part_key = node_rows, has_now
+        if part_key not in self._number_of:
+            self._number_of[part_key] = len(self.rows)
+            self.rows.append((*_with_times(node_rows), self._own_row(node_rows, part, has_now=has_now)))
+        return self._number_of[part_key]
 
-    def _own_row(self, nodes: tuple[Row, ...], part: PartRows, *, has_now: bool) -> Row:
+    def _own_row(self, node_rows: tuple[Row, ...], part: PartRows, *, has_now: bool) -> Row:
         row = (
             0,
-            len(nodes),
+            len(node_rows),
             codes.TABLE if part.is_flat else codes.WINDOWED,
             part.variables,
             part.tables,
             part.end_corner,
             self.table_size,
-            known_bounds(nodes),
+            known_bounds(node_rows),
             int(has_now),
-            int(is_monotone(nodes)),
+            int(is_monotone(node_rows)),
         )
         if part.is_flat:
             self.table_size += 1 << part.variables
         else:
             self.keeps_history = True
-            self.literals |= {row[codes.NODE_A] for row in nodes if row[codes.NODE_CODE] == codes.LITERAL}
+            self.literals |= {row[codes.NODE_A] for row in node_rows if row[codes.NODE_CODE] == codes.LITERAL}
         return row
 
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
     """Yield the rows, with numbers for windows in seconds."""
-    timed = 0
+    timed_count = 0
     for row in nodes:
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
         is_timed = unit != codes.SAMPLES and code in (*codes.AHEAD_OF, *codes.PAST_WINDOWS, codes.PAST_DELAY)
-        yield (*row, timed if is_timed else NOTHING)
-        timed += is_timed
+        yield (*row, timed_count if is_timed else NOTHING)
+        timed_count += is_timed
 
 
 def _with_signal_row(row: Row, signals: SignalTable) -> Row:
@@ -670,7 +681,7 @@ def _now_rule(node: Temporal) -> int:
     """
     if node.operator not in FUTURE_OPERATORS:
         return codes.NOW_OF_PART
-    weak = node.operator in ("G", "R", "W", "WX")
+    is_weak = node.operator in ("G", "R", "W", "WX")
     if node.operator in ("X", "WX") or (node.bound is not None and node.bound.lower > 0):
-        return codes.NOW_TRUE if weak else codes.NOW_FALSE
+        return codes.NOW_TRUE if is_weak else codes.NOW_FALSE
     return codes.NOW_EITHER if node.operator == "W" else codes.NOW_LAST_OPERAND

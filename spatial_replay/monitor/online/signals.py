@@ -70,30 +70,35 @@ def _slide(
     The ring is a monotonic queue: it holds the positions that can still attain the extremum.
     """
     operand, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]
-    near, far = rows[row, codes.SIGNAL_LOW], rows[row, codes.SIGNAL_HIGH]
+    near_distance, far_distance = rows[row, codes.SIGNAL_LOW], rows[row, codes.SIGNAL_HIGH]
     sign = 1.0 if rows[row, codes.SIGNAL_CODE] == codes.WINDOW_MAX else -1.0
-    ring, size = 1 + 4 * rows[row, codes.SIGNAL_WINDOW] + channel, times.shape[1] - RING
-    head, tail, entering = times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING]
+    ring_row, ring_size = 1 + 4 * rows[row, codes.SIGNAL_WINDOW] + channel, times.shape[1] - RING
+    head, tail, entering_position = times[ring_row, HEAD], times[ring_row, TAIL], times[ring_row, ENTERING]
     for place in range(begin, begin + count):
-        while entering <= offset + place and _distance(times, unit, entering - offset, place) >= near:
-            number = sign * history[channel, operand, entering - offset]
+        while (
+            entering_position <= offset + place
+            and _distance(times, unit, entering_position - offset, place) >= near_distance
+        ):
+            operand_number = sign * history[channel, operand, entering_position - offset]
             while tail > head:
-                newest = times[ring, RING + (tail - 1) % size] - offset
-                if sign * history[channel, operand, newest] > number:
+                newest_place = times[ring_row, RING + (tail - 1) % ring_size] - offset
+                if sign * history[channel, operand, newest_place] > operand_number:
                     break
                 tail -= 1
-            times[ring, RING + tail % size] = entering
+            times[ring_row, RING + tail % ring_size] = entering_position
             tail += 1
-            entering += 1
-        oldest = 0
+            entering_position += 1
+        oldest_place = 0
         while tail > head:
-            oldest = times[ring, RING + head % size] - offset
+            oldest_place = times[ring_row, RING + head % ring_size] - offset
             # a negative place was dropped from the history: it is further back than any window reaches
-            if oldest >= 0 and _distance(times, unit, oldest, place) <= far:
+            if oldest_place >= 0 and _distance(times, unit, oldest_place, place) <= far_distance:
                 break
             head += 1
-        history[channel, target, place] = history[channel, operand, oldest] if tail > head else -sign * np.inf
-    times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING] = head, tail, entering
+        history[channel, target, place] = (
+            history[channel, operand, oldest_place] if tail > head else -sign * np.inf
+        )
+    times[ring_row, HEAD], times[ring_row, TAIL], times[ring_row, ENTERING] = head, tail, entering_position
 
 
 @piece
@@ -109,57 +114,78 @@ def run_signals(
         times: times of the recent samples, then a ring for each sliding window and channel.
         memory: (4, …), every signal at the last sample, then at the first sample, by channel.
     """
-    offset, channels, signal_count, end = (
+    offset, channel_count, signal_count, end = (
         position - begin,
         leaves.shape[0],
         rows[0, codes.HEAD_SIGNALS],
         begin + count,
     )
-    for s in range(signal_count):
-        row = rows[0, codes.HEAD_SIGNALS_AT] + s
-        code, a, b = rows[row, codes.SIGNAL_CODE], rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_B]
-        unit, low, high = (
+    for signal in range(signal_count):
+        row = rows[0, codes.HEAD_SIGNALS_AT] + signal
+        code, first_operand, second_operand = (
+            rows[row, codes.SIGNAL_CODE],
+            rows[row, codes.SIGNAL_A],
+            rows[row, codes.SIGNAL_B],
+        )
+        unit, low_entry, high_entry = (
             rows[row, codes.SIGNAL_UNIT],
             rows[row, codes.SIGNAL_LOW],
             rows[row, codes.SIGNAL_HIGH],
         )
-        for c in range(channels):
+        for channel in range(channel_count):
             if code == codes.LEAF:
-                for k in range(count):
-                    history[c, s, begin + k] = leaves[c, first_leaf + a, t + k]
+                for step in range(count):
+                    history[channel, signal, begin + step] = leaves[
+                        channel, first_leaf + first_operand, t + step
+                    ]
             elif code == codes.CONSTANT:
-                for k in range(begin, end):
-                    history[c, s, k] = low * np.inf
+                for place in range(begin, end):
+                    history[channel, signal, place] = low_entry * np.inf
             elif code == codes.NOT:
-                opposite = c ^ 1 if channels > 1 else c
-                for k in range(begin, end):
-                    history[c, s, k] = -history[opposite, a, k]
+                mirror_channel = channel ^ 1 if channel_count > 1 else channel
+                for place in range(begin, end):
+                    history[channel, signal, place] = -history[mirror_channel, first_operand, place]
             elif code == codes.AND:
-                for k in range(begin, end):
-                    history[c, s, k] = min(history[c, a, k], history[c, b, k])
+                for place in range(begin, end):
+                    history[channel, signal, place] = min(
+                        history[channel, first_operand, place], history[channel, second_operand, place]
+                    )
             elif code == codes.OR:
-                for k in range(begin, end):
-                    history[c, s, k] = max(history[c, a, k], history[c, b, k])
+                for place in range(begin, end):
+                    history[channel, signal, place] = max(
+                        history[channel, first_operand, place], history[channel, second_operand, place]
+                    )
             elif code in (codes.ONCE, codes.HISTORICALLY, codes.SINCE):
-                value = memory[c, s]
+                value = memory[channel, signal]
                 if position == 0:
                     value = np.inf if code == codes.HISTORICALLY else -np.inf
-                for k in range(begin, end):
-                    value = past_value(code, history[c, a, k], history[c, b, k], value)
-                    history[c, s, k] = value
+                for place in range(begin, end):
+                    value = past_value(
+                        code,
+                        history[channel, first_operand, place],
+                        history[channel, second_operand, place],
+                        value,
+                    )
+                    history[channel, signal, place] = value
             elif code == codes.DELAY:
-                for k in range(begin, end):
-                    place = _delay_place(times, unit, k, low)
-                    history[c, s, k] = history[c, a, place] if place >= 0 else high * np.inf
+                for place in range(begin, end):
+                    delayed_place = _delay_place(times, unit, place, low_entry)
+                    history[channel, signal, place] = (
+                        history[channel, first_operand, delayed_place]
+                        if delayed_place >= 0
+                        else high_entry * np.inf
+                    )
             elif code == codes.ELAPSED:
-                for k in range(begin, end):
-                    distance = offset + k if unit == codes.SAMPLES else times[0, k] - start_ns
-                    history[c, s, k] = high * (np.inf if distance >= low else -np.inf)
+                for place in range(begin, end):
+                    distance = offset + place if unit == codes.SAMPLES else times[0, place] - start_ns
+                    history[channel, signal, place] = high_entry * (
+                        np.inf if distance >= low_entry else -np.inf
+                    )
             else:
-                _slide(rows, row, history, c, s, times, offset, begin, count)
-            memory[c, s] = history[c, s, end - 1]
+                _slide(rows, row, history, channel, signal, times, offset, begin, count)
+            memory[channel, signal] = history[channel, signal, end - 1]
             if position == 0:
-                memory[c, signal_count + s] = history[c, s, begin]
+                memory[channel, signal_count + signal] = history[channel, signal, begin]
 
 
 # work rows of a part, after one row for each of its nodes; its results follow
@@ -178,51 +204,61 @@ def read_table(tables: Floats, row: int, first: int, variables: int, points: Flo
     # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
     value, corner = tables[row, first], 0
     for _ in range(variables):
-        greatest = -1
-        for j in range(variables):
-            if not corner >> j & 1 and (greatest < 0 or points[point, j] > points[point, greatest]):
-                greatest = j
-        corner |= 1 << greatest
-        value = max(value, min(points[point, greatest], tables[row, first + corner]))
+        greatest_variable = -1
+        for variable in range(variables):
+            if not corner >> variable & 1 and (
+                greatest_variable < 0 or points[point, variable] > points[point, greatest_variable]
+            ):
+                greatest_variable = variable
+        corner |= 1 << greatest_variable
+        value = max(value, min(points[point, greatest_variable], tables[row, first + corner]))
     return float(value)
 
 
 @inlined
 def _start(
-    rows: Integers, first: int, end: int, corners: int, memory: Floats, channel: int, table: int,
-    work: Floats, values: int,
+    rows: Integers, first_row: int, end_row: int, corner_count: int, memory: Floats, channel: int, table: int,
+    work: Floats, values_row: int,
 ) -> None:  # fmt: skip
     """Fill the table before the first sample: each operator equals its value at the next sample."""
-    for corner in range(corners):
-        for d in range(end - first):
-            variable, a, b = rows[first + d, codes.NODE_VARIABLE], rows[first + d, codes.NODE_A], 0
+    for corner in range(corner_count):
+        for node in range(end_row - first_row):
+            variable, left_node, right_node = (
+                rows[first_row + node, codes.NODE_VARIABLE],
+                rows[first_row + node, codes.NODE_A],
+                0,
+            )
             if variable >= 0:
-                work[values, d] = np.inf if corner >> variable & 1 else -np.inf
-            elif rows[first + d, codes.NODE_CODE] == codes.PART_OR:
-                b = rows[first + d, codes.NODE_B]
-                work[values, d] = max(work[values, a], work[values, b])
-        memory[channel, table + corner] = work[values, end - 1 - first]
+                work[values_row, node] = np.inf if corner >> variable & 1 else -np.inf
+            elif rows[first_row + node, codes.NODE_CODE] == codes.PART_OR:
+                right_node = rows[first_row + node, codes.NODE_B]
+                work[values_row, node] = max(work[values_row, left_node], work[values_row, right_node])
+        memory[channel, table + corner] = work[values_row, end_row - 1 - first_row]
 
 
 @inlined
 def _fill_columns(
-    rows: Integers, first: int, end: int, history: Floats, channel: int, begin: int, count: int,
+    rows: Integers, first_row: int, end_row: int, history: Floats, channel: int, begin: int, count: int,
     work: Floats, top: int,
 ) -> None:  # fmt: skip
     """Compute the nodes that depend on no variable, at `count` samples."""
-    for d in range(end - first):
-        row, target = first + d, top + d
-        code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], top + rows[row, codes.NODE_B]
+    for node in range(end_row - first_row):
+        row, target_row = first_row + node, top + node
+        code, first_entry, second_row = (
+            rows[row, codes.NODE_CODE],
+            rows[row, codes.NODE_A],
+            top + rows[row, codes.NODE_B],
+        )
         if code == codes.LITERAL:
-            for k in range(count):
-                work[target, k] = history[channel, a, begin + k]
+            for sample in range(count):
+                work[target_row, sample] = history[channel, first_entry, begin + sample]
         elif not rows[row, codes.NODE_DEPENDS]:
             if code == codes.PART_AND:
-                for k in range(count):
-                    work[target, k] = min(work[top + a, k], work[b, k])
+                for sample in range(count):
+                    work[target_row, sample] = min(work[top + first_entry, sample], work[second_row, sample])
             elif code == codes.PART_OR:
-                for k in range(count):
-                    work[target, k] = max(work[top + a, k], work[b, k])
+                for sample in range(count):
+                    work[target_row, sample] = max(work[top + first_entry, sample], work[second_row, sample])
 
 
 @inlined
@@ -231,20 +267,33 @@ def _run_simple(
     top: int, first_result: int, count: int,
 ) -> None:  # fmt: skip
     """Run a part that is a single until or release, with a table of two numbers."""
-    low, high = memory[channel, table], memory[channel, table + 1]
-    has_left, a, b = rows[root, codes.NODE_A] >= 0, rows[root, codes.NODE_A], rows[root, codes.NODE_B]
+    lower_bound, upper_bound = memory[channel, table], memory[channel, table + 1]
+    has_left, left_node, right_node = (
+        rows[root, codes.NODE_A] >= 0,
+        rows[root, codes.NODE_A],
+        rows[root, codes.NODE_B],
+    )
     is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
-    for k in range(count):
-        right = work[top + b, k]
+    for sample in range(count):
+        right_number = work[top + right_node, sample]
         # the value of the root if its next value is -inf, and if it is +inf
         if is_until:
-            least, most = right, max(right, work[top + a, k]) if has_left else np.inf
+            least_value, greatest_value = (
+                right_number,
+                max(right_number, work[top + left_node, sample]) if has_left else np.inf,
+            )
         else:
-            least, most = min(right, work[top + a, k]) if has_left else -np.inf, right
-        low, high = max(low, min(least, high)), max(low, min(most, high))
-        work[first_result + 1, k], work[first_result + 2, k] = low, high
-        work[first_result, k] = high if end_corner else low
-    memory[channel, table], memory[channel, table + 1] = low, high
+            least_value, greatest_value = (
+                min(right_number, work[top + left_node, sample]) if has_left else -np.inf,
+                right_number,
+            )
+        lower_bound, upper_bound = (
+            max(lower_bound, min(least_value, upper_bound)),
+            max(lower_bound, min(greatest_value, upper_bound)),
+        )
+        work[first_result + 1, sample], work[first_result + 2, sample] = lower_bound, upper_bound
+        work[first_result, sample] = upper_bound if end_corner else lower_bound
+    memory[channel, table], memory[channel, table + 1] = lower_bound, upper_bound
 
 
 @piece
@@ -263,56 +312,72 @@ def run_table(
     Returns:
         the row of `work` with its value; the rows of its lower and upper bound follow.
     """
-    first, end = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
-    variables, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
-    nodes, corners, root = end - first, 1 << variables, rows[end - 1, codes.NODE_CODE]
-    values, fresh, point, first_result = (
-        top + nodes + VALUES,
-        top + nodes + FRESH,
-        top + nodes + POINT,
-        top + nodes + RESULTS,
+    first_row, end_row = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
+    variable_count, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
+    node_count, corner_count, root_code = (
+        end_row - first_row,
+        1 << variable_count,
+        rows[end_row - 1, codes.NODE_CODE],
+    )
+    values_row, fresh_row, point_row, first_result = (
+        top + node_count + VALUES,
+        top + node_count + FRESH,
+        top + node_count + POINT,
+        top + node_count + RESULTS,
     )
     if position == 0:
-        _start(rows, first, end, corners, memory, channel, table, work, values)
-    elif memory[channel, table] == memory[channel, table + corners - 1]:
+        _start(rows, first_row, end_row, corner_count, memory, channel, table, work, values_row)
+    elif memory[channel, table] == memory[channel, table + corner_count - 1]:
         # the extreme corners agree: no later sample can change the value
-        for k in range(count):
-            work[first_result, k] = work[first_result + 1, k] = work[first_result + 2, k] = memory[
-                channel, table
-            ]
+        for sample in range(count):
+            work[first_result, sample] = work[first_result + 1, sample] = work[first_result + 2, sample] = (
+                memory[channel, table]
+            )
         return int(first_result)
-    _fill_columns(rows, first, end, history, channel, begin, count, work, top)
-    if variables == 1 and root in (codes.UNTIL, codes.RELEASE):
-        _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, first_result, count)
+    _fill_columns(rows, first_row, end_row, history, channel, begin, count, work, top)
+    if variable_count == 1 and root_code in (codes.UNTIL, codes.RELEASE):
+        _run_simple(rows, end_row - 1, end_corner, memory, channel, table, work, top, first_result, count)
         return int(first_result)
-    for k in range(count):
-        for d in range(nodes):
+    for sample in range(count):
+        for node in range(node_count):
             # a node that depends on no variable has one value for all corners
-            if not rows[first + d, codes.NODE_DEPENDS]:
-                work[values, d] = work[top + d, k]
-        for corner in range(corners):
-            for row in range(first, end):
+            if not rows[first_row + node, codes.NODE_DEPENDS]:
+                work[values_row, node] = work[top + node, sample]
+        for corner in range(corner_count):
+            for row in range(first_row, end_row):
                 if not rows[row, codes.NODE_DEPENDS]:
                     continue
-                code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], rows[row, codes.NODE_B]
+                code, left_node, right_node = (
+                    rows[row, codes.NODE_CODE],
+                    rows[row, codes.NODE_A],
+                    rows[row, codes.NODE_B],
+                )
                 if code == codes.PART_AND:
-                    value = min(work[values, a], work[values, b])
+                    value = min(work[values_row, left_node], work[values_row, right_node])
                 elif code == codes.PART_OR:
-                    value = max(work[values, a], work[values, b])
+                    value = max(work[values_row, left_node], work[values_row, right_node])
                 else:
                     variable, is_until = rows[row, codes.NODE_VARIABLE], code == codes.UNTIL
                     value = np.inf if corner >> variable & 1 else -np.inf
-                    if a >= 0:
-                        value = min(work[values, a], value) if is_until else max(work[values, a], value)
-                    value = max(work[values, b], value) if is_until else min(work[values, b], value)
-                    work[point, variable] = value
-                work[values, row - first] = value
-            work[fresh, corner] = read_table(memory, channel, table, variables, work, point)
-        for corner in range(corners):
-            memory[channel, table + corner] = work[fresh, corner]
-        work[first_result, k] = memory[channel, table + end_corner]
-        work[first_result + 1, k], work[first_result + 2, k] = (
+                    if left_node >= 0:
+                        value = (
+                            min(work[values_row, left_node], value)
+                            if is_until
+                            else max(work[values_row, left_node], value)
+                        )
+                    value = (
+                        max(work[values_row, right_node], value)
+                        if is_until
+                        else min(work[values_row, right_node], value)
+                    )
+                    work[point_row, variable] = value
+                work[values_row, row - first_row] = value
+            work[fresh_row, corner] = read_table(memory, channel, table, variable_count, work, point_row)
+        for corner in range(corner_count):
+            memory[channel, table + corner] = work[fresh_row, corner]
+        work[first_result, sample] = memory[channel, table + end_corner]
+        work[first_result + 1, sample], work[first_result + 2, sample] = (
             memory[channel, table],
-            memory[channel, table + corners - 1],
+            memory[channel, table + corner_count - 1],
         )
     return int(first_result)
