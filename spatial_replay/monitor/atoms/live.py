@@ -2,11 +2,11 @@
 
 Most samples differ in their numbers, not in their names. A plan stores everything that depends on names as
 index arrays, so a sample only has to copy its numbers. A plan serves every sample whose members of open
-groups fit into it; an object missing from a sample is only a flag.
+groups fit into the plan. An object that is missing from a sample only needs a flag.
 
-Without open groups, one plan serves all samples. Otherwise a plan depends on the number of members. It has
-placeholders for objects that the specification does not name, because these differ only in their classes.
-Each sample assigns its objects to placeholders, so tracks with new names need no new plan.
+Without open groups, one plan serves all samples. Otherwise a plan depends on the number of members. The plan
+has placeholders for objects that the specification does not name, because these objects differ only in their
+classes. Each sample assigns its objects to placeholders, so tracks with new names need no new plan.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ _OF_OBJECT, _OF_PART = 5, 2
 
 
 class PlanArrays(NamedTuple):
-    """The arrays of a plan, the same for every sample; ragged lists come with the offsets of their rows.
+    """The arrays of a plan, which are the same for every sample. Ragged lists have offsets of their rows.
 
     Attributes:
         region_parts: number of parts of each region's footprint.
@@ -99,17 +99,18 @@ class PlanArrays(NamedTuple):
         region_radius: radius of each part.
         region_vertices: x and y of all vertices.
         region_heights: (bottom, top) of each region.
-        listed_start: offsets of the lists in `listed_rows`: one list for each operand, then for each closest
-            pair, each binding, and each measurement.
-        listed_rows: rows of an operand or a pair's group, rows needed for a binding, and rows without which a
-            measurement is unknown.
+        listed_start: offsets of the lists in `listed_rows`: one list for each operand, then one list for each
+            closest pair, each binding, and each measurement.
+        listed_rows: rows of an operand, rows of a pair's group, rows needed for a binding, and rows without
+            which a measurement is unknown.
         listed_classes: the class that each listed row must have, or `ANY`.
         enlargement: enlargement of each operand.
-        geometric: numbers of the measurements between footprints, with their `quantity` and operands
-            `first` and `second` (-1: none).
+        geometric: numbers of the measurements between footprints, with a `quantity` and the operands `first`
+            and `second`, which is -1 for a single operand.
         yaws: (Y, 3), number of each measurement between orientations, and its two rows.
         closest_enlargement: total enlargement of each closest pair.
-        is_group: 1 if a binding stands for the group itself, whose members are unknown without its row.
+        is_group: 1 for an entry that stands for a group itself. Its members are unknown in samples without
+            the listed row.
         code, constants, outputs: arguments of `run_instructions`.
     """
 
@@ -135,7 +136,7 @@ class PlanArrays(NamedTuple):
 
 
 class PlanExtent(NamedTuple):
-    """The numbers of samples, regions, places, signals, and class codes of places in a plan."""
+    """Counts of samples, regions, places, signals, and class codes of places in a plan."""
 
     samples: int
     regions: int
@@ -145,12 +146,13 @@ class PlanExtent(NamedTuple):
 
 
 class PackedPlan(NamedTuple):
-    """A plan's arrays joined into two arrays, because a kernel pays for each array that it receives.
+    """A plan's arrays joined into two arrays, because each array argument costs time in a kernel.
 
     Attributes:
         whole: the fields of `PlanPlaces`, then the integer arrays.
         real: the float arrays.
-        room: size of the work space of `measure_sample`, without three entries per number of the objects.
+        room: size of the work space of `measure_sample`, entries. The space that depends on the sample's
+            objects, three entries per number, is not included.
     """
 
     whole: Integers
@@ -159,7 +161,7 @@ class PackedPlan(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """The size of both arrays in bytes."""
+        """Size of both arrays in bytes."""
         return self.whole.nbytes + self.real.nbytes
 
     @classmethod
@@ -193,7 +195,7 @@ class PlanPlaces(NamedTuple):
     """Begins and ends of a plan's arrays in `PackedPlan.whole` and `PackedPlan.real`, and counts.
 
     The begin of an array has the array's name, and its end has the suffix `_end`. Kernels get these numbers
-    instead of a tuple of arrays, because they count references to each array.
+    instead of a tuple of arrays, because kernels count references to each array.
 
     Attributes:
         samples, regions, places, signals, coded: the plan's extent.
@@ -251,7 +253,7 @@ def plan_at(whole: Integers) -> PlanPlaces:
 
 
 class RowPlaces(NamedTuple):
-    """Places of a plan's rows in the numbers of one sample, in the layout of `measure_rows`.
+    """Begins of the row arrays in the work space of one sample, in the layout of `measure_rows`.
 
     Attributes:
         rows, parts, corners: numbers of rows, parts and vertices.
@@ -371,7 +373,7 @@ def _measure(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     values: int, begin: int,
 ) -> None:  # fmt: skip
-    """Write K values, then K spreads, at `values`, as `measurements.measurement_values` computes them.
+    """Write K values at `values`, then K spreads, equal to those of `measurements.measurement_values`.
 
     Args:
         begin: begin of the work space for operands.
@@ -398,7 +400,7 @@ def _measure(
                 lists[members + index] = row
                 spread = max(spread, sample[rows.uncertainty + row])
         sample[operand_spreads + operand] = spread
-    # numba gives a literal 0 a type of its own, and would compile `measure_rows` once more for it
+    # a literal 0 has a numba type of its own, for which `measure_rows` would be compiled once more
     zero = min(operand_count, 0)
     measure_rows(
         lists[rows.part_start : rows.part_start + rows.rows + 1],
@@ -453,7 +455,7 @@ def _closest(
     plan: PlanPlaces, rows: RowPlaces, whole: Integers, real: Floats, sample: Floats, lists: Integers,
     closest: int,
 ) -> None:  # fmt: skip
-    """Write the ends (K, 4) of the closest pairs at `closest`, as `leaf_values` computes them."""
+    """Write the ends (K, 4) of the closest pairs at `closest`, equal to those in `leaf_values`."""
     nearest_distances = np.empty((1, 3))
     for pair in range(plan.pairs):
         list_index = plan.listed_start + plan.operands + pair
@@ -491,7 +493,7 @@ def _closest(
 
 @inlined
 def _members(plan: PlanPlaces, classes: int, whole: Integers, lists: Integers, members: int) -> None:
-    """Write at `members` whether all objects of each binding are members: 1, 0, or -1 if unknown."""
+    """Write for each binding, at `members`, whether all its objects are members: 1, 0, or -1 if unknown."""
     first_list = plan.listed_start + plan.operands + plan.pairs
     for binding in range(plan.groups):
         is_group = whole[plan.is_group + binding] != 0
@@ -532,14 +534,14 @@ def _channels_of(
 
 @kernel
 def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leaves: Floats) -> int:
-    """Compute the leaves of one sample, (C, A, 1), equal to those of `leaf_values`.
+    """Compute the leaves (C, A, 1) of one sample, equal to the leaves of `leaf_values`.
 
     Args:
         whole, real: arrays of a `PackedPlan`.
         sample: 0 or `ABSENT` for each sample, then the value of each signal. If the plan distinguishes
-            classes, the class code of each place follows. The `packed` object of each place comes last: with
-            0 parts for an absent object, with -1 parts for an unknown position.
-        end: end of these numbers; work space follows.
+            classes, the class code of each place follows. The `packed` object of each place comes last. It
+            has 0 parts for an absent object, and -1 parts for an unknown position.
+        end: end of the sample's numbers, where the work space begins.
         leaves: (MOST_CHANNELS, A, 1), output.
 
     Returns:
@@ -548,10 +550,10 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
     # the work space holds floats and integers in one buffer
     plan, lists = plan_at(whole), sample.view(np.int64)
     measurement_count = plan.geometric_count + plan.yaw_count
-    # work space for results, operands and rows: allocating arrays would take as long as the distances
+    # a work space for results, operands and rows, because allocation would take as long as the distances
     closest_begin, members_begin = end + 2 * measurement_count, end + 2 * measurement_count + 4 * plan.pairs
     work_begin = members_begin + plan.groups
-    if measurement_count + plan.groups + plan.pairs > 0:  # else there are only signals
+    if measurement_count + plan.groups + plan.pairs > 0:  # otherwise the plan has only signals
         operand_room = 3 * plan.operands + 2 + plan.geometric_count + whole[plan.listed_start + plan.operands]
         rows = _rows_at(plan, sample, work_begin + operand_room)
         _fill_rows(plan, rows, whole, real, sample, lists)
@@ -579,6 +581,9 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
 class SampleRoom:
     """Memory for the newest sample of a stream, in the layout of kernels.
 
+    Args:
+        leaves: number of leaves.
+
     Attributes:
         arguments: arguments of `measure_sample`.
         leaves: (MOST_CHANNELS, A, 1), measured leaves.
@@ -595,7 +600,7 @@ class SampleRoom:
         self._bytes, self._numbers = bytearray(), np.empty(0)
 
     def fill(self, plan: PackedPlan, layout: Struct, numbers: Sequence[float], objects: list[bytes]) -> None:
-        """Store the next sample: its plan, its numbers, and the packed objects of its places."""
+        """Store the plan of the next sample, its numbers, and the packed objects of the plan's places."""
         packed_objects = b"".join(objects)
         if plan is not self._plan or len(packed_objects) != self._objects_length:
             self._fit(plan, layout.size, len(packed_objects))
@@ -643,8 +648,8 @@ class PlanContext:
     Attributes:
         leaves: leaves of each formula.
         delays: delays of the samples that terms read; delay 0 is first.
-        classes: code of each class of an open group, by its name in lower case. Other classes have code 0.
-        regions: regions in formulas, and centres of regions in formulas.
+        classes: code of each class of an open group, by class name in lower case. Other classes have code 0.
+        regions: regions, and centres of regions, in formulas.
     """
 
     leaves: Sequence[Leaves]
@@ -654,10 +659,11 @@ class PlanContext:
 
 
 class Place(NamedTuple):
-    """An object in one of the samples that a plan reads, or the point at its centre.
+    """An object in one of the samples that a plan reads, or the point at the object's centre.
 
     Attributes:
-        rate: terms of the rate that moves the object back; empty without a rate.
+        sample: index of the sample's delay.
+        rate: terms of the rate by which the object is moved back; empty without a rate.
     """
 
     sample: int
@@ -667,7 +673,7 @@ class Place(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A row of a plan, and the class that it must have to count, or `ANY`."""
+    """A row of a plan, and the class code without which the row is ignored, or `ANY`."""
 
     row: int
     class_code: int = ANY
@@ -708,7 +714,7 @@ class PlanRows:
         ]
 
     def of_term(self, term: Term) -> list[Row]:
-        """Return the rows whose union is the term."""
+        """Return the rows whose union is the footprint of the term."""
         is_point, term = is_centre(term), standing(term)
         base = term.term if isinstance(term, Earlier) else term
         rate = term.rate if isinstance(term, Earlier) else ()
@@ -723,7 +729,7 @@ class PlanRows:
         return [Row(place_row(name)) for name in named_members(base)]
 
     def required_rows(self, term: Term) -> list[Row]:
-        """Return the rows without which a term is unknown, with the row of its sample."""
+        """Return the rows without which a term is unknown, with the row of an earlier sample."""
         current_term, base = standing(term), base_of(term)
         sample_rows = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
@@ -744,7 +750,7 @@ class PlanRows:
 
 
 class LeafPlan:
-    """Index arrays that compute the leaves of a sample, also from earlier samples."""
+    """Index arrays for the leaves of a sample, which may read earlier samples."""
 
     def __init__(
         self, frame: PlanContext, members: frozenset[Member], placeholders: Mapping[_Classes, Sequence[str]]
@@ -752,7 +758,7 @@ class LeafPlan:
         """Create a plan for samples whose open groups only have members in `members`.
 
         Args:
-            placeholders: names of members that stand for unnamed objects, by the classes of the object.
+            placeholders: names of members that stand for unnamed objects, by the classes of an object.
 
         Raises:
             UsageError: the bindings exceed `MAX_BINDINGS`.
@@ -937,15 +943,15 @@ def _whole(numbers: Iterable[int]) -> Integers:
 
 
 def _enlargement(term: Term) -> float:
-    """Return the total enlargement of a term; the order of summation equals that of `TraceScene`."""
+    """Return the total enlargement of a term, summed in the order of `TraceScene`."""
     return _enlargement(term.term) + term.radius if isinstance(term, Enlarged) else 0.0
 
 
 MOST_PLANS = 64
 _MOST_BYTES = 1 << 22
-"""Limits on stored plans, by number and bytes; the least recently used plans are evicted first."""
+"""Limits on the number and the bytes of stored plans. The least recently used plans are evicted first."""
 _MOST_CLASSES = 1024
-"""Limit on cached class names; objects may write them in any case."""
+"""Limit on cached class names. Objects may write a class in upper and lower case."""
 
 _NO_OBJECT = ""
 """A name that no object has."""
@@ -957,14 +963,14 @@ def _region(outline: Outline) -> TrackedObject:
 
 
 _Classes: TypeAlias = tuple[int, ...]
-"""Class codes of one object in all samples that a plan reads; usually a single code."""
+"""Class codes of one object in all samples that a plan reads. Usually, it is a single code."""
 
 _Counts: TypeAlias = tuple[tuple[_Classes, int], ...]
 """Number of placeholders for unnamed objects, by their class codes."""
 
 
 class SampleLeaves:
-    """The leaves of formulas, sample by sample."""
+    """Computes the leaves of formulas sample by sample."""
 
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
@@ -1008,14 +1014,14 @@ class SampleLeaves:
         self.room = SampleRoom(len(formulas))
 
     def look_at(self, sample: Sample) -> Sequence[Sample | None]:
-        """Add the next sample; return the sample at each delay of terms, or None before the first sample."""
+        """Add the next sample. Return the sample at each delay of terms, or None before the first sample."""
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)
         return self._recent_samples.add(sample)
 
     def fill_room(self, sample: Sample) -> SampleRoom:
-        """Add the next sample and copy it, with earlier samples that terms read, into memory for kernels.
+        """Add the next sample. Copy it, and earlier samples that terms read, into memory for kernels.
 
         Raises:
             UsageError: the bindings exceed `MAX_BINDINGS`.
@@ -1033,7 +1039,7 @@ class SampleLeaves:
         placeholder_counts = {classes: _room(len(names)) for classes, names in names_by_classes.items()}
         try:
             plan = self._plan_for(placeholder_counts)
-        except UsageError:  # the rounded-up counts exceed the limit of bindings; the exact ones may not
+        except UsageError:  # rounded-up counts exceed the limit of bindings, but exact counts may not
             placeholder_counts = {classes: len(names) for classes, names in names_by_classes.items()}
             plan = self._plan_for(placeholder_counts)
         stands_for: dict[str, str] = {}
@@ -1072,7 +1078,7 @@ class SampleLeaves:
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given numbers of unnamed members, from the cache if possible."""
         key, plans = (self._spec_members, tuple(sorted(counts.items()))), self._plans
-        # removed and added again, so that the order of the dict is the order of use
+        # moved to the end, so that the order of the dict is the order of use
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)
@@ -1096,7 +1102,6 @@ def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
 
 
 def _plan(frame: PlanContext, prefix: str, spec_members: frozenset[Member], counts: _Counts) -> LeafPlan:
-    """Create the plan for the given numbers of unnamed members."""
     # no name of the specification begins with the prefix
     placeholders = {
         classes: [f"{prefix}{classes} {number}" for number in range(count)] for classes, count in counts

@@ -2,8 +2,8 @@
 
 Every number has up to four channels: the ends of its interval with every uncertainty at 0 (nominal low and
 high), and the ends with uncertainty (wide low and high). Channels that are equal for the whole run are not
-stored: one is enough without unknown values, and two without uncertainty. A negation swaps low and high:
-channel ^ 1.
+stored. A run without unknown values has one channel, and a run without uncertainty has two. A negation swaps
+low and high: channel ^ 1.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SAMPLES, NANOSECONDS = 0, 1
 
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
-SIGNAL_IS_KEPT = 7  # whether it is also read at earlier samples
+SIGNAL_IS_KEPT = 7  # whether the signal is also read at earlier samples
 SIGNAL_WIDTH = 8
 OFFLINE_TARGET = 6  # in offline rows instead of SIGNAL_WINDOW: the column that the row writes
 OFFLINE_WIDTH = 7
@@ -33,7 +33,7 @@ DELAY = 12  # a at distance low back; before the first sample, infinity with the
 # infinity whose sign is high from a distance low after the first sample on, and the opposite before
 ELAPSED = 31
 RINGS = (WINDOW_MAX, WINDOW_MIN)  # store positions in a ring
-AHEAD = 16  # added to a code from ONCE on: the operator in reversed time (see `offline`)
+AHEAD = 16  # added to a code from ONCE on for the operator in reversed time (see `offline`)
 
 # columns of parts' nodes
 # a = -1 if the left operand is missing: `true` in an until, `false` in a release
@@ -59,19 +59,20 @@ BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 # columns of parts: rows of the nodes, the kind, numbers of variables and tables, the corner that ends a run,
 # and the begin of the table in each channel (for parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# a bit for `OPEN_LOW` and one for `OPEN_HIGH`: whether this bound follows from the table alone, because
+# a bit for `OPEN_LOW` and a bit for `OPEN_HIGH`: whether the bound follows from the table alone, because
 # later samples may exceed every pending position
 PART_KNOWN = 7
-PART_HAS_NOW = 8  # whether it also reports its value at the newest sample
-PART_IS_MONOTONE = 9  # whether the operand of a root by the minimum never falls (maximum: never rises)
+PART_HAS_NOW = 8  # whether the part also reports its value at the newest sample
+# whether the operand never falls, if the root joins by the minimum; by the maximum, whether it never rises
+PART_IS_MONOTONE = 9
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 
 # columns of reports: index of the signal or part; rule for the number `now`
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
 REPORT_WIDTH = 5
-# codes of reports. Reports are nodes as written, so `xor`, `->` and `<->` have codes, too: rows for their
-# expansions would cost eight numbers per sample each
+# codes of reports; reports are nodes as written, so `xor`, `->` and `<->` have codes, too
+# a row for each node of an expansion would cost eight numbers per sample
 REPORT_SIGNAL, REPORT_PART = 0, 1
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
@@ -87,7 +88,7 @@ REPORT_OF_BOOLEAN = MappingProxyType(
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
 
-# columns of the first row of a program: begins of its tables, and their numbers of rows
+# columns of the first row of a program: begin and number of rows of each table
 HEAD_SIGNALS_AT, HEAD_SIGNALS, HEAD_PARTS_AT, HEAD_PARTS, HEAD_REPORTS_AT, HEAD_REPORTS = range(6)
 HEAD_OPERANDS_AT = 6
 
@@ -98,7 +99,7 @@ CHANNELS = 4
 """Number of channels: nominal low and high, wide low and high."""
 
 _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
-"""Stored channel that each of the four channels equals, by the number of stored channels."""
+"""Number of the stored channel that equals each of the four channels, by the number of stored channels."""
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:
@@ -114,7 +115,7 @@ def distinct_channels(numbers: Floats) -> Floats:
 
 
 def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
-    """Concatenate arrays (C, …) into a `roomy` array with the largest number of channels among them."""
+    """Concatenate arrays (C, …) into a `roomy` array. C is the largest number of channels of an array."""
     channel_count = max(map(len, parts))
     return join_arrays([in_channels(part, channel_count) for part in parts], axis)
 

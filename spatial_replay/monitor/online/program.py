@@ -4,15 +4,15 @@ A formula becomes three tables, each with operands first:
 
 - *signals*: every subformula without a future operator. Its robustness at a sample is final once that
   sample has come, so it is computed forwards, with a little state for past operators.
-- *parts*: one for each temporal operator that looks ahead. A part is in negation normal form over signals,
-  so its robustness is monotone in all its operands.
-- *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
+- *parts*: one part for each temporal operator that looks ahead. A part is in negation normal form over
+  signals, so its robustness is monotone in all its operands.
+- *reports*: the tree as the user wrote it. Boolean nodes combine the numbers of their operands.
 
-`OnlineRun` runs samples through them. docs/design/monitor.md explains them with an example.
+`OnlineRun` evaluates samples by these tables. docs/design/monitor.md explains the tables with an example.
 
-Some bounds of a part follow from its root's rows alone. A root that joins by the minimum, such as `G`, cannot
-exceed the least value of its closed positions, and later samples may always be worse. The reverse holds for a
-root that joins by the maximum, such as `F`.
+Some bounds of a part follow from its rows alone. A root that joins by the minimum, such as `G`, cannot exceed
+the least value of its closed positions, and later samples may always be worse. The reverse holds for a root
+that joins by the maximum, such as `F`.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import leaf_key, looks_ahead, nodes_with_operands
 
 Row = tuple[int, ...]
-"""A row of a table, with the columns that `codes` lists."""
+"""A row of a table. The columns are listed in `codes`."""
 
 NOTHING = -1
 """Entry of a row for a missing operand, upper end, variable, table or window."""
 
 
 def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
-    """Return the unit, the lower end and the upper end (None: unbounded) of an operator's window."""
+    """Return the unit, the lower end and the upper end of an operator's window; None for no upper end."""
     if bound is None:
         return codes.SAMPLES, 0, None
     return (codes.SAMPLES if bound.unit == "samples" else codes.NANOSECONDS), bound.lower, bound.upper
 
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
-    """Return rows as an array (R, width); shorter rows are padded with zeros."""
+    """Return rows as an array (R, width). Shorter rows are padded with zeros."""
     padded_rows = [(*row, *(0,) * (width - len(row))) for row in rows]
     return np.array(padded_rows, np.int64).reshape(len(rows), width)
 
@@ -71,7 +71,7 @@ def _operands_of_row(row: Row) -> tuple[int, ...]:
 
 
 class SignalTable:
-    """Collects rows of signals, operands first; equal subformulas share a row.
+    """Collects rows of signals, operands first. Equal subformulas share a row.
 
     Attributes:
         leaves: atoms and open quantifiers, in the order of their numbers.
@@ -82,7 +82,7 @@ class SignalTable:
         self.leaves: list[Atom | Quantified] = []
         self._leaf_numbers: dict[object, int] = {}
         self._rows: dict[Row, int] = {}
-        # an expansion repeats an operand; without this, nested expansions would take 2**depth steps
+        # without this cache, nested expansions, which repeat operands, would take 2**depth steps
         self._row_by_id: dict[int, tuple[Formula, int]] = {}
         for leaf in leaves:
             self._leaf_number(leaf)
@@ -102,7 +102,7 @@ class SignalTable:
         return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
 
     def array(self, kept_rows: Iterable[int]) -> Integers:
-        """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
+        """Return the table (S, SIGNAL_WIDTH) with numbers of rings.
 
         Args:
             kept_rows: rows that parts read at earlier samples.
@@ -123,7 +123,7 @@ class SignalTable:
         formula = expand(formula)
         if id(formula) not in self._row_by_id:
             operands = [self.add(operand) for operand in operands_of(formula)]
-            # the formula is stored to stay alive: a new formula could reuse the id of a freed one
+            # the formula is stored to stay alive, because a new formula could reuse the id of a freed formula
             self._row_by_id[id(formula)] = formula, self._added_row(formula, operands)
         return self._row_by_id[id(formula)][1]
 
@@ -139,7 +139,7 @@ class SignalTable:
                 return self._temporal(formula.operator, operands, formula.bound)
 
     def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
-        """Return the number of a row; it is added unless an equal row exists."""
+        """Return the number of a row, which is added if no equal row exists."""
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
@@ -158,7 +158,7 @@ class SignalTable:
         return joined_row
 
     def _temporal(self, operator: str, operands: list[int], bound: Bound | None, ahead: int = 0) -> int:
-        """Add a past operator; with `codes.AHEAD`, the future operator that it equals in reversed time."""
+        """Add a past operator or, with `codes.AHEAD`, the future operator that it equals in reversed time."""
         unit, low, high = window_of(bound)
         match operator:
             case "Y":
@@ -176,8 +176,8 @@ class SignalTable:
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
         """Add a since over a window, phi S[a,b] psi.
 
-        It is rewritten as O[a,b] psi and phi S[a,inf] psi. The latter is phi on the last a, and phi S psi
-        before. Both are exact for robustness, because min distributes over max.
+        It is rewritten as O[a,b] psi and phi S[a,inf] psi. phi S[a,inf] psi is rewritten as phi over the last
+        a, and phi S psi before. Both identities are exact for robustness, because min distributes over max.
         """
         row = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
@@ -190,11 +190,11 @@ class SignalTable:
         return row
 
     def infinity_after(self, unit: int, distance: int, sign: int) -> int:
-        """Add an infinity with this sign from a distance after the first sample on; before, the opposite."""
+        """Add an infinity that has `sign` from a distance after the first sample on, and -`sign` before."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
 
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
-        """Add an operand delayed by a distance; before the first sample it is +inf (weak) or -inf."""
+        """Add an operand delayed by a distance. Before the first sample, it is +inf if weak, else -inf."""
         return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
 
 
@@ -224,15 +224,15 @@ def part_of(signals: SignalTable, node: Temporal) -> PartRows:
 
 
 class PartRows:
-    """The rows of a node that looks ahead, in negation normal form: operands first, equal rows once.
+    """The distinct rows of a node that looks ahead, in negation normal form, operands first.
 
     Attributes:
         variables: number of operators whose value depends on the next sample.
-        tables: number of tables: one of the part, and one for each past operator with its own table.
+        tables: number of tables: the part's table, and one table for each unbounded since or trigger.
     """
 
     def __init__(self, signals: SignalTable, root: Temporal) -> None:
-        """Build the part of a node; `signals` receives the subformulas that do not look ahead."""
+        """Build the part of a node, and add the subformulas that do not look ahead to `signals`."""
         self.variables = 0
         self.tables = 1
         self._rows: dict[Row, int] = {}
@@ -246,7 +246,10 @@ class PartRows:
             self._add(root, True)
 
     def rows(self) -> tuple[Row, ...]:
-        """Return the rows, each with its variable and table, and whether it depends on any of them."""
+        """Return the rows with three more columns.
+
+        They are the row's variable, its table, and whether the row depends on a variable or table.
+        """
         next_variable = 0
         next_table = 1  # 0 is the part's own table
         numbered_rows: list[Row] = []
@@ -275,7 +278,7 @@ class PartRows:
 
     @property
     def end_corner(self) -> int:
-        """The corner of the table that ends a run: +inf for weak operators, -inf for strong ones."""
+        """The corner of the table that ends a run: +inf for weak operators, -inf for strong operators."""
         weak_flags = [row[3] for row in self._rows if row[-1]]
         return sum(1 << variable for variable, is_weak in enumerate(weak_flags) if is_weak)
 
@@ -290,7 +293,7 @@ class PartRows:
         high: int = 0,
         variable: bool = False,
     ) -> int:
-        """Return the number of a row; it is added unless an equal row exists."""
+        """Return the number of a row, which is added if no equal row exists."""
         key = (code, a, b, weak, unit, low, high, int(variable))
         if key not in self._rows:
             self._rows[key] = len(self._rows)
@@ -299,9 +302,9 @@ class PartRows:
         return self._rows[key]
 
     def _add(self, formula: Formula, is_positive: bool) -> int:
-        """Return the row of a formula, or of its negation, in negation normal form.
+        """Return the row of a formula or, if not `is_positive`, of its negation, in negation normal form.
 
-        Each of the two is built once, because the expansion of `xor` has its operands in both.
+        Each of the two rows is built once, because the expansion of `xor` has operands of both signs.
         """
         formula = expand(formula)
         while isinstance(formula, Boolean) and formula.operator == "not":
@@ -372,8 +375,8 @@ class PartRows:
     def _ending(self, formula: Formula, is_positive: bool) -> int:
         """Return the row of a bounded operator that is needed only at the first sample.
 
-        Its window is a fixed interval of the run. In an until, positions outside the window are -inf. From
-        the window's end on, the left operand is -inf, too, so later samples have no effect.
+        The operator's window is a fixed interval of the run. In an until, positions outside the window are
+        -inf. From the window's end on, the left operand is -inf, too, so later samples have no effect.
         """
         formula = expand(formula)
         if isinstance(formula, Boolean) and formula.operator == "not":
@@ -406,14 +409,17 @@ class PartRows:
 
 
 def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:
-    """Return a future operator's operands and bound as for U; X is F[1,1], F and G have no left operand."""
+    """Return a future operator's left operand, right operand and bound as an until.
+
+    X is F[1,1]. X, F and G have no left operand.
+    """
     if operator == "U":
         return operands[0], operands[1], bound
     return NOTHING, operands[0], Bound(1, 1, "samples") if operator == "X" else bound
 
 
 def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
-    """Return the extremum for the right operand of an until or since, and the one for its left operand."""
+    """Return the extremum for the right operand and for the left operand of an until or since."""
     return (greatest, least) if is_strong else (least, greatest)
 
 
@@ -427,7 +433,7 @@ def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
 
 
 class _Direction(NamedTuple):
-    """Codes of nodes below a root that joins by the minimum. For the maximum, each has its dual.
+    """Codes of nodes below a root that joins by the minimum, or their duals for the maximum.
 
     Attributes:
         either, both: codes of "or" and "and".
@@ -462,11 +468,11 @@ def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
 
 
 def known_bounds(rows: tuple[Row, ...]) -> int:
-    """Return the bounds that follow from a part's table regardless of open positions, one bit each.
+    """Return the bounds that follow from a part's table regardless of open positions, one bit per bound.
 
-    Later samples may always violate `G x`, so its lower bound is -inf. Its upper bound depends on closed
-    positions alone if later samples can satisfy x at every open position, as for `F y` and `F y or z`. The
-    table then has this bound, if the same holds for all its variables.
+    Later samples may always violate `G x`, so the lower bound of `G x` is -inf. The upper bound depends on
+    closed positions alone if later samples can satisfy x at every open position, as for `F y` and `F y or z`.
+    The table has this upper bound if all its variables fulfil this condition.
     """
     direction = _direction_of(rows)
     if direction is None:
@@ -494,7 +500,7 @@ def known_bounds(rows: tuple[Row, ...]) -> int:
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
     """Return for each node whether its numbers never fall with new samples, and whether they never rise.
 
-    The numbers are those of a run that ends with the newest sample.
+    A number belongs to a run that ends with the newest sample.
     """
     node_directions = list[tuple[bool, bool]]()
     for code, first_operand, second_operand, is_weak, *_ in rows:
@@ -511,7 +517,10 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
 
 
 def is_monotone(rows: tuple[Row, ...]) -> bool:
-    """Return whether the operand never falls, for a root that joins by the minimum (maximum: never rises)."""
+    """Return whether the operand of a root that joins by the minimum never falls.
+
+    For a root that joins by the maximum, return whether the operand never rises.
+    """
     direction = _direction_of(rows)
     if (
         direction is None
@@ -524,7 +533,7 @@ def is_monotone(rows: tuple[Row, ...]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A formula as tables (see `codes` for their columns).
+    """A formula as tables. Their columns are listed in `codes`.
 
     Attributes:
         leaves: atoms and open quantifiers, the inputs of the kernels at each sample.
@@ -532,10 +541,10 @@ class Program:
         parts: (P, NODE_WIDTH).
         part_rows: for each part (D + 1, NODE_WIDTH), its nodes, then the part itself.
         reports: (N, REPORT_WIDTH), in the order of node ids.
-        rows: (…, NODE_WIDTH), all tables joined: a row with their offsets, signals, parts, reports, operand
-            ids of the nodes of the tree, and nodes of the parts.
+        rows: (…, NODE_WIDTH), all tables joined: a row with the tables' offsets, signals, parts, reports,
+            operand ids of the tree's nodes, and nodes of the parts.
         windows: number of rings of positions that the signals need.
-        table_size: total size of the tables of parts without windows, numbers per channel.
+        table_size: total size of all tables of parts without windows, in numbers per channel.
         keeps_history: whether any window, delay or part reads more than the newest sample.
     """
 
@@ -590,9 +599,9 @@ def _join_rows(
     parts_begin = 1 + len(signals)
     reports_begin = parts_begin + len(parts)
     operands_begin = reports_begin + len(reports)
-    # ceiling division: operand ids fill rows of this width
+    # ceiling division, because operand ids fill whole rows
     next_row = operands_begin + -(-len(operands) // width)
-    # one array: each array argument of a kernel costs time at every sample
+    # a single array, because each array argument of a kernel costs time at every sample
     rows = np.zeros((next_row + sum(len(part_rows) - 1 for part_rows in parts), width), np.int64)
     rows[0, :7] = 1, len(signals), parts_begin, len(parts), reports_begin, len(reports), operands_begin
     rows[1:parts_begin, : codes.SIGNAL_WIDTH] = signals
@@ -610,7 +619,7 @@ def _join_rows(
 
 
 class _Parts:
-    """The parts of a formula; equal parts are stored once.
+    """The distinct parts of a formula.
 
     Attributes:
         literals: signals that parts with windows read.
@@ -657,7 +666,7 @@ class _Parts:
 
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
-    """Yield the rows, with numbers for windows in seconds."""
+    """Yield the rows with one more column, the number of a window or shift in seconds."""
     timed_count = 0
     for row in nodes:
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
@@ -667,7 +676,7 @@ def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
 
 
 def _with_signal_row(row: Row, signals: SignalTable) -> Row:
-    """Return a row; a negated literal is replaced by a literal of the negated signal."""
+    """Return a row, with a literal of the negated signal instead of a negated literal."""
     code, signal, is_negated, *fields = row
     if code != codes.LITERAL or not is_negated:
         return row
@@ -677,7 +686,8 @@ def _with_signal_row(row: Row, signals: SignalTable) -> Row:
 def _now_rule(node: Temporal) -> int:
     """Return the rule for an operator's number on the newest sample alone (`now`).
 
-    A future operator's number follows from its operands' numbers; a past operator's is stored in its part.
+    The number of a future operator follows from its operands' numbers. The number of a past operator is
+    stored in its part.
     """
     if node.operator not in FUTURE_OPERATORS:
         return codes.NOW_OF_PART

@@ -1,16 +1,16 @@
 """Signals and tables: the nodes of a formula without windows into the future.
 
 A signal is a subformula without future operators. Its robustness at a sample is final once that sample has
-come. So it is computed once, forwards, with a little state for past operators.
+come, so it is computed once, forwards, with a little state for past operators.
 
 A table is the value of a formula at the first sample as a function of later values. Let x_1 … x_m be the
 values of a part's unbounded temporal subformulas at the next sample. In negation normal form, the part's
-value is a monotone lattice polynomial of them (minima and maxima only). Its values at the corners x in
-{-inf, +inf}^m determine it: they are its table of 2^m numbers.
+value is a monotone lattice polynomial of x_1 … x_m (minima and maxima only). The polynomial is determined by
+its values at the corners x in {-inf, +inf}^m. These 2^m numbers are the table.
 
 A new sample replaces each x_j by its expansion (max(psi, min(phi, x)) for an until), and reads the old table
 at that point. The first and the last entry bound the value over every continuation. The corner with strong
-operators at -inf and weak ones at +inf is the value if the run ends here.
+operators at -inf and weak operators at +inf is the value if the run ends here.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
-# columns of a sliding window's ring: numbers of positions that have left and entered it, the next position to
-# enter, then the positions that can still attain the extremum
+# columns of a sliding window's ring: number of positions that left the ring, number of positions that entered
+# it, the next position to enter, then the positions that can still attain the extremum
 HEAD, TAIL, ENTERING, RING = range(4)
 
 
 @inlined
 def _delay_place(times: Integers, unit: int, place: int, distance: int) -> int:
-    """Return the last place that is at least `distance` before `place`; negative if there is none.
+    """Return the last place that is at least `distance` before `place`; negative without such a place.
 
     Times are compared by their differences, because a time plus the distance could exceed 64 bits.
     """
@@ -56,7 +56,7 @@ def past_value(code: int, first: float, second: float, before: float) -> float:
 
 @inlined
 def _distance(times: Integers, unit: int, place: int, later: int) -> int:
-    """Return the distance from a place to a later one, in the unit of a window."""
+    """Return the distance from a place to a later place, in the unit of a window."""
     return later - place if unit == codes.SAMPLES else times[0, later] - times[0, place]
 
 
@@ -91,7 +91,7 @@ def _slide(
         oldest_place = 0
         while tail > head:
             oldest_place = times[ring_row, RING + head % ring_size] - offset
-            # a negative place was dropped from the history: it is further back than any window reaches
+            # a negative place was dropped from the history, because no window reaches so far back
             if oldest_place >= 0 and _distance(times, unit, oldest_place, place) <= far_distance:
                 break
             head += 1
@@ -110,7 +110,8 @@ def run_signals(
 
     Args:
         first_leaf: index of the program's first leaf in `leaves`.
-        position: number of the first of these samples in the run; its place in the history is `begin`.
+        position: number of the first of these samples in the run.
+        begin: place of that sample in the history.
         times: times of the recent samples, then a ring for each sliding window and channel.
         memory: (4, …), every signal at the last sample, then at the first sample, by channel.
     """
@@ -188,14 +189,14 @@ def run_signals(
                 memory[channel, signal_count + signal] = history[channel, signal, begin]
 
 
-# work rows of a part, after one row for each of its nodes; its results follow
+# work rows of a part: one row for each node, then these rows, then its results
 VALUES, FRESH, POINT, RESULTS = range(4)
 EXTRA_ROWS = 6
 
 
 @inlined
 def read_table(tables: Floats, row: int, first: int, variables: int, points: Floats, point: int) -> float:
-    """Read a table at a point: walk its corners in descending order of the coordinates.
+    """Read a table at a point by a walk over its corners, in descending order of the point's coordinates.
 
     Args:
         tables, row, first: array, row and column of the table's begin.
@@ -305,12 +306,13 @@ def run_table(
 
     Args:
         part: row of the part.
-        table: begin of its table in the `memory` of the channel.
+        table: begin of the part's table in the `memory` of the channel.
         top: first free row of `work`.
-        position: number of the first of the `count` samples; its place in the history is `begin`.
+        position: number of the first of the `count` samples in the run.
+        begin: place of that sample in the history.
 
     Returns:
-        the row of `work` with its value; the rows of its lower and upper bound follow.
+        the row of `work` with the part's value. The rows of its lower and its upper bound follow.
     """
     first_row, end_row = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
     variable_count, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
@@ -328,7 +330,7 @@ def run_table(
     if position == 0:
         _start(rows, first_row, end_row, corner_count, memory, channel, table, work, values_row)
     elif memory[channel, table] == memory[channel, table + corner_count - 1]:
-        # the extreme corners agree: no later sample can change the value
+        # the extreme corners are equal, so no later sample can change the value
         for sample in range(count):
             work[first_result, sample] = work[first_result + 1, sample] = work[first_result + 2, sample] = (
                 memory[channel, table]
