@@ -77,23 +77,23 @@ def _combine(code: int, left: float, left_mirror: float, right: float, right_mir
 @inlined
 def _join(code: int, work: Floats, target: int, source: int, count: int) -> None:
     if code == codes.REPORT_AND:
-        for k in range(count):
-            work[target, k] = min(work[target, k], work[source, k])
+        for sample in range(count):
+            work[target, sample] = min(work[target, sample], work[source, sample])
     else:
-        for k in range(count):
-            work[target, k] = max(work[target, k], work[source, k])
+        for sample in range(count):
+            work[target, sample] = max(work[target, sample], work[source, sample])
 
 
 @inlined
 def _copy(work: Floats, source: int, target: int, count: int) -> None:
-    for k in range(count):
-        work[target, k] = work[source, k]
+    for sample in range(count):
+        work[target, sample] = work[source, sample]
 
 
 @inlined
 def _fill(work: Floats, target: int, value: float, count: int) -> None:
-    for k in range(count):
-        work[target, k] = value
+    for sample in range(count):
+        work[target, sample] = value
 
 
 @piece
@@ -108,75 +108,100 @@ def report(
         work: numbers of the parts; then output: numbers of the nodes and the series.
         begin: place of these samples in the history.
     """
-    first, number = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
-    operands, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
-    nodes_at, row_count = NUMBERS * rows[0, codes.HEAD_PARTS], SERIES if channels == 1 else NUMBERS
-    for n in range(number - 1, -1, -1):
-        row = first + n
+    first_report, node_count = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
+    operands_begin, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
+    nodes_begin, row_count = NUMBERS * rows[0, codes.HEAD_PARTS], SERIES if channels == 1 else NUMBERS
+    for node in range(node_count - 1, -1, -1):
+        row = first_report + node
         code, index, rule = (
             rows[row, codes.REPORT_CODE],
             rows[row, codes.REPORT_INDEX],
             rows[row, codes.REPORT_RULE],
         )
-        start, stop, left, right = rows[row, codes.REPORT_FIRST], rows[row, codes.REPORT_END], 0, 0
-        if stop > start:
-            left = nodes_at + NUMBERS * rows[operands + start // width, start % width]
-            right = nodes_at + NUMBERS * rows[operands + (stop - 1) // width, (stop - 1) % width]
-        for r in range(row_count):
-            target, part, mirror = nodes_at + NUMBERS * n + r, NUMBERS * index + r, _mirror(r, channels)
-            channel, is_now = _channel(r, channels), r == 1 if channels == 1 else r in (2, 3)
+        operand_start, operand_stop, left_begin, right_begin = (
+            rows[row, codes.REPORT_FIRST],
+            rows[row, codes.REPORT_END],
+            0,
+            0,
+        )
+        if operand_stop > operand_start:
+            left_begin = (
+                nodes_begin + NUMBERS * rows[operands_begin + operand_start // width, operand_start % width]
+            )
+            right_begin = (
+                nodes_begin
+                + NUMBERS * rows[operands_begin + (operand_stop - 1) // width, (operand_stop - 1) % width]
+            )
+        for number_row in range(row_count):
+            target_row, part_row, mirror_row = (
+                nodes_begin + NUMBERS * node + number_row,
+                NUMBERS * index + number_row,
+                _mirror(number_row, channels),
+            )
+            channel, is_now = (
+                _channel(number_row, channels),
+                number_row == 1 if channels == 1 else number_row in (2, 3),
+            )
             if is_now and code == codes.REPORT_SIGNAL:
-                for k in range(count):
-                    work[target, k] = history[channel, index, begin + k]
+                for sample in range(count):
+                    work[target_row, sample] = history[channel, index, begin + sample]
             elif code == codes.REPORT_SIGNAL:  # the value of a signal at the first sample is final
-                _fill(work, target, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
+                _fill(work, target_row, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
             elif code == codes.REPORT_PART:
                 if not is_now or rule == codes.NOW_OF_PART:
-                    _copy(work, part, target, count)
+                    _copy(work, part_row, target_row, count)
                 elif rule in (codes.NOW_LAST_OPERAND, codes.NOW_EITHER):
-                    _copy(work, right + r, target, count)
+                    _copy(work, right_begin + number_row, target_row, count)
                     if rule == codes.NOW_EITHER:
-                        _join(codes.REPORT_OR, work, target, left + r, count)
+                        _join(codes.REPORT_OR, work, target_row, left_begin + number_row, count)
                 else:
-                    _fill(work, target, np.inf if rule == codes.NOW_TRUE else -np.inf, count)
+                    _fill(work, target_row, np.inf if rule == codes.NOW_TRUE else -np.inf, count)
             elif code == codes.REPORT_NOT:
-                for k in range(count):
-                    work[target, k] = -work[left + mirror, k]
+                for sample in range(count):
+                    work[target_row, sample] = -work[left_begin + mirror_row, sample]
             elif code in (codes.REPORT_AND, codes.REPORT_OR, codes.REPORT_SPEC):
-                _copy(work, left + r, target, count)
-                for place in range(start + 1, stop):
-                    operand = nodes_at + NUMBERS * rows[operands + place // width, place % width]
-                    _join(code, work, target, operand + r, count)
-            else:
-                for k in range(count):
-                    work[target, k] = _combine(
-                        code,
-                        work[left + r, k],
-                        work[left + mirror, k],
-                        work[right + r, k],
-                        work[right + mirror, k],
+                _copy(work, left_begin + number_row, target_row, count)
+                for operand_index in range(operand_start + 1, operand_stop):
+                    operand_begin = (
+                        nodes_begin
+                        + NUMBERS * rows[operands_begin + operand_index // width, operand_index % width]
                     )
-    _write_series(work, nodes_at, nodes_at + NUMBERS * number, number, channels, count)
+                    _join(code, work, target_row, operand_begin + number_row, count)
+            else:
+                for sample in range(count):
+                    work[target_row, sample] = _combine(
+                        code,
+                        work[left_begin + number_row, sample],
+                        work[left_begin + mirror_row, sample],
+                        work[right_begin + number_row, sample],
+                        work[right_begin + mirror_row, sample],
+                    )
+    _write_series(work, nodes_begin, nodes_begin + NUMBERS * node_count, node_count, channels, count)
 
 
 @inlined
-def _write_series(work: Floats, first: int, series: int, number: int, channels: int, count: int) -> None:
+def _write_series(
+    work: Floats, nodes_begin: int, series_begin: int, node_count: int, channels: int, count: int
+) -> None:
     """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers have equal bits.
     """
-    for n in range(number):
-        for r in range(SERIES):
-            target, source = series + SERIES * n + r, first + NUMBERS * n + r
-            if channels > 1 and r < 2:
-                source += r
-                for k in range(count):
-                    low, high = work[source, k], work[source + 1, k]
-                    work[target, k] = low + 0.0 if low == high else np.nan
+    for node in range(node_count):
+        for number_row in range(SERIES):
+            target_row, source_row = (
+                series_begin + SERIES * node + number_row,
+                nodes_begin + NUMBERS * node + number_row,
+            )
+            if channels > 1 and number_row < 2:
+                source_row += number_row
+                for sample in range(count):
+                    low, high = work[source_row, sample], work[source_row + 1, sample]
+                    work[target_row, sample] = low + 0.0 if low == high else np.nan
             else:
-                source += 0 if channels == 1 else 2
-                for k in range(count):
-                    work[target, k] = work[source, k] + 0.0
+                source_row += 0 if channels == 1 else 2
+                for sample in range(count):
+                    work[target_row, sample] = work[source_row, sample] + 0.0
 
 
 TILE = 1024
@@ -207,27 +232,41 @@ def run_samples(
         work: rows for the numbers of parts and nodes, for the series, and for intermediate numbers.
         position: number of the first of these `count` samples; its place in the history is `begin`.
     """
-    channels, signals, parts = leaves.shape[0], rows[0, codes.HEAD_SIGNALS], rows[0, codes.HEAD_PARTS]
+    channel_count, signal_count, part_count = (
+        leaves.shape[0],
+        rows[0, codes.HEAD_SIGNALS],
+        rows[0, codes.HEAD_PARTS],
+    )
     if phases & BEGIN:
         run_signals(rows, leaves, first_leaf, t, count, position, begin, start_ns, history, times, memory)
-        top = NUMBERS * parts + (NUMBERS + SERIES) * rows[0, codes.HEAD_REPORTS]
-        for p in range(parts):
-            part = rows[0, codes.HEAD_PARTS_AT] + p
-            table = 2 * signals + rows[part, codes.PART_TABLE_START]
-            for channel in range(channels if rows[part, codes.PART_KIND] == codes.TABLE else 0):
+        free_row = NUMBERS * part_count + (NUMBERS + SERIES) * rows[0, codes.HEAD_REPORTS]
+        for part_number in range(part_count):
+            part_row = rows[0, codes.HEAD_PARTS_AT] + part_number
+            table_begin = 2 * signal_count + rows[part_row, codes.PART_TABLE_START]
+            for channel in range(channel_count if rows[part_row, codes.PART_KIND] == codes.TABLE else 0):
                 first_result = run_table(
-                    rows, part, history, channel, memory, table, work, top, position, begin, count
+                    rows,
+                    part_row,
+                    history,
+                    channel,
+                    memory,
+                    table_begin,
+                    work,
+                    free_row,
+                    position,
+                    begin,
+                    count,
                 )
                 for mode in range(3):
-                    row = result_row(mode, channel, channels)
+                    row = result_row(mode, channel, channel_count)
                     if row >= 0:
-                        for k in range(count):
-                            work[NUMBERS * p + row, k] = work[first_result + mode, k]
-                if channels > 1 and channel >= channels - 2:
-                    for k in range(count):
-                        work[NUMBERS * p + 6 + (channel & 1), k] = work[first_result, k]
+                        for sample in range(count):
+                            work[NUMBERS * part_number + row, sample] = work[first_result + mode, sample]
+                if channel_count > 1 and channel >= channel_count - 2:
+                    for sample in range(count):
+                        work[NUMBERS * part_number + 6 + (channel & 1), sample] = work[first_result, sample]
     if phases & FINISH:
-        report(rows, history, memory, work, channels, begin, count)
+        report(rows, history, memory, work, channel_count, begin, count)
 
 
 @kernel
@@ -251,9 +290,9 @@ def run_sample(
         # in the same kernel: with two kernels and arrays between them, an update took 1.4 times as long
         channels = measure_sample(whole, real, sample, end, leaves)
         # a run with more channels than the leaves reads copies (see `codes.in_channels`)
-        for c in range(channels, CHANNELS):
+        for channel in range(channels, CHANNELS):
             for leaf in range(leaves.shape[1]):
-                leaves[c, leaf, 0] = leaves[c % channels, leaf, 0]
+                leaves[channel, leaf, 0] = leaves[channel % channels, leaf, 0]
     if channels > run_channels:
         return channels
     if phases & BEGIN:
@@ -263,10 +302,10 @@ def run_sample(
         start_ns, phases,
     )  # fmt: skip
     if phases & FINISH:
-        series = NUMBERS * (rows[0, codes.HEAD_PARTS] + rows[0, codes.HEAD_REPORTS])
+        series_begin = NUMBERS * (rows[0, codes.HEAD_PARTS] + rows[0, codes.HEAD_REPORTS])
         for node in range(numbers.shape[0]):
-            for k in range(SERIES):
-                numbers[node, k] = work[series + SERIES * node + k, 0]
+            for number_row in range(SERIES):
+                numbers[node, number_row] = work[series_begin + SERIES * node + number_row, 0]
     return channels
 
 
@@ -274,23 +313,23 @@ class _OpenPart:
     """State of one part with windows in one channel, for `run_windows`."""
 
     def __init__(self, rows: Integers, room: int) -> None:
-        nodes, part, timed = len(rows) - 1, rows[-1], int(rows[:-1, codes.NODE_TIMED].max()) + 1
-        variables, count = int(part[codes.PART_VARIABLES]), int(part[codes.PART_TABLES])
-        self.rows, self._nodes = rows, nodes
-        self.tables = np.zeros((2 * count + 2, max(1 << variables, count)))
-        self.columns = np.empty((windows.EXTRA * nodes + windows.EXTRA_ROWS, room))
-        width = max(room, nodes, windows.NEXT + 2 * timed)
-        self.state = np.zeros((windows.STARTS + 2 * timed, width), np.int64)
+        node_count, part, timed_count = len(rows) - 1, rows[-1], int(rows[:-1, codes.NODE_TIMED].max()) + 1
+        variable_count, table_count = int(part[codes.PART_VARIABLES]), int(part[codes.PART_TABLES])
+        self.rows, self._node_count = rows, node_count
+        self.tables = np.zeros((2 * table_count + 2, max(1 << variable_count, table_count)))
+        self.columns = np.empty((windows.EXTRA * node_count + windows.EXTRA_ROWS, room))
+        state_width = max(room, node_count, windows.NEXT + 2 * timed_count)
+        self.state = np.zeros((windows.STARTS + 2 * timed_count, state_width), np.int64)
         self.state[windows.HEAD, windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
-        self.state[windows.STATE, :nodes] = -1
+        self.state[windows.STATE, :node_count] = -1
 
     def copy(self, room: int) -> _OpenPart:
         """Return a copy of the state without the columns, which are computed again."""
         part = _OpenPart(self.rows, room)
         part.tables[:] = self.tables
         part.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
-        part.state[windows.LOWS : windows.STARTS, : self._nodes] = self.state[
-            windows.LOWS : windows.STARTS, : self._nodes
+        part.state[windows.LOWS : windows.STARTS, : self._node_count] = self.state[
+            windows.LOWS : windows.STARTS, : self._node_count
         ]
         return part
 
@@ -302,24 +341,24 @@ class _OpenPart:
         # windows in seconds are recorded again for the new positions
         head[windows.ENTERED :] = 0
         head[windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
-        self.state[[windows.LOWS, windows.BOUNDARY], : self._nodes] -= drop_count
+        self.state[[windows.LOWS, windows.BOUNDARY], : self._node_count] -= drop_count
         # -1 stays: there is no state yet
-        self.state[windows.STATE, : self._nodes] -= np.where(
-            self.state[windows.STATE, : self._nodes] < 0, 0, drop_count
+        self.state[windows.STATE, : self._node_count] -= np.where(
+            self.state[windows.STATE, : self._node_count] < 0, 0, drop_count
         )
 
     @property
     def kept_from(self) -> int | None:
         """The first position that it may still read; None if there is none."""
-        is_begun, last = (
+        is_begun, last_corner = (
             self.state[windows.HEAD, windows.IS_BEGUN],
             (1 << self.rows[-1, codes.PART_VARIABLES]) - 1,
         )
         # the extreme corners of a monotone table bound all others
-        is_constant = is_begun and self.tables[0, 0] == self.tables[0, last]
+        is_constant = is_begun and self.tables[0, 0] == self.tables[0, last_corner]
         if is_constant and not self.rows[-1, codes.PART_HAS_NOW]:
             return None
-        return int(self.state[windows.LOWS, : self._nodes].min())
+        return int(self.state[windows.LOWS, : self._node_count].min())
 
 
 class OnlineRun:
@@ -340,21 +379,25 @@ class OnlineRun:
         """
         self._program, self._tile = program, tile
         self.room = room = max(room, tile) if program.keeps_history else tile
-        signals, parts, reports = len(program.signals), len(program.parts), len(program.reports)
-        self._history = np.zeros((CHANNELS, signals, room))
+        signal_count, part_count, node_count = len(program.signals), len(program.parts), len(program.reports)
+        self._history = np.zeros((CHANNELS, signal_count, room))
         self._times = np.zeros((1 + CHANNELS * program.windows, room + RING), np.int64)
-        self._memory = np.zeros((CHANNELS, 2 * signals + program.table_size))
-        nodes = max((len(rows) for rows in program.part_rows), default=0)
-        corners = 1 << max((int(part[codes.PART_VARIABLES]) for part in program.parts), default=0)
-        shape = (
-            NUMBERS * parts + (NUMBERS + SERIES) * reports + nodes + EXTRA_ROWS,
-            max(tile, nodes, corners),
+        self._memory = np.zeros((CHANNELS, 2 * signal_count + program.table_size))
+        most_rows = max((len(rows) for rows in program.part_rows), default=0)
+        most_corners = 1 << max((int(part[codes.PART_VARIABLES]) for part in program.parts), default=0)
+        work_shape = (
+            NUMBERS * part_count + (NUMBERS + SERIES) * node_count + most_rows + EXTRA_ROWS,
+            max(tile, most_rows, most_corners),
         )
-        self._work = np.zeros(shape)
-        series_at = NUMBERS * (parts + reports)
-        self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
-        self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
-        self._shape = reports, SERIES
+        self._work = np.zeros(work_shape)
+        series_begin = NUMBERS * (part_count + node_count)
+        self._numbers = self._work[NUMBERS * part_count : series_begin].reshape(
+            node_count, NUMBERS, work_shape[1]
+        )
+        self._series = self._work[series_begin : series_begin + SERIES * node_count].reshape(
+            node_count, SERIES, work_shape[1]
+        )
+        self._numbers_shape = node_count, SERIES
         self._begin()
 
     def restart(self) -> None:
@@ -365,8 +408,8 @@ class OnlineRun:
 
     def _begin(self) -> None:
         self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
-        self._newest = 0  # place of the newest sample's numbers
-        self._open = [
+        self._newest_place = 0  # place of the newest sample's numbers
+        self._open_parts = [
             (number, [_OpenPart(rows, self.room)])
             for number, rows in enumerate(self._program.part_rows)
             if rows[-1, codes.PART_KIND] == codes.WINDOWED
@@ -382,7 +425,7 @@ class OnlineRun:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
         ends = [0, 0] if self._channels == 1 else [6, 7]
         # adding zero turns -0.0 into 0.0
-        return np.asarray(self._numbers[:, ends, self._newest] + 0.0)
+        return np.asarray(self._numbers[:, ends, self._newest_place] + 0.0)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
@@ -399,18 +442,20 @@ class OnlineRun:
         Raises:
             ValueError: the shapes do not match; kernels would read beyond the arrays.
         """
-        shape = len(self._program.leaves), len(times_ns)
-        if leaves.shape[1:] != shape or len(leaves) not in (1, 2, 4):
-            raise ValueError(f"leaves have the shape {leaves.shape}; the program needs (1, 2 or 4, *{shape})")
+        leaf_shape = len(self._program.leaves), len(times_ns)
+        if leaves.shape[1:] != leaf_shape or len(leaves) not in (1, 2, 4):
+            raise ValueError(
+                f"leaves have the shape {leaves.shape}; the program needs (1, 2 or 4, *{leaf_shape})"
+            )
         self.widen(len(leaves))
         # a copy: kernels are compiled for writable arrays in C order
         leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")
         series, begin = empty((len(self._program.reports), SERIES, len(times_ns))), 0
         while begin < len(times_ns):
-            count = self._make_room(min(self._tile, len(times_ns) - begin))
-            self._add(leaves, times_ns[begin : begin + count], begin, count)
-            series[:, :, begin : begin + count] = self._series[:, :, :count]
-            begin += count
+            sample_count = self._make_room(min(self._tile, len(times_ns) - begin))
+            self._add(leaves, times_ns[begin : begin + sample_count], begin, sample_count)
+            series[:, :, begin : begin + sample_count] = self._series[:, :, :sample_count]
+            begin += sample_count
         return series
 
     def widen(self, channels: int) -> None:
@@ -422,7 +467,7 @@ class OnlineRun:
             if old_channels == 1:
                 state[1] = state[0]
             state[2:] = state[:2]
-        for _, parts in self._open:
+        for _, parts in self._open_parts:
             parts += [
                 parts[channel % old_channels].copy(self.room) for channel in range(old_channels, channels)
             ]
@@ -443,8 +488,8 @@ class OnlineRun:
         begin = position - self._offset
         if position == 0:
             self._start_ns = time_ns
-        numbers = np.empty(self._shape)
-        phases = BEGIN if self._open else BEGIN | FINISH
+        numbers = np.empty(self._numbers_shape)
+        phases = BEGIN if self._open_parts else BEGIN | FINISH
         # a sample that needs more channels than the run has is run again after `widen`
         while True:
             room.channels = channels = run_sample(
@@ -458,7 +503,7 @@ class OnlineRun:
             else:
                 self._run_all_open(begin, 1)
                 phases = FINISH
-        self._position, self._newest = position + 1, 0
+        self._position, self._newest_place = position + 1, 0
         return numbers
 
     def _add(self, leaves: Floats, times_ns: Integers, t: int, count: int) -> None:
@@ -473,24 +518,24 @@ class OnlineRun:
         self._stamps[begin : begin + count] = times_ns
         if self._position == 0:
             self._start_ns = int(self._stamps[begin])
-        arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
-        numbers = 0, t, count, self._position, begin, self._start_ns
-        if not self._open:
-            run_samples(*arrays, *numbers, BEGIN | FINISH)
+        kernel_arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
+        kernel_numbers = 0, t, count, self._position, begin, self._start_ns
+        if not self._open_parts:
+            run_samples(*kernel_arrays, *kernel_numbers, BEGIN | FINISH)
         else:
-            run_samples(*arrays, *numbers, BEGIN)
+            run_samples(*kernel_arrays, *kernel_numbers, BEGIN)
             self._run_all_open(begin, count)
-            run_samples(*arrays, *numbers, FINISH)
+            run_samples(*kernel_arrays, *kernel_numbers, FINISH)
         self._position += count
-        self._newest = count - 1
+        self._newest_place = count - 1
 
     def _run_all_open(self, begin: int, count: int) -> None:
         """Run the parts with windows in all channels."""
-        for number, parts in self._open:
+        for part_number, parts in self._open_parts:
             for channel, part in enumerate(parts):
-                self._run_open(number, channel, part, begin, count)
+                self._run_open(part_number, channel, part, begin, count)
 
-    def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
+    def _run_open(self, part_number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
         """Run a part in one channel, and store its results."""
         channels, is_high = self._channels, channel & 1
         # bounds include uncertainty, so they come from the last two channels
@@ -500,7 +545,7 @@ class OnlineRun:
             begin, count, bounds,
         )  # fmt: skip
         results = part.columns[-SERIES:, :count]
-        rows = self._work[NUMBERS * number : NUMBERS * (number + 1), :count]
+        rows = self._work[NUMBERS * part_number : NUMBERS * (part_number + 1), :count]
         if channels == 1:
             rows[:SERIES] = results
             return
@@ -519,36 +564,38 @@ class OnlineRun:
         """Return the rings of sliding windows, (W, CHANNELS, …)."""
         return self._times[1:].reshape(-1, CHANNELS, self._times.shape[1])
 
-    def _make_room(self, requested: int) -> int:
+    def _make_room(self, requested_count: int) -> int:
         """Make room for at least one of the requested samples; return the number that fits."""
         if not self._program.keeps_history:
-            return min(requested, self.room)
-        used = self._position - self._offset
-        if used + requested > self.room:
-            drop_count = self._kept_from() if used else 0
+            return min(requested_count, self.room)
+        used_count = self._position - self._offset
+        if used_count + requested_count > self.room:
+            drop_count = self._kept_from() if used_count else 0
             # dropping less than half would move numbers often; the capacity doubles instead
             if 2 * drop_count >= self.room:
-                self._forget(drop_count, used - drop_count)
-                used -= drop_count
-            elif used == self.room:
+                self._forget(drop_count, used_count - drop_count)
+                used_count -= drop_count
+            elif used_count == self.room:
                 self._grow()
-        return min(requested, self.room - used)
+        return min(requested_count, self.room - used_count)
 
     def _kept_from(self) -> int:
         """Return the first of the recent samples that may still be read after the newest one."""
-        last = self._position - self._offset - 1
-        first_needed, stamps = last, self._stamps[: last + 1]
+        last_place = self._position - self._offset - 1
+        first_needed, stamps = last_place, self._stamps[: last_place + 1]
         for code, _, _, unit, low, high, *_ in self._program.signals.tolist():
             if code not in (codes.DELAY, *codes.RINGS):
                 continue
-            far = low if code == codes.DELAY else high
+            far_distance = low if code == codes.DELAY else high
             if unit == codes.SAMPLES:
-                first_needed = min(first_needed, last - far)
+                first_needed = min(first_needed, last_place - far_distance)
             else:
-                behind = stamps[last] - stamps
+                distances_ns = stamps[last_place] - stamps
                 # a delay also reads the last sample that is further back
-                first_needed = min(first_needed, int(np.count_nonzero(behind > far)) - (code == codes.DELAY))
-        for _, parts in self._open:
+                first_needed = min(
+                    first_needed, int(np.count_nonzero(distances_ns > far_distance)) - (code == codes.DELAY)
+                )
+        for _, parts in self._open_parts:
             for part in parts:
                 part_start = part.kept_from
                 first_needed = first_needed if part_start is None else min(first_needed, part_start)
@@ -559,9 +606,9 @@ class OnlineRun:
         self._stamps[:keep_count] = self._stamps[drop_count : drop_count + keep_count].copy()
         signals = np.flatnonzero(self._program.signals[:, codes.SIGNAL_IS_KEPT])
         for signal in signals.tolist():
-            recent = self._history[: self._channels, signal]
-            recent[:, :keep_count] = recent[:, drop_count : drop_count + keep_count].copy()
-        for _, parts in self._open:
+            signal_numbers = self._history[: self._channels, signal]
+            signal_numbers[:, :keep_count] = signal_numbers[:, drop_count : drop_count + keep_count].copy()
+        for _, parts in self._open_parts:
             for part in parts:
                 part.forget(drop_count)
         self._offset += drop_count
@@ -569,16 +616,16 @@ class OnlineRun:
     def _grow(self) -> None:
         """Double the capacity."""
         old_room, self.room = self.room, 2 * self.room
-        history = np.zeros((*self._history.shape[:2], self.room))
-        history[: self._channels, :, :old_room] = self._history[: self._channels]
-        times = np.zeros((len(self._times), self.room + RING), np.int64)
-        times[0, :old_room] = self._stamps
-        for ring, grown in zip(self._times[1:], times[1:], strict=True):
+        new_history = np.zeros((*self._history.shape[:2], self.room))
+        new_history[: self._channels, :, :old_room] = self._history[: self._channels]
+        new_times = np.zeros((len(self._times), self.room + RING), np.int64)
+        new_times[0, :old_room] = self._stamps
+        for ring, new_ring in zip(self._times[1:], new_times[1:], strict=True):
             # places in a ring are modulo the capacity, which changes
             entries = np.arange(ring[HEAD], ring[TAIL])
-            grown[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
-            grown[RING + entries % self.room] = ring[RING + entries % old_room]
-        self._history, self._times = history, times
-        for _, parts in self._open:
+            new_ring[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
+            new_ring[RING + entries % self.room] = ring[RING + entries % old_room]
+        self._history, self._times = new_history, new_times
+        for _, parts in self._open_parts:
             parts[:] = [part.copy(self.room) for part in parts]
         self._refresh_views()

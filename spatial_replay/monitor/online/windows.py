@@ -84,16 +84,16 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
     sign = 1.0 if is_greatest else -1.0
     v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = sign * start
     # the loop is vectorised only if numba knows that no index is negative, because it wraps those around
-    k = max(begin, 0)
-    while k + 8 <= end:
-        v0, v1 = max(v0, sign * columns[row, k]), max(v1, sign * columns[row, k + 1])
-        v2, v3 = max(v2, sign * columns[row, k + 2]), max(v3, sign * columns[row, k + 3])
-        v4, v5 = max(v4, sign * columns[row, k + 4]), max(v5, sign * columns[row, k + 5])
-        v6, v7 = max(v6, sign * columns[row, k + 6]), max(v7, sign * columns[row, k + 7])
-        k += 8
+    place = max(begin, 0)
+    while place + 8 <= end:
+        v0, v1 = max(v0, sign * columns[row, place]), max(v1, sign * columns[row, place + 1])
+        v2, v3 = max(v2, sign * columns[row, place + 2]), max(v3, sign * columns[row, place + 3])
+        v4, v5 = max(v4, sign * columns[row, place + 4]), max(v5, sign * columns[row, place + 5])
+        v6, v7 = max(v6, sign * columns[row, place + 6]), max(v7, sign * columns[row, place + 7])
+        place += 8
     value = max(max(max(v0, v1), max(v2, v3)), max(max(v4, v5), max(v6, v7)))
-    for i in range(k, end):
-        value = max(value, sign * columns[row, i])
+    for late_place in range(place, end):
+        value = max(value, sign * columns[row, late_place])
     return sign * value
 
 
@@ -101,41 +101,47 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
 
 
 @inlined
-def window_of(rows: Integers, d: int) -> tuple[bool, int, int, int, int]:
+def window_of(rows: Integers, node: int) -> tuple[bool, int, int, int, int]:
     """Return whether a node looks ahead, its window's unit and ends, and the row of its window's times."""
-    is_ahead = codes.PART_WINDOW_MAX <= rows[d, codes.NODE_CODE] <= codes.SHIFT
-    times = STARTS + 2 * rows[d, codes.NODE_TIMED]
-    return is_ahead, rows[d, codes.NODE_UNIT], rows[d, codes.NODE_LOW], rows[d, codes.NODE_HIGH], times
+    is_ahead = codes.PART_WINDOW_MAX <= rows[node, codes.NODE_CODE] <= codes.SHIFT
+    times_row = STARTS + 2 * rows[node, codes.NODE_TIMED]
+    return (
+        is_ahead,
+        rows[node, codes.NODE_UNIT],
+        rows[node, codes.NODE_LOW],
+        rows[node, codes.NODE_HIGH],
+        times_row,
+    )
 
 
 @inlined
 def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
     """Return the first position in a window; last + 1 if the window has not begun."""
-    is_ahead, unit, near, far, times = window
+    is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
-        return int(min(state[times, position], last + 1))
-    return min(position + near, last + 1) if is_ahead else max(position - far, 0)
+        return int(min(state[times_row, position], last + 1))
+    return min(position + near_end, last + 1) if is_ahead else max(position - far_end, 0)
 
 
 @inlined
 def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
     """Return the last position in a window plus one, at most last + 1."""
-    is_ahead, unit, near, far, times = window
+    is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
-        return int(min(state[times + 1, position], last + 1))
-    return min(position + far, last) + 1 if is_ahead else position - near + 1
+        return int(min(state[times_row + 1, position], last + 1))
+    return min(position + far_end, last) + 1 if is_ahead else position - near_end + 1
 
 
 @inlined
 def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
     """Return the first position whose window ends at `position` or later."""
-    is_ahead, unit, near, far, times = window
+    is_ahead, unit, near_end, far_end, times_row = window
     if unit == codes.SAMPLES:
-        return max(position - far, 0) if is_ahead else position + near
+        return max(position - far_end, 0) if is_ahead else position + near_end
     low, high = 0, last + 1
     while low < high:
         middle = (low + high) >> 1
-        if state[times + 1, middle] <= position:
+        if state[times_row + 1, middle] <= position:
             low = middle + 1
         else:
             high = middle
@@ -147,13 +153,13 @@ def _first_starting(
     state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int
 ) -> int:
     """Return the first position whose window ahead starts at `position` or later."""
-    _, unit, near, _, times = window
+    _, unit, near_end, _, times_row = window
     if unit == codes.SAMPLES:
-        return max(position - near, 0)
+        return max(position - near_end, 0)
     low, high = 0, last + 1
     while low < high:
         middle = (low + high) >> 1
-        if state[times, middle] < position:
+        if state[times_row, middle] < position:
             low = middle + 1
         else:
             high = middle
@@ -163,39 +169,45 @@ def _first_starting(
 @inlined
 def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int) -> int:
     """Return the first position whose window ahead may get a later sample."""
-    _, unit, _, far, times = window
+    _, unit, _, far_end, times_row = window
     if unit == codes.SAMPLES:
-        return max(last - far + 1, 0)
-    first = state[HEAD, NEXT + times + 1 - STARTS]
-    return int(first + 1 if stamps[last] - stamps[first] == far else first)
+        return max(last - far_end + 1, 0)
+    next_close = state[HEAD, NEXT + times_row + 1 - STARTS]
+    return int(next_close + 1 if stamps[last] - stamps[next_close] == far_end else next_close)
 
 
 @inlined
 def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
     """Record which windows in seconds begin or have ended with the newest samples."""
-    for d in range(len(rows) - 1):
-        if rows[d, codes.NODE_TIMED] < 0:
+    for node in range(len(rows) - 1):
+        if rows[node, codes.NODE_TIMED] < 0:
             continue
-        is_ahead, _, near, far, times = window_of(rows, d)
-        next_begin, next_close = state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS]
+        is_ahead, _, near_end, far_end, times_row = window_of(rows, node)
+        next_begin, next_close = (
+            state[HEAD, NEXT + times_row - STARTS],
+            state[HEAD, NEXT + times_row + 1 - STARTS],
+        )
         for position in range(state[HEAD, ENTERED], last + 1):
             time_ns = stamps[position]
             if is_ahead:
-                state[times, position] = state[times + 1, position] = _NEVER
-                while next_begin <= position and time_ns - stamps[next_begin] >= near:
-                    state[times, next_begin] = position
+                state[times_row, position] = state[times_row + 1, position] = _NEVER
+                while next_begin <= position and time_ns - stamps[next_begin] >= near_end:
+                    state[times_row, next_begin] = position
                     next_begin += 1
                 # far is -1 without an upper end
-                while far >= 0 and next_close < position and time_ns - stamps[next_close] > far:
-                    state[times + 1, next_close] = position
+                while far_end >= 0 and next_close < position and time_ns - stamps[next_close] > far_end:
+                    state[times_row + 1, next_close] = position
                     next_close += 1
             else:
-                while next_begin < position and time_ns - stamps[next_begin] > far:
+                while next_begin < position and time_ns - stamps[next_begin] > far_end:
                     next_begin += 1
-                while next_close <= position and time_ns - stamps[next_close] >= near:
+                while next_close <= position and time_ns - stamps[next_close] >= near_end:
                     next_close += 1
-                state[times, position], state[times + 1, position] = next_begin, next_close
-        state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS] = next_begin, next_close
+                state[times_row, position], state[times_row + 1, position] = next_begin, next_close
+        state[HEAD, NEXT + times_row - STARTS], state[HEAD, NEXT + times_row + 1 - STARTS] = (
+            next_begin,
+            next_close,
+        )
     state[HEAD, ENTERED] = last + 1
 
 
@@ -205,7 +217,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
 @inlined
 def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    child: int, column: int, scratch: int, begin: int, end: int, last: int,
+    operand_column: int, column: int, scratch_row: int, begin: int, end: int, last: int,
 ) -> int:  # fmt: skip
     """Compute extrema over the windows of positions begin … end - 1.
 
@@ -215,40 +227,40 @@ def _slide(
     Returns:
         the first position whose number changes; last + 1 for none.
     """
-    nothing, changed = -np.inf if is_greatest else np.inf, last + 1
+    neutral, first_change = -np.inf if is_greatest else np.inf, last + 1
     while begin < end:
-        middle, stop = _after(state, window, begin, last), end
-        at = _start(state, window, end - 1, last)
-        if at >= middle:
-            stop, at = begin + 1, _start(state, window, begin, last)
-            while stop < end and _start(state, window, stop, last) < middle:
-                at = _start(state, window, stop, last)
+        scan_end, stop = _after(state, window, begin, last), end
+        scan_begin = _start(state, window, end - 1, last)
+        if scan_begin >= scan_end:
+            stop, scan_begin = begin + 1, _start(state, window, begin, last)
+            while stop < end and _start(state, window, stop, last) < scan_end:
+                scan_begin = _start(state, window, stop, last)
                 stop += 1
-        value = extremum(is_greatest, columns, child, at, middle, nothing)
+        value = extremum(is_greatest, columns, operand_column, scan_begin, scan_end, neutral)
         for position in range(stop - 1, begin - 1, -1):
-            start = _start(state, window, position, last)
-            while at > start:
-                at -= 1
-                value = better(is_greatest, value, columns[child, at])
-            columns[scratch, position - begin] = value
-        value = nothing
+            window_start = _start(state, window, position, last)
+            while scan_begin > window_start:
+                scan_begin -= 1
+                value = better(is_greatest, value, columns[operand_column, scan_begin])
+            columns[scratch_row, position - begin] = value
+        value = neutral
         for position in range(begin, stop):
-            after = _after(state, window, position, last)
-            while middle < after:
-                value = better(is_greatest, value, columns[child, middle])
-                middle += 1
-            number = better(is_greatest, columns[scratch, position - begin], value)
-            if changed > last and columns[column, position] != number:
-                changed = position
+            window_end = _after(state, window, position, last)
+            while scan_end < window_end:
+                value = better(is_greatest, value, columns[operand_column, scan_end])
+                scan_end += 1
+            number = better(is_greatest, columns[scratch_row, position - begin], value)
+            if first_change > last and columns[column, position] != number:
+                first_change = position
             columns[column, position] = number
         begin = stop
-    return changed
+    return first_change
 
 
 @inlined
 def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    child: int, column: int, begin: int, changed: int, last: int, is_fresh: bool,
+    operand_column: int, column: int, begin: int, first_change: int, last: int, is_fresh: bool,
 ) -> int:  # fmt: skip
     """Update the windows that reach to the last sample, from the last window backwards.
 
@@ -261,23 +273,26 @@ def _run_open(
     for position in range(begin if is_fresh else last, last + 1):
         columns[column, position] = value
     # windows that begin after the newest sample are empty: skip them
-    position, at = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
+    position, scan_begin = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
     while position > begin and not is_same:
         stop = max(position - STRIDE, begin)
-        first = _start(state, window, stop, last)
-        if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
+        stride_start = _start(state, window, stop, last)
+        if (
+            scan_begin <= last
+            and extremum(is_greatest, columns, operand_column, stride_start, scan_begin, value) == value
+        ):
             # no number in these windows exceeds the extremum, so all of them have this extremum
-            start = _start(state, window, position - 1, last)
-            is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
-            for k in range(position if is_same else stop, position):
-                columns[column, k] = value
-            position, at = position if is_same else stop, first
+            window_start = _start(state, window, position - 1, last)
+            is_same = not is_fresh and window_start <= first_change and columns[column, position - 1] == value
+            for index in range(position if is_same else stop, position):
+                columns[column, index] = value
+            position, scan_begin = position if is_same else stop, stride_start
         while position > stop and not is_same:
-            start = _start(state, window, position - 1, last)
-            while at > start:
-                at -= 1
-                value = better(is_greatest, value, columns[child, at])
-            is_same = not is_fresh and start <= changed and columns[column, position - 1] == value
+            window_start = _start(state, window, position - 1, last)
+            while scan_begin > window_start:
+                scan_begin -= 1
+                value = better(is_greatest, value, columns[operand_column, scan_begin])
+            is_same = not is_fresh and window_start <= first_change and columns[column, position - 1] == value
             if not is_same:
                 position -= 1
                 columns[column, position] = value
@@ -286,22 +301,24 @@ def _run_open(
 
 @inlined
 def _changing_windows(
-    is_greatest: bool, columns: Floats, child: int, column: int, seen: int, changed: int, changed_end: int,
-    begin: int, end: int,
+    is_greatest: bool, columns: Floats, operand_column: int, column: int, seen_column: int,
+    change_begin: int, change_end: int, begin: int, end: int,
 ) -> tuple[int, int]:  # fmt: skip
     """Skip windows whose number beats all changed numbers, old and new.
 
     Returns:
         the bounds of the windows among begin … end - 1 that may change: first, last plus one.
     """
-    nothing = -np.inf if is_greatest else np.inf
-    if changed >= changed_end:
+    neutral = -np.inf if is_greatest else np.inf
+    if change_begin >= change_end:
         begin = end
     if begin < end:
-        old_extremum = extremum(is_greatest, columns, seen, changed, changed_end, nothing)
-        new_extremum = extremum(is_greatest, columns, child, changed, changed_end, nothing)
-        worst = extremum(not is_greatest, columns, column, begin, end, -nothing)
-        if _outdoes(is_greatest, worst, old_extremum) and not _outdoes(is_greatest, new_extremum, worst):
+        old_extremum = extremum(is_greatest, columns, seen_column, change_begin, change_end, neutral)
+        new_extremum = extremum(is_greatest, columns, operand_column, change_begin, change_end, neutral)
+        worst_number = extremum(not is_greatest, columns, column, begin, end, -neutral)
+        if _outdoes(is_greatest, worst_number, old_extremum) and not _outdoes(
+            is_greatest, new_extremum, worst_number
+        ):
             begin = end
         while begin < end and (
             _outdoes(is_greatest, columns[column, begin], old_extremum)
@@ -318,88 +335,126 @@ def _changing_windows(
 
 @inlined
 def _run_window(
-    rows: Integers, d: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
+    rows: Integers, node: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
     is_fresh: bool,
 ) -> tuple[int, int]:  # fmt: skip
     """Update the column of a bounded operator; return the bounds of the changed positions."""
-    code, window, lowest, nodes = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d], len(rows) - 1
-    child, column = mode * nodes + rows[d, codes.NODE_A], mode * nodes + d
-    changed, changed_end = state[CHANGED, rows[d, codes.NODE_A]], state[CHANGED_END, rows[d, codes.NODE_A]]
-    seen, is_ahead = SEEN * nodes + column, window[0]
+    code, window, lowest, node_count = (
+        rows[node, codes.NODE_CODE],
+        window_of(rows, node),
+        state[LOWS, node],
+        len(rows) - 1,
+    )
+    operand_column, column = mode * node_count + rows[node, codes.NODE_A], mode * node_count + node
+    change_begin, change_end = (
+        state[CHANGED, rows[node, codes.NODE_A]],
+        state[CHANGED_END, rows[node, codes.NODE_A]],
+    )
+    seen_column, is_ahead = SEEN * node_count + column, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     # whether the bound of an open window is infinite, regardless of its numbers so far
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
-    tail = last + 1
+    open_begin = last + 1
     if is_decided:
-        tail = _first_open(state, stamps, window, last)
+        open_begin = _first_open(state, stamps, window, last)
     elif is_ahead:
-        tail = _first_holding(state, window, last, last)
-    begin, tail = lowest, min(max(tail, lowest), last + 1)
-    end = tail
+        open_begin = _first_holding(state, window, last, last)
+    begin, open_begin = lowest, min(max(open_begin, lowest), last + 1)
+    end = open_begin
     if not is_fresh:
-        begin = min(max(min(_first_holding(state, window, changed, last), last), lowest), tail)
+        begin = min(max(min(_first_holding(state, window, change_begin, last), last), lowest), open_begin)
     if is_ahead and not is_fresh:
-        closing = tail  # windows from this position on close with the newest sample or later
+        closing_begin = open_begin  # windows from this position on close with the newest sample or later
         if is_decided and last > 0:
-            closing = min(max(_first_holding(state, window, last - 1, last), lowest), tail)
-        end = min(_first_starting(state, window, changed_end, last), closing)
+            closing_begin = min(max(_first_holding(state, window, last - 1, last), lowest), open_begin)
+        end = min(_first_starting(state, window, change_end, last), closing_begin)
         begin, end = _changing_windows(
-            is_greatest, columns, child, column, seen, changed, changed_end, begin, end
+            is_greatest, columns, operand_column, column, seen_column, change_begin, change_end, begin, end
         )
-        if closing < tail:
-            begin, end = closing if begin >= end else begin, tail
+        if closing_begin < open_begin:
+            begin, end = closing_begin if begin >= end else begin, open_begin
     if is_ahead:
-        for k in range(changed, changed_end):
-            columns[seen, k] = columns[child, k]
-        columns[seen, last] = columns[child, last]
-    first = _slide(
-        is_greatest, window, state, columns, child, column, EXTRA * nodes + BEFORE, begin, end, last
+        for index in range(change_begin, change_end):
+            columns[seen_column, index] = columns[operand_column, index]
+        columns[seen_column, last] = columns[operand_column, last]
+    first_change = _slide(
+        is_greatest,
+        window,
+        state,
+        columns,
+        operand_column,
+        column,
+        EXTRA * node_count + BEFORE,
+        begin,
+        end,
+        last,
     )
     if is_decided:
-        for position in range(tail if is_fresh else max(tail, last), last + 1):
+        for position in range(open_begin if is_fresh else max(open_begin, last), last + 1):
             columns[column, position] = beyond(mode, 0)
-    elif tail <= last:
-        opened = _run_open(is_greatest, window, state, columns, child, column, tail, changed, last, is_fresh)
-        if opened < last:
-            first, end = min(first, opened), last
-    return (lowest, last) if is_fresh else (first, min(end, last))
+    elif open_begin <= last:
+        first_open_change = _run_open(
+            is_greatest,
+            window,
+            state,
+            columns,
+            operand_column,
+            column,
+            open_begin,
+            change_begin,
+            last,
+            is_fresh,
+        )
+        if first_open_change < last:
+            first_change, end = min(first_change, first_open_change), last
+    return (lowest, last) if is_fresh else (first_change, min(end, last))
 
 
 @inlined
 def _run_since(
-    strong: bool, has_left: bool, columns: Floats, left: int, right: int, column: int, value: float,
-    begin: int, last: int,
+    is_strong: bool, has_left: bool, columns: Floats, left_column: int, right_column: int, column: int,
+    value: float, begin: int, last: int,
 ) -> int:  # fmt: skip
     """Run a since or trigger forwards from `begin`, given the value before; return the first change."""
-    changes, is_same = begin, True
-    for k in range(begin, last + 1):
+    first_change, is_same = begin, True
+    for position in range(begin, last + 1):
         if has_left:
-            value = better(not strong, columns[left, k], value)
-        value = better(strong, columns[right, k], value)
-        is_same = is_same and k < last and columns[column, k] == value
-        changes += is_same
-        columns[column, k] = value
-    return changes
+            value = better(not is_strong, columns[left_column, position], value)
+        value = better(is_strong, columns[right_column, position], value)
+        is_same = is_same and position < last and columns[column, position] == value
+        first_change += is_same
+        columns[column, position] = value
+    return first_change
 
 
 @inlined
-def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> float:
+def _start_of_past(rows: Integers, node: int, state: Integers, tables: Floats) -> float:
     """Return the start value of a since or trigger, which its table gives for the position of its state."""
-    value, part = beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK]), len(rows) - 1
-    if state[STATE, d] >= 0:
-        variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
-        value = read_table(tables, rows[d, codes.NODE_TABLE], 0, variables, tables, point)
+    value, part_row = beyond(codes.OPEN_END, rows[node, codes.NODE_WEAK]), len(rows) - 1
+    if state[STATE, node] >= 0:
+        variable_count, point_row = (
+            rows[part_row, codes.PART_VARIABLES],
+            2 * rows[part_row, codes.PART_TABLES],
+        )
+        value = read_table(tables, rows[node, codes.NODE_TABLE], 0, variable_count, tables, point_row)
     return value
 
 
 @inlined
 def _set_point(
-    rows: Integers, d: int, state: Integers, columns: Floats, row: int, mode: int, last: int, tables: Floats
+    rows: Integers,
+    node: int,
+    state: Integers,
+    columns: Floats,
+    column: int,
+    mode: int,
+    last: int,
+    tables: Floats,
 ) -> None:
     """Set the coordinate of a node's variable in the point to the node's value at the boundary."""
-    boundary = state[BOUNDARY, d]
-    value = columns[row, boundary] if boundary <= last else beyond(mode, rows[d, codes.NODE_WEAK])
-    tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[d, codes.NODE_VARIABLE]] = value
+    boundary = state[BOUNDARY, node]
+    value = columns[column, boundary] if boundary <= last else beyond(mode, rows[node, codes.NODE_WEAK])
+    tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[node, codes.NODE_VARIABLE]] = value
 
 
 @inlined
@@ -415,92 +470,134 @@ def _bring_up(
     mode: int, last: int, is_fresh: bool,
 ) -> None:  # fmt: skip
     """Update the columns of one set to the last sample; if `is_fresh`, compute all their numbers."""
-    nodes, first = len(rows) - 1, mode * (len(rows) - 1)
-    for d in range(nodes if has_column(rows) else nodes - 1):
-        code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
-        column, begin, end, lowest = first + d, last, last, state[LOWS, d]
+    node_count, first_column = len(rows) - 1, mode * (len(rows) - 1)
+    for node in range(node_count if has_column(rows) else node_count - 1):
+        code, left_operand, right_operand = (
+            rows[node, codes.NODE_CODE],
+            rows[node, codes.NODE_A],
+            rows[node, codes.NODE_B],
+        )
+        column, begin, end, lowest = first_column + node, last, last, state[LOWS, node]
         if code == codes.LITERAL:
             begin = lowest if is_fresh else last
-            for k in range(begin, last + 1):
-                columns[column, k] = history[a, k]
+            for index in range(begin, last + 1):
+                columns[column, index] = history[left_operand, index]
         elif code in (codes.PART_AND, codes.PART_OR):
-            is_or, left, right = code == codes.PART_OR, first + a, first + b
-            begin = max(min(state[CHANGED, a], state[CHANGED, b]), lowest)
-            end = max(state[CHANGED_END, a], state[CHANGED_END, b])
+            is_or, left_column, right_column = (
+                code == codes.PART_OR,
+                first_column + left_operand,
+                first_column + right_operand,
+            )
+            begin = max(min(state[CHANGED, left_operand], state[CHANGED, right_operand]), lowest)
+            end = max(state[CHANGED_END, left_operand], state[CHANGED_END, right_operand])
             while (
                 begin < end
                 and not is_fresh
-                and better(is_or, columns[left, begin], columns[right, begin]) == columns[column, begin]
+                and better(is_or, columns[left_column, begin], columns[right_column, begin])
+                == columns[column, begin]
             ):
                 begin += 1
             left_values, right_values, values = (
-                columns[left, begin:end],
-                columns[right, begin:end],
+                columns[left_column, begin:end],
+                columns[right_column, begin:end],
                 columns[column, begin:end],
             )
             if is_or:
-                for k in range(len(values)):
-                    values[k] = max(left_values[k], right_values[k])
+                for index in range(len(values)):
+                    values[index] = max(left_values[index], right_values[index])
             else:
-                for k in range(len(values)):
-                    values[k] = min(left_values[k], right_values[k])
-            columns[column, last] = better(is_or, columns[left, last], columns[right, last])
+                for index in range(len(values)):
+                    values[index] = min(left_values[index], right_values[index])
+            columns[column, last] = better(is_or, columns[left_column, last], columns[right_column, last])
         elif code in (codes.UNTIL, codes.RELEASE):
-            left, right, strong = first + max(a, 0), first + b, code == codes.UNTIL
-            changed, begin = state[CHANGED, b], last + 1
-            if a >= 0:
-                changed = min(changed, state[CHANGED, a])
-            value, is_same = beyond(mode, rows[d, codes.NODE_WEAK]), False
+            left_column, right_column, is_strong = (
+                first_column + max(left_operand, 0),
+                first_column + right_operand,
+                code == codes.UNTIL,
+            )
+            first_change, begin = state[CHANGED, right_operand], last + 1
+            if left_operand >= 0:
+                first_change = min(first_change, state[CHANGED, left_operand])
+            value, is_same = beyond(mode, rows[node, codes.NODE_WEAK]), False
             while begin > lowest and not is_same:
-                if a >= 0:
-                    value = better(not strong, columns[left, begin - 1], value)
-                value = better(strong, columns[right, begin - 1], value)
-                is_same = not is_fresh and begin <= min(changed, last) and columns[column, begin - 1] == value
+                if left_operand >= 0:
+                    value = better(not is_strong, columns[left_column, begin - 1], value)
+                value = better(is_strong, columns[right_column, begin - 1], value)
+                is_same = (
+                    not is_fresh and begin <= min(first_change, last) and columns[column, begin - 1] == value
+                )
                 if not is_same:
                     begin -= 1
                     columns[column, begin] = value
-            if rows[d, codes.NODE_VARIABLE] >= 0:
-                _set_point(rows, d, state, columns, column, mode, last, tables)
+            if rows[node, codes.NODE_VARIABLE] >= 0:
+                _set_point(rows, node, state, columns, column, mode, last, tables)
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
-            left, right, start = first + max(a, 0), first + b, state[STATE, d]
-            value, begin = _start_of_past(rows, d, state, tables), min(state[CHANGED, b], last)
-            if a >= 0:
-                begin = min(begin, state[CHANGED, a])
-            # the start value comes from a table, so it may depend on later samples
-            if start >= 0 and (is_fresh or columns[column, start] != value):
-                columns[column, start], begin = value, start
-            begin = start + 1 if is_fresh else max(begin, start + 1)
-            if begin > start + 1:
-                value = columns[column, begin - 1]
-            changed = _run_since(
-                code == codes.PAST_SINCE, a >= 0, columns, left, right, column, value, begin, last
+            left_column, right_column, state_position = (
+                first_column + max(left_operand, 0),
+                first_column + right_operand,
+                state[STATE, node],
             )
-            begin = lowest if is_fresh else changed
+            value, begin = _start_of_past(rows, node, state, tables), min(state[CHANGED, right_operand], last)
+            if left_operand >= 0:
+                begin = min(begin, state[CHANGED, left_operand])
+            # the start value comes from a table, so it may depend on later samples
+            if state_position >= 0 and (is_fresh or columns[column, state_position] != value):
+                columns[column, state_position], begin = value, state_position
+            begin = state_position + 1 if is_fresh else max(begin, state_position + 1)
+            if begin > state_position + 1:
+                value = columns[column, begin - 1]
+            first_change = _run_since(
+                code == codes.PAST_SINCE,
+                left_operand >= 0,
+                columns,
+                left_column,
+                right_column,
+                column,
+                value,
+                begin,
+                last,
+            )
+            begin = lowest if is_fresh else first_change
         elif code in (codes.SHIFT, codes.PAST_DELAY):
-            window, child = window_of(rows, d), first + a
-            missing = beyond(mode if window[0] else codes.OPEN_END, rows[d, codes.NODE_WEAK])
+            window, operand_column = window_of(rows, node), first_column + left_operand
+            missing_value = beyond(mode if window[0] else codes.OPEN_END, rows[node, codes.NODE_WEAK])
             if is_fresh:
                 begin = lowest
             elif window[0]:
-                begin = max(min(_first_starting(state, window, state[CHANGED, a], last), last), lowest)
+                begin = max(
+                    min(_first_starting(state, window, state[CHANGED, left_operand], last), last), lowest
+                )
             else:
-                begin = max(min(_first_holding(state, window, state[CHANGED, a], last), last), lowest)
-            for k in range(begin, last + 1):
-                at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
-                columns[column, k] = columns[child, at] if 0 <= at <= last else missing
+                begin = max(
+                    min(_first_holding(state, window, state[CHANGED, left_operand], last), last), lowest
+                )
+            for index in range(begin, last + 1):
+                source_position = (
+                    _start(state, window, index, last)
+                    if window[0]
+                    else _after(state, window, index, last) - 1
+                )
+                columns[column, index] = (
+                    columns[operand_column, source_position]
+                    if 0 <= source_position <= last
+                    else missing_value
+                )
         else:
-            begin, end = _run_window(rows, d, stamps, state, columns, mode, last, is_fresh)
+            begin, end = _run_window(rows, node, stamps, state, columns, mode, last, is_fresh)
         if begin >= end:
             begin, end = last, 0
-        state[CHANGED, d], state[CHANGED_END, d] = begin, end
+        state[CHANGED, node], state[CHANGED_END, node] = begin, end
     if not has_column(rows):
-        body = rows[nodes - 1, codes.NODE_B]
-        is_until, joined = rows[nodes - 1, codes.NODE_CODE] == codes.UNTIL, EXTRA * nodes + JOINED + mode
-        nothing, complete = -np.inf if is_until else np.inf, (last + 1) // BLOCK
-        for k in range(state[CHANGED, body] // BLOCK, complete):
-            if k == complete - 1 or k * BLOCK < state[CHANGED_END, body]:
-                columns[joined, k] = extremum(
-                    is_until, columns, first + body, k * BLOCK, (k + 1) * BLOCK, nothing
+        body = rows[node_count - 1, codes.NODE_B]
+        is_until, joined_row = (
+            rows[node_count - 1, codes.NODE_CODE] == codes.UNTIL,
+            EXTRA * node_count + JOINED + mode,
+        )
+        neutral, block_count = -np.inf if is_until else np.inf, (last + 1) // BLOCK
+        for index in range(state[CHANGED, body] // BLOCK, block_count):
+            if index == block_count - 1 or index * BLOCK < state[CHANGED_END, body]:
+                columns[joined_row, index] = extremum(
+                    is_until, columns, first_column + body, index * BLOCK, (index + 1) * BLOCK, neutral
                 )
 
 
@@ -509,14 +606,14 @@ def _bring_up(
 
 @inlined
 def _join_blocks(
-    is_until: bool, columns: Floats, body: int, joined: int, value: float, begin: int, end: int
+    is_until: bool, columns: Floats, body_column: int, joined_row: int, value: float, begin: int, end: int
 ) -> float:
     """Join a number with the numbers at begin … end - 1, using joined blocks."""
     first_block, block_end = begin // BLOCK + 1, end // BLOCK
     blocks_begin = min(first_block * BLOCK, end)
-    value = extremum(is_until, columns, body, begin, blocks_begin, value)
-    value = extremum(is_until, columns, joined, first_block, block_end, value)
-    return extremum(is_until, columns, body, max(blocks_begin, block_end * BLOCK), end, value)
+    value = extremum(is_until, columns, body_column, begin, blocks_begin, value)
+    value = extremum(is_until, columns, joined_row, first_block, block_end, value)
+    return extremum(is_until, columns, body_column, max(blocks_begin, block_end * BLOCK), end, value)
 
 
 @inlined
@@ -524,19 +621,27 @@ def _at_first(
     rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, last: int
 ) -> float:
     """Return the root's value at the first sample, from the columns of a set."""
-    nodes, base = len(rows) - 1, state[HEAD, BASE]
-    first, root = mode * nodes, nodes - 1
+    node_count, base = len(rows) - 1, state[HEAD, BASE]
+    first_column, root = mode * node_count, node_count - 1
     value = beyond(mode, rows[root, codes.NODE_WEAK])
     if not has_column(rows):
-        is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, first + rows[root, codes.NODE_B]
-        value = _join_blocks(is_until, columns, body, EXTRA * nodes + JOINED + mode, value, base, last + 1)
+        is_until, body_column = (
+            rows[root, codes.NODE_CODE] == codes.UNTIL,
+            first_column + rows[root, codes.NODE_B],
+        )
+        value = _join_blocks(
+            is_until, columns, body_column, EXTRA * node_count + JOINED + mode, value, base, last + 1
+        )
     elif base <= last:
-        value = columns[first + root, base]
+        value = columns[first_column + root, base]
     if state[HEAD, IS_BEGUN]:
-        variables, point = rows[nodes, codes.PART_VARIABLES], 2 * rows[nodes, codes.PART_TABLES]
+        variable_count, point_row = (
+            rows[node_count, codes.PART_VARIABLES],
+            2 * rows[node_count, codes.PART_TABLES],
+        )
         if rows[root, codes.NODE_VARIABLE] >= 0:
-            tables[point, rows[root, codes.NODE_VARIABLE]] = value
-        value = read_table(tables, 0, 0, variables, tables, point)
+            tables[point_row, rows[root, codes.NODE_VARIABLE]] = value
+        value = read_table(tables, 0, 0, variable_count, tables, point_row)
     return value
 
 
@@ -565,17 +670,20 @@ def run_windows(
             point at which tables are read, and start values of past operators.
         bounds: 1 to compute the lower bound, 2 for the upper bound, 3 for both.
     """
-    nodes = len(rows) - 1
-    root, first_result = nodes - 1, EXTRA * nodes + RESULTS
+    node_count = len(rows) - 1
+    root, first_result = node_count - 1, EXTRA * node_count + RESULTS
     is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
-    corners, has_now = 1 << rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_HAS_NOW] > 0
-    for k in range(count):
-        last = begin + k
-        if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corners - 1]:
+    corner_count, has_now = (
+        1 << rows[node_count, codes.PART_VARIABLES],
+        rows[node_count, codes.PART_HAS_NOW] > 0,
+    )
+    for index in range(count):
+        last = begin + index
+        if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corner_count - 1]:
             # the extreme corners agree: no later sample can change the value
-            columns[first_result, k] = columns[first_result + 2, k] = columns[first_result + 3, k] = tables[
-                0, 0
-            ]
+            columns[first_result, index] = columns[first_result + 2, index] = columns[
+                first_result + 3, index
+            ] = tables[0, 0]
             continue
         if state.shape[0] > STARTS:
             _enter(rows, stamps, state, last)
@@ -584,8 +692,8 @@ def run_windows(
             if mode != codes.OPEN_END and not bounds >> (mode - 1) & 1:
                 continue
             if mode != codes.OPEN_END and _is_known(rows, state, mode):
-                corner = 0 if mode == codes.OPEN_LOW else corners - 1
-                columns[result_row, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
+                corner = 0 if mode == codes.OPEN_LOW else corner_count - 1
+                columns[result_row, index] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
             # columns are computed again if they lack the previous sample
             is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
@@ -593,11 +701,11 @@ def run_windows(
             if is_fresh:
                 find_lows(rows, state, stamps, last)
             _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
-            columns[result_row, k] = _at_first(rows, columns, state, tables, mode, last)
+            columns[result_row, index] = _at_first(rows, columns, state, tables, mode, last)
         if has_now and has_column(rows):
-            columns[first_result + RESULT_NOW, k] = columns[root, last]
+            columns[first_result + RESULT_NOW, index] = columns[root, last]
         elif has_now:
-            columns[first_result + RESULT_NOW, k] = better(
+            columns[first_result + RESULT_NOW, index] = better(
                 is_until,
                 columns[rows[root, codes.NODE_B], last],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
@@ -621,41 +729,48 @@ def _reach(
     Returns:
         whether all windows between these positions and the root have closed.
     """
-    nodes, is_closed = len(rows) - 1, True
-    for d in range(nodes):
-        state[LOW, d], state[HIGH, d] = _NEVER, -1
-    state[LOW, nodes - 1], state[HIGH, nodes - 1] = root_low, root_high
-    for d in range(nodes - 1, -1, -1):
-        code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
-        state[PLAIN, d] = state[LOW, d]
-        if rows[d, codes.NODE_VARIABLE] >= 0 and state[HEAD, IS_BEGUN]:
-            state[LOW, d] = min(state[LOW, d], state[BOUNDARY, d])
-        if rows[d, codes.NODE_TABLE] >= 0:
+    node_count, is_closed = len(rows) - 1, True
+    for node in range(node_count):
+        state[LOW, node], state[HIGH, node] = _NEVER, -1
+    state[LOW, node_count - 1], state[HIGH, node_count - 1] = root_low, root_high
+    for node in range(node_count - 1, -1, -1):
+        code, left_operand, right_operand = (
+            rows[node, codes.NODE_CODE],
+            rows[node, codes.NODE_A],
+            rows[node, codes.NODE_B],
+        )
+        state[PLAIN, node] = state[LOW, node]
+        if rows[node, codes.NODE_VARIABLE] >= 0 and state[HEAD, IS_BEGUN]:
+            state[LOW, node] = min(state[LOW, node], state[BOUNDARY, node])
+        if rows[node, codes.NODE_TABLE] >= 0:
             # the column also has the start value of the operator
-            state[LOW, d] = min(state[LOW, d], max(state[STATE, d], 0))
-        low, high = state[LOW, d], state[HIGH, d]
+            state[LOW, node] = min(state[LOW, node], max(state[STATE, node], 0))
+        low, high = state[LOW, node], state[HIGH, node]
         if code == codes.LITERAL:
             continue
-        window = window_of(rows, d)
+        window = window_of(rows, node)
         if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
             is_closed = is_closed and high < _first_open(state, stamps, window, last)
             high = _after(state, window, high, last) - 1
         elif code == codes.SHIFT:
-            shifted = _start(state, window, high, last)
-            is_closed = is_closed and shifted <= last
-            farthest = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted
-            high = min(max(shifted, farthest), last)
+            shifted_position = _start(state, window, high, last)
+            is_closed = is_closed and shifted_position <= last
+            farthest_position = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted_position
+            high = min(max(shifted_position, farthest_position), last)
         elif code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
             low = _start(state, window, min(low, last), last)
         elif code == codes.PAST_DELAY:
             low = max(_after(state, window, min(low, last), last) - 1, 0)
-        if a >= 0:
-            state[LOW, a] = min(state[LOW, a], low)
-            state[HIGH, a] = max(state[HIGH, a], high, state[HIGH, d])
+        if left_operand >= 0:
+            state[LOW, left_operand] = min(state[LOW, left_operand], low)
+            state[HIGH, left_operand] = max(state[HIGH, left_operand], high, state[HIGH, node])
         if not (
             codes.PART_WINDOW_MAX <= code <= codes.SHIFT or codes.PAST_WINDOW_MAX <= code <= codes.PAST_DELAY
         ):
-            state[LOW, b], state[HIGH, b] = min(state[LOW, b], low), max(state[HIGH, b], high)
+            state[LOW, right_operand], state[HIGH, right_operand] = (
+                min(state[LOW, right_operand], low),
+                max(state[HIGH, right_operand], high),
+            )
     return is_closed
 
 
@@ -663,8 +778,8 @@ def _reach(
 def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> None:
     """Store the first position of each node that is still needed."""
     _reach(rows, state, stamps, min(state[HEAD, BASE], last), last, last)
-    for d in range(len(rows) - 1):
-        state[LOWS, d] = state[LOW, d]
+    for node in range(len(rows) - 1):
+        state[LOWS, node] = state[LOW, node]
 
 
 @piece
@@ -672,47 +787,82 @@ def _run_corner(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
 ) -> None:
     """Compute the nodes that depend on a variable or a table, at `LOW` … `HIGH`, for one corner."""
-    nodes = len(rows) - 1
-    point, corner_columns = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
-    for d in range(nodes):
-        if not rows[d, codes.NODE_DEPENDS]:
+    node_count = len(rows) - 1
+    point_row, corner_columns = 2 * rows[node_count, codes.PART_TABLES], SETS * node_count
+    for node in range(node_count):
+        if not rows[node, codes.NODE_DEPENDS]:
             continue
-        code, a, b = rows[d, codes.NODE_CODE], max(rows[d, codes.NODE_A], 0), rows[d, codes.NODE_B]
-        has_left, low, high = rows[d, codes.NODE_A] >= 0, state[LOW, d], state[HIGH, d]
-        left = corner_columns + a if rows[a, codes.NODE_DEPENDS] else a
-        right = corner_columns + b if rows[b, codes.NODE_DEPENDS] else b
-        column = corner_columns + d
+        code, left_operand, right_operand = (
+            rows[node, codes.NODE_CODE],
+            max(rows[node, codes.NODE_A], 0),
+            rows[node, codes.NODE_B],
+        )
+        has_left, low, high = rows[node, codes.NODE_A] >= 0, state[LOW, node], state[HIGH, node]
+        left_column = (
+            corner_columns + left_operand if rows[left_operand, codes.NODE_DEPENDS] else left_operand
+        )
+        right_column = (
+            corner_columns + right_operand if rows[right_operand, codes.NODE_DEPENDS] else right_operand
+        )
+        column = corner_columns + node
         if code in (codes.PART_AND, codes.PART_OR):
-            for k in range(low, high + 1):
-                columns[column, k] = better(code == codes.PART_OR, columns[left, k], columns[right, k])
+            for position in range(low, high + 1):
+                columns[column, position] = better(
+                    code == codes.PART_OR, columns[left_column, position], columns[right_column, position]
+                )
         elif code in (codes.UNTIL, codes.RELEASE):
-            variable, strong, start = rows[d, codes.NODE_VARIABLE], code == codes.UNTIL, -np.inf
+            variable, is_strong, start_value = rows[node, codes.NODE_VARIABLE], code == codes.UNTIL, -np.inf
             if variable >= 0 and corner >> variable & 1:
-                start = np.inf
-            value = start
-            for k in range(high, low - 1, -1):
+                start_value = np.inf
+            value = start_value
+            for position in range(high, low - 1, -1):
                 if has_left:
-                    value = better(not strong, columns[left, k], value)
-                value = better(strong, columns[right, k], value)
-                columns[column, k] = value
+                    value = better(not is_strong, columns[left_column, position], value)
+                value = better(is_strong, columns[right_column, position], value)
+                columns[column, position] = value
             if variable >= 0:
-                boundary = state[BOUNDARY, d]
-                tables[point, variable] = columns[column, boundary] if boundary <= high else start
+                boundary = state[BOUNDARY, node]
+                tables[point_row, variable] = columns[column, boundary] if boundary <= high else start_value
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
-            value = _start_of_past(rows, d, state, tables)
-            tables[point + 1, rows[d, codes.NODE_TABLE]] = value
-            begin = state[STATE, d] + 1
-            _run_since(code == codes.PAST_SINCE, has_left, columns, left, right, column, value, begin, high)
+            value = _start_of_past(rows, node, state, tables)
+            tables[point_row + 1, rows[node, codes.NODE_TABLE]] = value
+            begin = state[STATE, node] + 1
+            _run_since(
+                code == codes.PAST_SINCE,
+                has_left,
+                columns,
+                left_column,
+                right_column,
+                column,
+                value,
+                begin,
+                high,
+            )
         elif code in (codes.SHIFT, codes.PAST_DELAY):
-            window, missing = window_of(rows, d), beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK])
-            for k in range(low, high + 1):
-                at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
-                columns[column, k] = columns[left, at] if 0 <= at <= last else missing
+            window, missing_value = window_of(rows, node), beyond(codes.OPEN_END, rows[node, codes.NODE_WEAK])
+            for position in range(low, high + 1):
+                source_position = (
+                    _start(state, window, position, last)
+                    if window[0]
+                    else _after(state, window, position, last) - 1
+                )
+                columns[column, position] = (
+                    columns[left_column, source_position] if 0 <= source_position <= last else missing_value
+                )
         else:
             is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-            scratch = EXTRA * nodes + BEFORE
+            scratch_row = EXTRA * node_count + BEFORE
             _slide(
-                is_greatest, window_of(rows, d), state, columns, left, column, scratch, low, high + 1, last
+                is_greatest,
+                window_of(rows, node),
+                state,
+                columns,
+                left_column,
+                column,
+                scratch_row,
+                low,
+                high + 1,
+                last,
             )
 
 
@@ -721,26 +871,30 @@ def _renew_tables(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
     """Compute the tables of a part again, with more positions from its base on."""
-    nodes = len(rows) - 1
-    count, variables = rows[nodes, codes.PART_TABLES], rows[nodes, codes.PART_VARIABLES]
-    for corner in range(1 << variables):
+    node_count = len(rows) - 1
+    table_count, variable_count = rows[node_count, codes.PART_TABLES], rows[node_count, codes.PART_VARIABLES]
+    for corner in range(1 << variable_count):
         _run_corner(rows, stamps, columns, state, tables, corner, last)
         if state[HEAD, IS_BEGUN]:
-            tables[count, corner] = read_table(tables, 0, 0, variables, tables, 2 * count)
+            tables[table_count, corner] = read_table(tables, 0, 0, variable_count, tables, 2 * table_count)
         else:
-            root = nodes - 1
-            tables[count, corner] = columns[
-                SETS * nodes + root if rows[root, codes.NODE_DEPENDS] else root, 0
+            root = node_count - 1
+            tables[table_count, corner] = columns[
+                SETS * node_count + root if rows[root, codes.NODE_DEPENDS] else root, 0
             ]
-        for d in range(nodes):
-            table, at = rows[d, codes.NODE_TABLE], state[PLAIN, d] - 1
+        for node in range(node_count):
+            table, state_position = rows[node, codes.NODE_TABLE], state[PLAIN, node] - 1
             if table >= 0:
-                is_new = at > state[STATE, d]
-                value = columns[SETS * nodes + d, at] if is_new else tables[2 * count + 1, table]
-                tables[count + table, corner] = value
-    for table in range(count):
-        for corner in range(1 << variables):
-            tables[table, corner] = tables[count + table, corner]
+                is_new = state_position > state[STATE, node]
+                value = (
+                    columns[SETS * node_count + node, state_position]
+                    if is_new
+                    else tables[2 * table_count + 1, table]
+                )
+                tables[table_count + table, corner] = value
+    for table in range(table_count):
+        for corner in range(1 << variable_count):
+            tables[table, corner] = tables[table_count + table, corner]
 
 
 @inlined
@@ -772,11 +926,11 @@ def _absorb(
             size //= 2
             continue
         _renew_tables(rows, stamps, columns, state, tables, last)
-        for d in range(len(rows) - 1):
-            if rows[d, codes.NODE_VARIABLE] >= 0:
-                state[BOUNDARY, d] = state[HIGH, d] + 1
-            if rows[d, codes.NODE_TABLE] >= 0:
-                state[STATE, d] = max(state[STATE, d], state[PLAIN, d] - 1)
+        for node in range(len(rows) - 1):
+            if rows[node, codes.NODE_VARIABLE] >= 0:
+                state[BOUNDARY, node] = state[HIGH, node] + 1
+            if rows[node, codes.NODE_TABLE] >= 0:
+                state[STATE, node] = max(state[STATE, node], state[PLAIN, node] - 1)
         state[HEAD, BASE], state[HEAD, IS_BEGUN] = base + size, 1
     if rows[len(rows) - 1, codes.PART_IS_MONOTONE] and state[HEAD, IS_BEGUN]:
         _pass_outdone(rows, columns, state, tables, last)
