@@ -1,13 +1,13 @@
 """The evaluation of one program over one stream of samples, for monitors and replays.
 
 Samples run in tiles: first the signals of a tile (subformulas without future operators, final at each
-sample), then each part, then the tree as the user wrote it. A tile of one sample and a tile of many give the
-same bits, because the only arithmetic is minima, maxima and negation.
+sample), then each part, then the tree as the user wrote it. The bits of a result do not depend on the length
+of a tile, because the only arithmetic is minima, maxima and negation.
 
 In one channel, a node has four numbers for each sample: value, now, lower and upper. In more channels (see
-`codes`) it has eight numbers, the low and high ends of four values. These are the value, `now`, the value
-over every continuation, and the value if the run ends there. A number depends on its operands' numbers in the
-same row; under a negation, on those in the mirror row.
+`codes`), it has eight numbers, the low and high ends of four values. The four values are the value, `now`,
+the value over every continuation, and the value if the run ends with the sample. A number depends on the
+numbers of its operands in the same row. Under a negation, it depends on the numbers in the mirror row.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ def _mirror(row: int, channels: int) -> int:
 
 @inlined
 def _channel(row: int, channels: int) -> int:
-    """Return the channel of a row."""
     if channels == 1:
         return 0
     # value and now are nominal, the other two numbers have uncertainty
@@ -56,7 +55,7 @@ def _channel(row: int, channels: int) -> int:
 
 @inlined
 def result_row(mode: int, channel: int, channels: int) -> int:
-    """Return the row of a part's result in a channel, for a mode such as `OPEN_END`; -1 for none."""
+    """Return the row of a part's result in a channel, for a mode such as `OPEN_END`; -1 without a result."""
     if channels == 1:
         return 0 if mode == codes.OPEN_END else 1 + mode
     if mode == codes.OPEN_END:
@@ -66,7 +65,7 @@ def result_row(mode: int, channel: int, channels: int) -> int:
 
 @inlined
 def _combine(code: int, left: float, left_mirror: float, right: float, right_mirror: float) -> float:
-    """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
+    """Return the lower end of a Boolean operator over two intervals. The upper end is its mirror image."""
     if code == codes.REPORT_XOR:
         return max(min(left, -right_mirror), min(-left_mirror, right))
     if code == codes.REPORT_IMPLIES:
@@ -105,8 +104,8 @@ def report(
     Args:
         rows: rows of a program (see `Program`).
         history, memory: history and memory of the signals (see `run_signals`).
-        work: numbers of the parts; then output: numbers of the nodes and the series.
-        begin: place of these samples in the history.
+        work: numbers of the parts, then the output: numbers of the nodes, and the series.
+        begin: place of the first of these samples in the history.
     """
     first_report, node_count = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
     operands_begin, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
@@ -183,7 +182,7 @@ def report(
 def _write_series(
     work: Floats, nodes_begin: int, series_begin: int, node_count: int, channels: int, count: int
 ) -> None:
-    """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
+    """Write value, now, lower and upper of every node, and NaN where the ends of value or now differ.
 
     Adding zero turns -0.0 into 0.0, so that equal numbers have equal bits.
     """
@@ -208,12 +207,12 @@ TILE = 1024
 """Number of samples in a tile: enough to amortise kernel calls, few enough for the CPU cache."""
 
 ROOM = 256
-"""Initial capacity of a live run, recent samples; small enough for the CPU cache."""
+"""Initial capacity of a live run in recent samples, small enough for the CPU cache."""
 
 BEGIN, FINISH = 1, 2
-"""Phases of `run_samples`: signals with parts without windows, and the numbers of all nodes."""
+"""Phases of `run_samples`: computes signals and parts without windows; computes the numbers of all nodes."""
 _UNKNOWN = -2
-"""Entry of `KNOWN` for a set of columns without any sample."""
+"""Entry of `KNOWN` for a set of columns without a sample."""
 
 
 @kernel
@@ -225,12 +224,13 @@ def run_samples(
 
     Args:
         rows: rows of the program.
-        leaves: (C, A, T); the leaves of this program begin at `first_leaf`, and these samples at `t`.
+        leaves: (C, A, T). The leaves of this program begin at `first_leaf`, and its samples at `t`.
         history: (4, S, room), signals at the recent samples, by channel.
         times: (1 + 4 W, room + RING), times of the recent samples, then rings of sliding windows, by channel.
         memory: (4, …), each signal at the last and at the first sample, then the tables of parts.
         work: rows for the numbers of parts and nodes, for the series, and for intermediate numbers.
-        position: number of the first of these `count` samples; its place in the history is `begin`.
+        position: number of the first of the `count` samples in the run.
+        begin: place of that sample in the history.
     """
     channel_count, signal_count, part_count = (
         leaves.shape[0],
@@ -281,13 +281,14 @@ def run_sample(
         whole, real, sample, end, leaves: arguments of `measure_sample`.
         numbers: (N, 4), output: value, now, lower and upper of each node.
         channels: number of channels of the leaves; 0 if they are not measured yet.
-        run_channels: number of channels of the state. With fewer channels than the leaves, nothing runs.
+        run_channels: number of channels of the state. If the leaves have more channels, the program does not
+            run.
 
     Returns:
         the number of channels of the leaves.
     """
     if channels == 0:
-        # in the same kernel: with two kernels and arrays between them, an update took 1.4 times as long
+        # in the same kernel, because an update by two kernels took 1.4 times as long
         channels = measure_sample(whole, real, sample, end, leaves)
         # a run with more channels than the leaves reads copies (see `codes.in_channels`)
         for channel in range(channels, CHANNELS):
@@ -342,19 +343,19 @@ class _OpenPart:
         head[windows.ENTERED :] = 0
         head[windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
         self.state[[windows.LOWS, windows.BOUNDARY], : self._node_count] -= drop_count
-        # -1 stays: there is no state yet
+        # -1 marks a node without a state, and is not shifted
         self.state[windows.STATE, : self._node_count] -= np.where(
             self.state[windows.STATE, : self._node_count] < 0, 0, drop_count
         )
 
     @property
     def kept_from(self) -> int | None:
-        """The first position that it may still read; None if there is none."""
+        """The first position that the part may still read; None if the part reads no position."""
         is_begun, last_corner = (
             self.state[windows.HEAD, windows.IS_BEGUN],
             (1 << self.rows[-1, codes.PART_VARIABLES]) - 1,
         )
-        # the extreme corners of a monotone table bound all others
+        # the extreme corners of a monotone table bound all other corners
         is_constant = is_begun and self.tables[0, 0] == self.tables[0, last_corner]
         if is_constant and not self.rows[-1, codes.PART_HAS_NOW]:
             return None
@@ -364,17 +365,18 @@ class _OpenPart:
 class OnlineRun:
     """The state of a compiled formula between samples.
 
-    Its size depends on the formula and on the samples in its windows, not on the length of the stream.
+    The size of the state depends on the formula and on the samples in its windows, not on the length of the
+    stream.
 
     Attributes:
-        room: capacity, recent samples.
+        room: capacity in recent samples.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
         """Start before the first sample.
 
         Args:
-            room: initial capacity, recent samples; it doubles when needed.
+            room: initial capacity in recent samples. The capacity doubles when needed.
             tile: limit on samples that run together.
         """
         self._program, self._tile = program, tile
@@ -401,7 +403,7 @@ class OnlineRun:
         self._begin()
 
     def restart(self) -> None:
-        """Drop all samples; the capacity stays."""
+        """Drop all samples, but keep the capacity."""
         for state in (self._history, self._times, self._memory):
             state.fill(0)
         self._begin()
@@ -431,8 +433,8 @@ class OnlineRun:
         """Add samples.
 
         Args:
-            leaves: (C, A, T), leaves of the program. C = 1: exact values. C = 2: the interval's ends with
-                unknown values. C = 4: also the same ends with uncertainty.
+            leaves: (C, A, T), leaves of the program. With C = 1, they are exact values. With C = 2, they are
+                ends of intervals, because values are unknown. With C = 4, the ends with uncertainty follow.
             times_ns: (T,), increasing and after the previous samples.
             empty: allocator of the result.
 
@@ -440,7 +442,7 @@ class OnlineRun:
             (N, 4, T): value, now, lower and upper of each node.
 
         Raises:
-            ValueError: the shapes do not match; kernels would read beyond the arrays.
+            ValueError: the shapes do not match, so kernels would read beyond the arrays.
         """
         leaf_shape = len(self._program.leaves), len(times_ns)
         if leaves.shape[1:] != leaf_shape or len(leaves) not in (1, 2, 4):
@@ -448,7 +450,7 @@ class OnlineRun:
                 f"leaves have the shape {leaves.shape}; the program needs (1, 2 or 4, *{leaf_shape})"
             )
         self.widen(len(leaves))
-        # a copy: kernels are compiled for writable arrays in C order
+        # a copy, because kernels are compiled for writable arrays in C order
         leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")
         series, begin = empty((len(self._program.reports), SERIES, len(times_ns))), 0
         while begin < len(times_ns):
@@ -459,7 +461,7 @@ class OnlineRun:
         return series
 
     def widen(self, channels: int) -> None:
-        """Extend the state to `channels`; a new channel starts as a copy of the channel that it equalled."""
+        """Extend the state to `channels`. A new channel starts as a copy of the channel that it equalled."""
         if channels <= self._channels:
             return
         old_channels, self._channels = self._channels, channels
@@ -474,11 +476,11 @@ class OnlineRun:
         self._refresh_views()
 
     def add_sample(self, room: SampleRoom, first_leaf: int, time_ns: int) -> Floats:
-        """Add one sample; return value, now, lower and upper of each node, (N, 4).
+        """Add one sample, and return value, now, lower and upper of each node, (N, 4).
 
         Args:
-            room: the sample; its leaves are measured if needed.
-            first_leaf: index of the program's first leaf.
+            room: memory with the sample. Its leaves are measured if needed.
+            first_leaf: index of the program's first leaf in the memory.
         """
         program, position = self._program, self._position
         if not program.keeps_history:
@@ -490,7 +492,7 @@ class OnlineRun:
             self._start_ns = time_ns
         numbers = np.empty(self._numbers_shape)
         phases = BEGIN if self._open_parts else BEGIN | FINISH
-        # a sample that needs more channels than the run has is run again after `widen`
+        # if a sample needs more channels than the run has, it is run again after `widen`
         while True:
             room.channels = channels = run_sample(
                 *room.arguments, *self._arrays, numbers,
@@ -507,10 +509,12 @@ class OnlineRun:
         return numbers
 
     def _add(self, leaves: Floats, times_ns: Integers, t: int, count: int) -> None:
-        """Add samples within the capacity; the leaves have as many channels as the run.
+        """Add samples within the capacity.
 
         Args:
-            times_ns: times of the samples; their leaves begin at `t`.
+            leaves: (C, A, T) with as many channels as the run.
+            times_ns: times of the samples.
+            t: index in `leaves` of the first of these samples.
         """
         if not self._program.keeps_history:
             self._offset = self._position
@@ -530,7 +534,6 @@ class OnlineRun:
         self._newest_place = count - 1
 
     def _run_all_open(self, begin: int, count: int) -> None:
-        """Run the parts with windows in all channels."""
         for part_number, parts in self._open_parts:
             for channel, part in enumerate(parts):
                 self._run_open(part_number, channel, part, begin, count)
@@ -565,13 +568,13 @@ class OnlineRun:
         return self._times[1:].reshape(-1, CHANNELS, self._times.shape[1])
 
     def _make_room(self, requested_count: int) -> int:
-        """Make room for at least one of the requested samples; return the number that fits."""
+        """Make room for at least one of the requested samples, and return the number of samples that fit."""
         if not self._program.keeps_history:
             return min(requested_count, self.room)
         used_count = self._position - self._offset
         if used_count + requested_count > self.room:
             drop_count = self._kept_from() if used_count else 0
-            # dropping less than half would move numbers often; the capacity doubles instead
+            # to drop less than half would move numbers often, so the capacity doubles instead
             if 2 * drop_count >= self.room:
                 self._forget(drop_count, used_count - drop_count)
                 used_count -= drop_count
@@ -580,7 +583,7 @@ class OnlineRun:
         return min(requested_count, self.room - used_count)
 
     def _kept_from(self) -> int:
-        """Return the first of the recent samples that may still be read after the newest one."""
+        """Return the first of the recent samples that later samples may still read."""
         last_place = self._position - self._offset - 1
         first_needed, stamps = last_place, self._stamps[: last_place + 1]
         for code, _, _, unit, low, high, *_ in self._program.signals.tolist():
@@ -591,7 +594,7 @@ class OnlineRun:
                 first_needed = min(first_needed, last_place - far_distance)
             else:
                 distances_ns = stamps[last_place] - stamps
-                # a delay also reads the last sample that is further back
+                # a delay also reads the last sample beyond the distance
                 first_needed = min(
                     first_needed, int(np.count_nonzero(distances_ns > far_distance)) - (code == codes.DELAY)
                 )
@@ -602,7 +605,7 @@ class OnlineRun:
         return max(first_needed, 0)
 
     def _forget(self, drop_count: int, keep_count: int) -> None:
-        """Drop the oldest samples, which are not read again."""
+        """Drop the oldest samples, which later samples do not read."""
         self._stamps[:keep_count] = self._stamps[drop_count : drop_count + keep_count].copy()
         signals = np.flatnonzero(self._program.signals[:, codes.SIGNAL_IS_KEPT])
         for signal in signals.tolist():

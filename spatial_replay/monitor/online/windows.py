@@ -1,16 +1,18 @@
 """Windows below unbounded operators: the nodes of a part at every position that is still open.
 
 A part runs in one channel at a time. Each of its nodes has a row of numbers, its *column*, with one number
-for each recent sample. A sample changes a column only where a window opens or closes with it, or where an
-operand has changed. Columns are updated operands first, and each records the positions that have changed.
+for each recent sample. A sample changes a column only where a window opens or closes with the sample, or
+where an operand has changed. Columns are updated operands first. For each column, the changed positions are
+stored.
 
 Positions of the root whose windows have all closed are absorbed into a table (see `signals`). The *base* is
 the first position of the root that is not absorbed. The table gives the root's value at the first sample, as
-a function of each variable's value at the end of the table, its *boundary*. A past operator over an operator
-that looks ahead has its own table, with its value at one position, its *state*.
+a function of each variable's value at its *boundary*, the end of the table. A past operator over an operator
+that looks ahead has its own table, with the operator's value at one position, the operator's *state*.
 
-Columns exist in up to three sets: for a run that ends with the newest sample, and for the lowest and the
-highest values of later samples. Positions are indices of the recent samples; `last` is the newest one.
+Columns exist in up to three sets: for a run that ends with the newest sample, for the lowest later values,
+and for the highest later values. Positions are indices of the recent samples, and `last` is the newest
+sample.
 """
 
 from __future__ import annotations
@@ -25,28 +27,29 @@ from spatial_replay.monitor.online.signals import read_table
 CLOSING = 16
 """Number of samples between two searches for closed positions."""
 BLOCK = 64
-"""Number of positions in a block of the root's operand; a block is joined again only after a change."""
+"""Number of positions in a block of the root's operand. A block is joined again only after a change."""
 STRIDE = 16
 """Number of positions that `_run_open` fills at once."""
 _NEVER = 1 << 62
 """Position beyond all samples."""
 
 SETS = 3
-"""Sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""
+"""Number of sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""
 SEEN = SETS + 1
-"""Index of the first set with copies of operands' columns; windows compare them with the new columns."""
+"""Index of the first set with copies of operands' columns, which windows compare with the new columns."""
 EXTRA = SEEN + SETS
 """Number of sets of columns, before the extra rows."""
 # rows after the columns of the nodes: joined blocks, work space of `_slide`, and the results of a part
 JOINED, BEFORE, RESULTS = 0, SETS, SETS + 1
 RESULT_NOW = 1
-"""Result row of a part's value at the newest sample; the value at the first sample is row 0."""
+"""Result row of a part's value at the newest sample. The value at the first sample is in row 0."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: HEAD has single numbers, the others one number for each node. The newest sample changed
-# its own position, and the positions from CHANGED to before CHANGED_END; without any, CHANGED_END is 0
+# rows of the state: HEAD has single numbers, and the other rows have one number for each node
+# the newest sample changed its own position, and the positions from CHANGED to before CHANGED_END
+# CHANGED_END is 0 if no earlier position changed
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
-STARTS = 9  # then two rows per window in seconds: its first position, and its last position plus one
+STARTS = 9  # two rows follow for each window in seconds: its first position, and its last position plus one
 # columns of HEAD: number of dropped samples, the base, whether any position is absorbed, and the number of
 # samples entered into windows in seconds
 OFFSET, BASE, IS_BEGUN, ENTERED = range(4)
@@ -79,11 +82,11 @@ def beyond(mode: int, weak: int) -> float:
 def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int, start: float) -> float:
     """Return the greatest or least of `start` and the numbers of a row from `begin` to before `end`.
 
-    Eight chains run side by side; in a single chain, each step would wait for the previous one.
+    Eight chains run in parallel, because in a single chain, each step would wait for the previous step.
     """
     sign = 1.0 if is_greatest else -1.0
     v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = sign * start
-    # the loop is vectorised only if numba knows that no index is negative, because it wraps those around
+    # numba wraps negative indices around, so the loop is vectorised only if no index can be negative
     place = max(begin, 0)
     while place + 8 <= end:
         v0, v1 = max(v0, sign * columns[row, place]), max(v1, sign * columns[row, place + 1])
@@ -102,7 +105,7 @@ def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int,
 
 @inlined
 def window_of(rows: Integers, node: int) -> tuple[bool, int, int, int, int]:
-    """Return whether a node looks ahead, its window's unit and ends, and the row of its window's times."""
+    """Return whether a node looks ahead, the unit and ends of its window, and the row of its times."""
     is_ahead = codes.PART_WINDOW_MAX <= rows[node, codes.NODE_CODE] <= codes.SHIFT
     times_row = STARTS + 2 * rows[node, codes.NODE_TIMED]
     return (
@@ -116,7 +119,7 @@ def window_of(rows: Integers, node: int) -> tuple[bool, int, int, int, int]:
 
 @inlined
 def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the first position in a window; last + 1 if the window has not begun."""
+    """Return the first position in the window of `position`; last + 1 if the window has not begun."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
         return int(min(state[times_row, position], last + 1))
@@ -125,7 +128,7 @@ def _start(state: Integers, window: tuple[bool, int, int, int, int], position: i
 
 @inlined
 def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the last position in a window plus one, at most last + 1."""
+    """Return the last position in the window of `position`, plus one, at most last + 1."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
         return int(min(state[times_row + 1, position], last + 1))
@@ -178,7 +181,7 @@ def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int,
 
 @inlined
 def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
-    """Record which windows in seconds begin or have ended with the newest samples."""
+    """Store the positions at which windows in seconds begin or end with the newest samples."""
     for node in range(len(rows) - 1):
         if rows[node, codes.NODE_TIMED] < 0:
             continue
@@ -194,7 +197,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
                 while next_begin <= position and time_ns - stamps[next_begin] >= near_end:
                     state[times_row, next_begin] = position
                     next_begin += 1
-                # far is -1 without an upper end
+                # the far end is -1 without an upper end
                 while far_end >= 0 and next_close < position and time_ns - stamps[next_close] > far_end:
                     state[times_row + 1, next_close] = position
                     next_close += 1
@@ -221,11 +224,11 @@ def _slide(
 ) -> int:  # fmt: skip
     """Compute extrema over the windows of positions begin … end - 1.
 
-    The common positions of several windows are scanned once. Positions before them are scanned backwards for
-    the first windows, and positions after them forwards for the last windows.
+    The common positions of several windows are scanned once. Earlier positions are scanned backwards for the
+    first windows, and later positions are scanned forwards for the last windows.
 
     Returns:
-        the first position whose number changes; last + 1 for none.
+        the first position whose number changes; last + 1 without a change.
     """
     neutral, first_change = -np.inf if is_greatest else np.inf, last + 1
     while begin < end:
@@ -272,7 +275,7 @@ def _run_open(
     value, is_same = -np.inf if is_greatest else np.inf, False
     for position in range(begin if is_fresh else last, last + 1):
         columns[column, position] = value
-    # windows that begin after the newest sample are empty: skip them
+    # windows that begin after the newest sample are empty, so they are skipped
     position, scan_begin = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
     while position > begin and not is_same:
         stop = max(position - STRIDE, begin)
@@ -281,7 +284,7 @@ def _run_open(
             scan_begin <= last
             and extremum(is_greatest, columns, operand_column, stride_start, scan_begin, value) == value
         ):
-            # no number in these windows exceeds the extremum, so all of them have this extremum
+            # no number in these windows exceeds the extremum, so all these windows have this extremum
             window_start = _start(state, window, position - 1, last)
             is_same = not is_fresh and window_start <= first_change and columns[column, position - 1] == value
             for index in range(position if is_same else stop, position):
@@ -307,7 +310,7 @@ def _changing_windows(
     """Skip windows whose number beats all changed numbers, old and new.
 
     Returns:
-        the bounds of the windows among begin … end - 1 that may change: first, last plus one.
+        the first window among begin … end - 1 that may change, and the last such window plus one.
     """
     neutral = -np.inf if is_greatest else np.inf
     if change_begin >= change_end:
@@ -338,7 +341,7 @@ def _run_window(
     rows: Integers, node: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
     is_fresh: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Update the column of a bounded operator; return the bounds of the changed positions."""
+    """Update the column of a bounded operator, and return the begin and the end of the changed positions."""
     code, window, lowest, node_count = (
         rows[node, codes.NODE_CODE],
         window_of(rows, node),
@@ -352,7 +355,7 @@ def _run_window(
     )
     seen_column, is_ahead = SEEN * node_count + column, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-    # whether the bound of an open window is infinite, regardless of its numbers so far
+    # whether the bound of an open window is infinite, regardless of the window's numbers so far
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
     open_begin = last + 1
     if is_decided:
@@ -415,7 +418,7 @@ def _run_since(
     is_strong: bool, has_left: bool, columns: Floats, left_column: int, right_column: int, column: int,
     value: float, begin: int, last: int,
 ) -> int:  # fmt: skip
-    """Run a since or trigger forwards from `begin`, given the value before; return the first change."""
+    """Run a since or trigger forwards from `begin`, given its previous value, and return the first change."""
     first_change, is_same = begin, True
     for position in range(begin, last + 1):
         if has_left:
@@ -429,7 +432,7 @@ def _run_since(
 
 @inlined
 def _start_of_past(rows: Integers, node: int, state: Integers, tables: Floats) -> float:
-    """Return the start value of a since or trigger, which its table gives for the position of its state."""
+    """Return the start value of a since or trigger, read from its table if it has a state."""
     value, part_row = beyond(codes.OPEN_END, rows[node, codes.NODE_WEAK]), len(rows) - 1
     if state[STATE, node] >= 0:
         variable_count, point_row = (
@@ -459,7 +462,7 @@ def _set_point(
 
 @inlined
 def has_column(rows: Integers) -> bool:
-    """Return whether the root has a column. A root that joins all positions needs none."""
+    """Return whether the root has a column. A root that joins all positions has no column."""
     root = len(rows) - 2
     return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
 
@@ -469,7 +472,7 @@ def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
     mode: int, last: int, is_fresh: bool,
 ) -> None:  # fmt: skip
-    """Update the columns of one set to the last sample; if `is_fresh`, compute all their numbers."""
+    """Update the columns of one set to the last sample. If `is_fresh`, all numbers are computed."""
     node_count, first_column = len(rows) - 1, mode * (len(rows) - 1)
     for node in range(node_count if has_column(rows) else node_count - 1):
         code, left_operand, right_operand = (
@@ -608,7 +611,7 @@ def _bring_up(
 def _join_blocks(
     is_until: bool, columns: Floats, body_column: int, joined_row: int, value: float, begin: int, end: int
 ) -> float:
-    """Join a number with the numbers at begin … end - 1, using joined blocks."""
+    """Join a number with the numbers at begin … end - 1 by means of joined blocks."""
     first_block, block_end = begin // BLOCK + 1, end // BLOCK
     blocks_begin = min(first_block * BLOCK, end)
     value = extremum(is_until, columns, body_column, begin, blocks_begin, value)
@@ -664,7 +667,7 @@ def run_windows(
         rows: (D + 1, NODE_WIDTH), nodes of the part, then the part itself.
         history: (S, room), signals in the channel.
         stamps: (room,), times of the recent samples.
-        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows are output, the results of the part.
+        columns: (EXTRA * D + EXTRA_ROWS, room). The last four rows are output, the results of the part.
         state: state of the part (see `HEAD`).
         tables: (2 T + 2, …), tables of the part and of its past operators, space for the next tables, a
             point at which tables are read, and start values of past operators.
@@ -680,7 +683,7 @@ def run_windows(
     for index in range(count):
         last = begin + index
         if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corner_count - 1]:
-            # the extreme corners agree: no later sample can change the value
+            # the extreme corners are equal, so no later sample can change the value
             columns[first_result, index] = columns[first_result + 2, index] = columns[
                 first_result + 3, index
             ] = tables[0, 0]
@@ -710,7 +713,7 @@ def run_windows(
                 columns[rows[root, codes.NODE_B], last],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
             )
-        # counted from the first sample of the run, so that tiles of any length absorb at the same samples
+        # counted from the first sample of the run, so that the length of a tile does not matter
         if (state[HEAD, OFFSET] + last) % CLOSING == CLOSING - 1:
             _absorb(rows, stamps, columns, state, tables, last)
 
@@ -724,7 +727,7 @@ def _reach(
 ) -> bool:
     """Find the positions of each node that the root needs at root_low … root_high.
 
-    They are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before it is widened to boundaries and states.
+    The positions are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before boundaries and states are included.
 
     Returns:
         whether all windows between these positions and the root have closed.
@@ -870,7 +873,7 @@ def _run_corner(
 def _renew_tables(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
-    """Compute the tables of a part again, with more positions from its base on."""
+    """Compute the tables of a part again, with the positions from its base to the root's `HIGH`."""
     node_count = len(rows) - 1
     table_count, variable_count = rows[node_count, codes.PART_TABLES], rows[node_count, codes.PART_VARIABLES]
     for corner in range(1 << variable_count):
@@ -899,7 +902,7 @@ def _renew_tables(
 
 @inlined
 def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last: int) -> None:
-    """Move the base over positions with open windows that cannot change the root any more.
+    """Move the base over positions that cannot change the root any more, although their windows are open.
 
     The table bounds `G x` from above. A position has no effect once x is at least this bound, because x
     never falls.
@@ -918,7 +921,7 @@ def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
     """Move the base over all positions whose windows have all closed."""
-    # large runs first: the tables are then computed once for many positions
+    # large runs first, so that the tables are computed once for many positions
     size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]
