@@ -256,7 +256,7 @@ class Ending(NamedTuple):
 
 @named_arguments
 class Monitor:
-    """Evaluates a specification sample by sample. The numbers are bit by bit those of a replay of the log.
+    """Evaluates a specification sample by sample, with exactly the numbers of a replay of the log.
 
     Time per sample and memory depend on the samples in windows and delays (`a[-3]`), not on the length of the
     run. The paper's semantics is an exception: its nested temporal operators read all samples again.
@@ -716,7 +716,7 @@ class Settled:
     def witness(self) -> Witness | None:
         """The witness on the newest samples, or None.
 
-        The fewest samples that give the part the same verdict and number are used.
+        It uses few samples, if the part has `verdict` and `number` on them.
         """
         for begin in self._begins():
             witness = self._witness_from(begin)

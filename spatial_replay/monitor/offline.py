@@ -45,7 +45,7 @@ from spatial_replay.trace.trace import LATEST_NS
 
 
 class Steps(NamedTuple):
-    """The samples begin … end - 1 in the direction in which an operator reads them.
+    """Samples in the direction in which an operator reads them.
 
     Attributes:
         stamps: times of all samples in ns.
@@ -398,9 +398,9 @@ def evaluate_prefix(
 ) -> OfflineNodes:
     """Evaluate every node over samples that further samples may follow.
 
-    Values after the last sample are unknown, [-inf, +inf], so the robustness at the first sample equals a
-    monitor's. Its deciding path ends at the atom that settled a verdict before the log ended. Arguments are
-    as for `evaluate_offline`.
+    Values after the last sample are unknown, [-inf, +inf], so the robustness at the first sample is that of a
+    monitor. Its deciding path ends at the atom that settled a verdict before the log ended. Arguments are as
+    for `evaluate_offline`.
     """
     return replace(_evaluate_beyond(formula, order, leaves, times_ns, _is_open), goes_on=True)
 
@@ -447,7 +447,7 @@ class _OpenFormulas:
         self.leaves: list[Atom] = []
         self.columns: list[Booleans] = []
         self._times_ns, self._find_open = times_ns, find_open
-        # formulas are stored to stay alive: a new formula could reuse the id of a freed one
+        # formulas are stored to stay alive, because a new formula could reuse the id of a freed formula
         self._stand_ins: dict[int, tuple[Formula, Formula]] = {}
 
     def of(self, formula: Formula) -> Formula:
@@ -497,13 +497,13 @@ def is_cut(formula: Temporal, times_ns: Integers) -> Booleans:
 
 
 def _is_open(formula: Temporal, times_ns: Integers) -> Booleans:
-    """Return for each sample whether later samples can fall into an operator's window there, (T,)."""
+    """Return for each sample whether an operator's window at that sample may get later samples, (T,)."""
     bound = Bound(1, 1, "samples") if formula.operator in ("X", "WX") else formula.bound
     return ~is_closed(bound, times_ns) & (formula.operator in FUTURE_OPERATORS)
 
 
 def is_closed(bound: Bound | None, times_ns: Integers) -> Booleans:
-    """Return for each sample whether no later sample can fall into a future operator's window there, (T,)."""
+    """Return for each sample whether a future operator's window at that sample is complete, (T,)."""
     sample_count = len(times_ns)
     if bound is None or bound.upper is None:
         return np.zeros(sample_count, np.bool_)

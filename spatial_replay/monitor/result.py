@@ -699,7 +699,7 @@ class Evaluation(Displayed):
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:
-        """The templates that decided nothing, because no object fits them.
+        """The templates that decided nothing, because they have no instances.
 
         `SpecResult.vacuous` has the parts of a result that decided nothing.
         """
@@ -933,7 +933,7 @@ def evaluate_many(
 def _evaluate_group(
     specification: Specification, traces: Sequence[Trace], semantics: Semantics
 ) -> Iterator[Evaluation]:
-    """Evaluate traces with equal units, whose samples are measured independently of each other."""
+    """Evaluate traces with equal units, if no term looks back at other samples."""
     if not traces:
         return
     checked_semantics(semantics, [specification])

@@ -635,7 +635,6 @@ class PaperRun:
         return series
 
     def _make_room(self, sample_count: int) -> None:
-        """Grow the memory to hold the given number of samples."""
         memory, pair_table_count = self._memory, self._table.pairs
         if self._table.columns and sample_count > len(memory.stamps):
             # doubled, so that a long run copies each number a constant number of times

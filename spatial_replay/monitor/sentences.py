@@ -173,7 +173,7 @@ def find_causes(
 def find_least(
     conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause, whole: str
 ) -> LeastPart | None:
-    """Return the conjunct with the least robustness; None if the first cause has it.
+    """Return the conjunct with the least robustness; None if that is the conjunct of the first cause.
 
     Args:
         whole: name of the whole formula.
@@ -576,7 +576,7 @@ def _step_title(witness: Witness, step_index: int) -> str:
 def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> str:
     """Return the operator in whose window an atom is greatest or least, in parentheses.
 
-    Without such an operator, the result is that of `_in_time`.
+    Without such an operator, the result is that of `_in_time`: the innermost temporal operator.
     """
     passed_operators: set[str] = set()
     # one sample may settle a failing G or a holding F, and later samples may be more extreme

@@ -1,4 +1,4 @@
-"""Objects that never change while all others of their class move: the tracker may have lost them."""
+"""Find objects that may be lost by a tracker: they never change while all others of their class move."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Stillness:
             is_new = rows >= 0
             if trace.reported_ns is not None:
                 report_times_ns = trace.reported_ns[:, column]
-                # samples repeat a report until the next one comes
+                # samples repeat a report until the next report comes
                 is_new &= np.concatenate([[True], report_times_ns[1:] != report_times_ns[:-1]])
             rows = rows[is_new]
             if not len(rows):

@@ -158,7 +158,7 @@ def check_parameters(templates: list[NamedSpec], each: Mapping[str, str]) -> Non
 def _appearances(
     choices: Mapping[str | None, Choice], traces: Iterable[Trace], start_ns: int, end_ns: int
 ) -> dict[str | None, dict[str, tuple[int, int]]]:
-    """Return by parameter the objects that fit its choice, with the times of their first and last samples."""
+    """Return for each parameter the chosen objects, with the times of their first and last samples."""
     spans: dict[str, tuple[int, int]] = {}
     names_by_parameter: dict[str | None, set[str]] = {parameter: set() for parameter in choices}
     for trace in traces:
@@ -300,7 +300,7 @@ class InstanceStream:
         return SeriesBlock(times, series, leaves)
 
     def _settle(self, times_ns: Integers, series: Floats) -> None:
-        """Set `settled_ns` of the nodes that became certain in these samples."""
+        """Set `settled_ns` of the nodes that became certain in the given samples."""
         newest_series = series[:, :, -1]
         for column, is_settled in enumerate((newest_series[:, 2] >= 0.0, newest_series[:, 3] < 0.0)):
             # certainty is permanent, so only nodes that are certain at the newest sample are searched, once
@@ -345,7 +345,7 @@ class EvaluationStream:
             empty: allocator of the series.
 
         Raises:
-            TraceError: the samples do not follow the previous ones in time.
+            TraceError: the samples are not later than the previous samples.
         """
         if not len(trace):
             return [stream.extend(TraceScene(trace, self._regions)) for stream in self.streams]
@@ -443,7 +443,7 @@ class LiveStream:
         return [run.final if len(run) else None for run in self._runs]
 
     def extend(self, sample: Sample) -> list[Floats | None]:
-        """Add the next sample, which is later than the previous one.
+        """Add the next sample, which is later than the previous sample.
 
         Returns:
             (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns`, the entry of

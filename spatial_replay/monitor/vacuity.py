@@ -219,7 +219,7 @@ def _part(idle_part: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
 
 
 class _Implications(NamedTuple):
-    """A formula in which each implication is written with `->`. Its robustness is that of the original.
+    """A formula with the robustness of an original formula, in which implications are written with `->`.
 
     Attributes:
         nodes: for each node of this formula, the id of the original node that it stands for.
@@ -332,7 +332,7 @@ def _join_implications(
 
 
 class _Holding:
-    """Function of a condition: the samples (T,) at which it may hold, computed once per condition."""
+    """Computes the samples (T,) at which a condition may hold, once per condition."""
 
     def __init__(self, instance: Instance, leaves: Floats, times_ns: Integers) -> None:
         self._order = instance.program.leaves
@@ -350,7 +350,7 @@ class _Holding:
 
 
 class _Windows:
-    """Function of an operator: its windows at all samples (see `windows_of`), computed once per operator."""
+    """Computes the windows of an operator at all samples (see `windows_of`), once per operator."""
 
     def __init__(self, times_ns: Integers) -> None:
         self.times_ns = times_ns
@@ -475,7 +475,7 @@ def _untested_implication(
 
 
 def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence) -> Iterator[_Idle]:
-    """Find implications in quantifiers' bodies with an antecedent that never held for any member."""
+    """Find implications with an antecedent that never held for any member, in the bodies of quantifiers."""
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Quantified) or not scope.any():
             continue
@@ -571,7 +571,7 @@ def _leaves_all_out(nodes: OfflineNodes, path: DecidingPath, evidence: Evidence)
 
 
 def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idle]:
-    """Yield why a result is infinite, by the formula of its deciding node, if that tested nothing."""
+    """Yield the reason of an infinite result, which depends on the formula of the deciding node."""
     if leaves_out(node):
         member = "object in its group" if isinstance(node, Quantified) else "sample in its window"
         predicate = ("decides at ", instant, f", where no {member} has a rate.")

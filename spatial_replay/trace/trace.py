@@ -84,7 +84,7 @@ def _signal_value(name: str, value: Any) -> float:
         if isinstance(value, str):
             return text_number(value)
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number or a text") from error
-    # a number as text, and a truth value, convert to floats but are probably mistakes
+    # texts of numbers, and truth values, convert to floats, but are probably mistakes
     if isinstance(value, (str, bytes, bool, np.bool_)):
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true")
     return number
@@ -93,7 +93,7 @@ def _signal_value(name: str, value: Any) -> float:
 @named_arguments
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Every object and signal at one time.
+    """All objects and signals at one time.
 
     Attributes:
         time_ns: nanoseconds, 0 to 2**63 - 1.
@@ -446,7 +446,8 @@ class Trace(Displayed):
     def filling(self) -> NDArray[np.bool_]:
         """(T,), whether a sample fills a pause.
 
-        Runs of unknown samples fill a pause if they begin 1 ns after a sample or end 1 ns before one.
+        Consecutive unknown samples fill a pause if they begin 1 ns after a sample, or end 1 ns before a
+        sample.
         """
         is_unknown = self.is_unknown
         span_ends = np.flatnonzero(np.diff(is_unknown, prepend=False, append=False))
@@ -660,7 +661,7 @@ class Trace(Displayed):
         """Join traces that follow each other in time.
 
         Raises:
-            TraceError: a trace begins before the previous one has ended.
+            TraceError: a trace begins before the end of the previous trace.
         """
         names = tuple(sorted({name for trace in traces for name in trace.names}))
         column_of_name = {name: index for index, name in enumerate(names)}
@@ -901,7 +902,7 @@ class Pauses:
         self._interval_count = 0
 
     def add(self, times_ns: Integers, is_lost: NDArray[np.bool_] | None = None) -> None:
-        """Add times that follow the previous ones.
+        """Add times that follow the previous times.
 
         Args:
             is_lost: (T,), whether everything is unknown after each time. An interval after such a time is
@@ -985,7 +986,7 @@ class ReportsBack:
         self._counts: dict[str, tuple[int, int]] = {}
 
     def add(self, trace: Trace) -> None:
-        """Add samples that follow the previous ones."""
+        """Add samples that follow the previous samples."""
         previous_trace, self._last_trace = self._last_trace, trace if len(trace) else self._last_trace
         if any(
             block.reported_ns is not None or block.signals_reported_ns for block in (previous_trace, trace)

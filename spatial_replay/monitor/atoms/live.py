@@ -570,7 +570,7 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
         real[plan.constants : plan.constants_end],
     )
     channel_count = _channels_of(values, spreads, signals, pair_ends, memberships, constants)
-    zero = min(measurement_count, 0)  # as in `_measure`
+    zero = min(measurement_count, 0)  # not a literal 0, as in `_measure`
     run_instructions(
         whole[plan.code : plan.code_end], constants, values, spreads, signals, pair_ends, memberships,
         whole[plan.outputs : plan.outputs_end], leaves[:channel_count], zero, zero + 1,
@@ -659,7 +659,7 @@ class PlanContext:
 
 
 class Place(NamedTuple):
-    """An object in one of the samples that a plan reads, or the point at the object's centre.
+    """An object in a sample that a plan reads, or the point at the object's centre.
 
     Attributes:
         sample: index of the sample's delay.
@@ -1093,7 +1093,6 @@ class SampleLeaves:
 
 
 def _empty_reports(formulas: Sequence[Formula]) -> RecentReports:
-    """Return an empty `RecentReports` for the rates in formulas."""
     rates = [rate for formula in formulas for rate in rates_of(formula)]
     bases = [base_of(term) for rate in rates for term in rate.terms]
     is_any = any(isinstance(base, Variable) or (isinstance(base, Group) and base.is_open) for base in bases)

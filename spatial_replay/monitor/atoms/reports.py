@@ -198,7 +198,6 @@ class RecentReports:
 
 
 def _members_in(term: Term, sample: Sample) -> Iterable[str]:
-    """Return the names of a term's objects in a sample."""
     if not isinstance(term, Group):
         return (term.name,)  # type: ignore[union-attr]
     if not term.is_open:

@@ -318,7 +318,7 @@ class TraceScene:
 
         Returns:
             the names of all members (M,), their membership (T, M) as 1 or 0, and whether the membership is
-            unknown (T,), because the group looks back to a time before the trace.
+            unknown (T,). It is unknown if the group looks back to a time before the trace.
         """
         if group not in self._members:
             self._members[group] = self._find_members(group)

@@ -63,7 +63,6 @@ def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
 
 
 def _operands_of_row(row: Row) -> tuple[int, ...]:
-    """Return the operand rows of a row in a `SignalTable`."""
     code, first_operand, second_operand, *_ = row
     if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
         return ()
@@ -419,7 +418,7 @@ def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[
 
 
 def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
-    """Return the extremum for the right operand and for the left operand of an until or since."""
+    """Return the codes of the window extrema for the right and the left operand of an until or since."""
     return (greatest, least) if is_strong else (least, greatest)
 
 

@@ -189,7 +189,7 @@ def run_signals(
                 memory[channel, signal_count + signal] = history[channel, signal, begin]
 
 
-# work rows of a part: one row for each node, then these rows, then its results
+# work rows of a part: one row for each node, then `VALUES`, `FRESH` and `POINT`, then the part's results
 VALUES, FRESH, POINT, RESULTS = range(4)
 EXTRA_ROWS = 6
 

@@ -539,7 +539,6 @@ class OnlineRun:
                 self._run_open(part_number, channel, part, begin, count)
 
     def _run_open(self, part_number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
-        """Run a part in one channel, and store its results."""
         channels, is_high = self._channels, channel & 1
         # bounds include uncertainty, so they come from the last two channels
         bounds = 3 if channels == 1 else 1 << is_high if channel >= channels - 2 else 0

@@ -6,9 +6,10 @@ where an operand has changed. Columns are updated operands first. For each colum
 stored.
 
 Positions of the root whose windows have all closed are absorbed into a table (see `signals`). The *base* is
-the first position of the root that is not absorbed. The table gives the root's value at the first sample, as
-a function of each variable's value at its *boundary*, the end of the table. A past operator over an operator
-that looks ahead has its own table, with the operator's value at one position, the operator's *state*.
+the first position of the root that is not absorbed. The table gives the root's value at the first sample. It
+is a function of each variable's value at the end of the table, the variable's *boundary*. If the operand of a
+past operator looks ahead, the past operator has a table, too. This table gives the past operator's value at
+one position, its *state*.
 
 Columns exist in up to three sets: for a run that ends with the newest sample, for the lowest later values,
 and for the highest later values. Positions are indices of the recent samples, and `last` is the newest
@@ -267,7 +268,7 @@ def _run_open(
 ) -> int:  # fmt: skip
     """Update the windows that reach to the last sample, from the last window backwards.
 
-    Earlier windows contain later ones, so the update stops at the first window that does not change.
+    Earlier windows contain later windows, so the update stops at the first window that does not change.
 
     Returns:
         the first position whose number changes.
@@ -454,7 +455,7 @@ def _set_point(
     last: int,
     tables: Floats,
 ) -> None:
-    """Set the coordinate of a node's variable in the point to the node's value at the boundary."""
+    """Store a node's value at the boundary as the coordinate of the node's variable in the point."""
     boundary = state[BOUNDARY, node]
     value = columns[column, boundary] if boundary <= last else beyond(mode, rows[node, codes.NODE_WEAK])
     tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[node, codes.NODE_VARIABLE]] = value
@@ -725,7 +726,7 @@ def run_windows(
 def _reach(
     rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last: int
 ) -> bool:
-    """Find the positions of each node that the root needs at root_low … root_high.
+    """Find the positions of each node that the root needs at its positions root_low … root_high.
 
     The positions are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before boundaries and states are included.
 

@@ -244,7 +244,6 @@ def _is_absent(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 
 
 def _is_classified(trace: Trace, part: NamedPart) -> bool:
-    """Return whether an object has a class in some sample."""
     if part.is_signal or part.name not in trace.names:
         return False
     rows = trace.rows[:, trace.names.index(part.name)]

@@ -123,7 +123,7 @@ class Extremum(NamedTuple):
 
 def extremum_of(operator: BooleanOperator, operands: Sequence[int]) -> SignedOperand | Extremum:
     """Return a Boolean operator as minima and maxima of the operands with the given indices."""
-    # distinct stand-ins, because two equal operands of the text may be one Python object
+    # distinct stand-ins, because equal operands of the text may be a single Python object
     stand_ins = tuple(Truth(True) for _ in operands)
     operand_of_id = {id(stand_in): number for stand_in, number in zip(stand_ins, operands, strict=True)}
     formula = Boolean(operator, stand_ins)
@@ -583,7 +583,7 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
 
 
 def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
-    """Return condition and response of the outermost failed implication below a quantifier.
+    """Return the condition and the response of the outermost failed implication below a quantifier.
 
     The third value is whether the deciding atom of the leaf is in the condition.
     """

@@ -610,7 +610,6 @@ def _plus(expression: Expression, number: float) -> Expression:
 
 
 def _enlarge_term(atom: Atom, term_index: int, radius: float) -> Atom:
-    """Return an atom with one of its terms enlarged."""
     enlarged_term = Enlarged(atom.terms[term_index], radius)
 
     def leaf(part: Number | Signal | Measurement) -> Expression:
@@ -625,7 +624,7 @@ def _enlarge_term(atom: Atom, term_index: int, radius: float) -> Atom:
 
 
 def _short_numbers(number: float, value: float) -> Iterator[float]:
-    """Iterate over short numbers at `number`, and beyond it as seen from `value`. The last is `number`."""
+    """Iterate over short numbers near `number`, rounded to nearest or away from `value`, then `number`."""
     exact_number, change = Decimal(number), Decimal(number) - Decimal(value)
     rounding_away = ROUND_CEILING if change > 0 else ROUND_FLOOR
     # a number near 0 may be a rounding error, so the digits of the change are used

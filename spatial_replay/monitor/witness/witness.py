@@ -182,8 +182,8 @@ def find_witness(
         times_ns: (T,), T at least 1.
         node: id of the node.
         goes_on: whether samples may follow. The verdict then holds over every continuation.
-        whole: leaves and times over which a threshold has to flip the verdict, such as those of the whole
-            log; None for `leaves` and `times_ns`.
+        whole: leaves and times of the whole log, over which a threshold has to flip the verdict. None for
+            `leaves` and `times_ns`.
         flips: whether to search for the number that flips the verdict.
     """
     instance = evidence.instance
