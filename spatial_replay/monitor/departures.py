@@ -337,8 +337,8 @@ def _without_enlargement(term: Term) -> Term:
 def _with_base(term: Term, change: Callable[[Term], Term]) -> Term:
     """Apply `change` to a term, or to the term inside a `Centre`."""
     if isinstance(term, Centre):
-        inner: Any = _with_base(term.term, change)
-        return replace(term, term=inner)
+        inner_term: Any = _with_base(term.term, change)
+        return replace(term, term=inner_term)
     return change(term)
 
 

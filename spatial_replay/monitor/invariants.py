@@ -153,8 +153,8 @@ class _Invariant(NamedTuple):
         while operator_of(body) == "spec":
             (body,), body_node = operands_of(body), body_node + 1
         # ids are in the order of the text: the first operand follows its node
-        condition = body_node + 1 if sign > 0 and operator_of(body) == "->" else None
-        return cls(conjunct, formula, node + 1, condition)
+        condition_node = body_node + 1 if sign > 0 and operator_of(body) == "->" else None
+        return cls(conjunct, formula, node + 1, condition_node)
 
 
 def _intervals_of(

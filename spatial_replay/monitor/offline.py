@@ -417,7 +417,7 @@ def evaluate_with_whole_windows(
 
 def _evaluate_beyond(
     formula: Formula,
-    order: Sequence[Atom | Quantified],
+    leaf_order: Sequence[Atom | Quantified],
     leaves: Floats,
     times_ns: Integers,
     find_open: Callable[[Temporal, Integers], Booleans],
@@ -426,7 +426,7 @@ def _evaluate_beyond(
     stand_ins = [open_formulas.of(node_formula) for node_formula in computed_formulas(formula)]
     is_open = np.array(open_formulas.columns, np.bool_).reshape(-1, len(times_ns))
     unknown_ends = np.stack([np.full(is_open.shape, -np.inf), np.where(is_open, np.inf, -np.inf)])
-    compiled = OfflineFormula.of(formula, (*order, *open_formulas.leaves), stand_ins)
+    compiled = OfflineFormula.of(formula, (*leaf_order, *open_formulas.leaves), stand_ins)
     return compiled.evaluate(joined_channels([leaves, unknown_ends], axis=1), times_ns)
 
 

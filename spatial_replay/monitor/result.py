@@ -469,8 +469,8 @@ class SpecResult(Displayed):
             UsageError: the width is below 1 ns, the semantics is the paper's, or the leaves were not stored.
         """
         leaves = self._leaves("a sliding window")
-        order = self.evidence.instance.program.leaves
-        return window_signal(self.formula, order, leaves, self.times_ns, width_ns)
+        leaf_order = self.evidence.instance.program.leaves
+        return window_signal(self.formula, leaf_order, leaves, self.times_ns, width_ns)
 
     def witness(self, node: str | int | None = None) -> Witness:
         """Return the witness of the verdict of a node, given by name or id. The default is the root.

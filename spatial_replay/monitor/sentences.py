@@ -391,14 +391,15 @@ def how_text(
         number: robustness of the atom.
         units: declared units (see `declared_unit`).
         past: whether the text is in the past tense.
-        is_violated: whether the atom decides a violation. If it does, and it holds, it "must not hold".
+        is_violated: whether the atom decides a violation. The text on an atom that holds then begins with
+            "must not hold".
     """
     outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
     unwanted_text = "must not hold, and " if is_violated and number >= 0.0 else ""
     if not without_residue(number, atom):
         return f"{unwanted_text}{outcome} by rounding" if number else f"{unwanted_text}just {outcome}"
-    amount = f" by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else ""
-    return f"{unwanted_text}{outcome}{amount}"
+    amount_clause = f" by {amount_text(abs(number), atom, units)}" if math.isfinite(number) else ""
+    return f"{unwanted_text}{outcome}{amount_clause}"
 
 
 def uncertain_text(least: str) -> str:
@@ -665,8 +666,8 @@ def _flip(
     elif threshold.verdict is Verdict.UNKNOWN:
         would_text = "It would not have been violated then"
     if _is_overlap(deciding, threshold):
-        place = _place(deciding, threshold)
-        return f"No distance {place} makes it {threshold.verdict}: the objects touch or overlap."
+        place_text = _place(deciding, threshold)
+        return f"No distance {place_text} makes it {threshold.verdict}: the objects touch or overlap."
     if threshold.is_written:
         is_idle = deciding is witness.deciding and witness.missed is not None and witness.missed.is_condition
         reason = ", as the condition would not hold there" if is_idle else ""

@@ -56,7 +56,7 @@ class Stillness:
     def add(self, trace: Trace) -> None:
         """Add the next samples."""
         self._lasting |= trace.lasting
-        numbers = _numbers(trace)
+        observation_numbers = _numbers(trace)
         for column, name in enumerate(trace.names):
             rows = trace.rows[:, column]
             is_new = rows >= 0
@@ -68,7 +68,7 @@ class Stillness:
             if not len(rows):
                 continue
             reports = self._reports[name]
-            report_numbers = np.concatenate([reports.last_numbers[None], numbers[rows]])
+            report_numbers = np.concatenate([reports.last_numbers[None], observation_numbers[rows]])
             # the first report of an object has no previous report to differ from
             is_first = bool(np.isnan(report_numbers[0]).all())
             # NaN differs from itself, but a missing yaw is no change

@@ -335,13 +335,13 @@ class _Holding:
     """Computes the samples (T,) at which a condition may hold, once per condition."""
 
     def __init__(self, instance: Instance, leaves: Floats, times_ns: Integers) -> None:
-        self._order = instance.program.leaves
+        self._leaf_order = instance.program.leaves
         self._leaves, self._times_ns = leaves, times_ns
         self._samples: dict[Formula, _Samples] = {}
 
     def __call__(self, condition: Formula) -> _Samples:
         if condition not in self._samples:
-            nodes = evaluate_offline(condition, self._order, self._leaves, self._times_ns)
+            nodes = evaluate_offline(condition, self._leaf_order, self._leaves, self._times_ns)
             self._samples[condition] = nodes.ends(0)[1] >= 0.0
         return self._samples[condition]
 
@@ -592,7 +592,7 @@ def _infinite(identifier: int, node: Formula, instant: Instant) -> Iterator[_Idl
 
 def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
     """Return remarks on the goals (`F`) of a formula that already hold at the first sample."""
-    order = evidence.instance.program.leaves
+    leaf_order = evidence.instance.program.leaves
     sentences: list[Sentence] = []
     pending_nodes = [evidence.instance.formula]
     while pending_nodes:
@@ -607,7 +607,7 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
         ):
             (goal,) = node.operands
             if is_spatial(goal):
-                low, _ = evaluate_offline(goal, order, leaves[..., :1], times_ns[:1]).interval(0)
+                low, _ = evaluate_offline(goal, leaf_order, leaves[..., :1], times_ns[:1]).interval(0)
                 name = node.name or shortened_formula(format_formula(node))
                 sentences += (
                     [Sentence(f"`{name}` is already true at the first sample.")] if low >= 0.0 else []
@@ -634,11 +634,11 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
         leaves: (C, A, T), the leaves of the instance's formula.
     """
     instance = evidence.instance
-    order = instance.program.leaves
-    unknown_leaves = _with_unknown_leaves(order, leaves, evidence)
+    leaf_order = instance.program.leaves
+    unknown_leaves = _with_unknown_leaves(leaf_order, leaves, evidence)
     known_leaves = leaves if verdict is Verdict.SATISFIED else unknown_leaves
     # each leaf is evaluated twice: unknown, and with its values for antecedents
-    stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(order)}
+    stand_ins = {leaf_key(leaf): Atom("", "signal", Signal(f"\0{n}")) for n, leaf in enumerate(leaf_order)}
 
     def with_stand_ins(formula: Formula, *, in_antecedent: bool = False) -> Formula:
         match formula:
@@ -666,11 +666,13 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 
     all_leaves = joined_channels([unknown_leaves, known_leaves], axis=1)
     formula = with_stand_ins(_implications_of(instance.formula).formula)
-    nodes = evaluate_offline(formula, (*order, *stand_ins.values()), all_leaves, times_ns)
+    nodes = evaluate_offline(formula, (*leaf_order, *stand_ins.values()), all_leaves, times_ns)
     return final_verdict(*nodes.interval(0)) is verdict
 
 
-def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
+def _with_unknown_leaves(
+    leaf_order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence
+) -> Floats:
     """Return leaves (2, A, T) with unknown values.
 
     Only antecedents in quantifiers, leaves over empty groups, and conditions on rates keep their values.
@@ -678,7 +680,7 @@ def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evi
     low, high = low_and_high(len(leaves), wide=True)
     unknown_leaves = roomy((2, *leaves.shape[1:]), np.float64)
     unknown_leaves[0], unknown_leaves[1] = -np.inf, np.inf
-    for leaf_index, leaf in enumerate(order):
+    for leaf_index, leaf in enumerate(leaf_order):
         bound_leaf = evidence.bound(leaf)
         groups = list(dict.fromkeys(_open_groups(bound_leaf)))
         if is_about_having_rates(bound_leaf):
@@ -727,9 +729,9 @@ def find_cut_window(
     nodes = nodes_of(instance.formula)
     if not any(isinstance(node, Temporal) and is_cut(node, times_ns)[-1] for node in nodes):
         return None
-    order = instance.program.leaves
-    cut_nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
-    whole_nodes = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
+    leaf_order = instance.program.leaves
+    cut_nodes = evaluate_offline(instance.formula, leaf_order, leaves, times_ns)
+    whole_nodes = evaluate_with_whole_windows(instance.formula, leaf_order, leaves, times_ns)
     cut_verdict, whole_verdict = (final_verdict(*nodes.interval(0)) for nodes in (cut_nodes, whole_nodes))
     if cut_verdict is not verdict or whole_verdict is verdict:
         return None

@@ -132,10 +132,11 @@ class Sample:
         if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, (int, np.integer)):
             raise TraceError(f"time_ns is {self.time_ns!r}; give integer nanoseconds")
         for attribute in _EXAMPLES:
-            by_name = getattr(self, attribute)
-            if not isinstance(by_name, Mapping):
+            named_values = getattr(self, attribute)
+            if not isinstance(named_values, Mapping):
                 raise TraceError(
-                    f"{attribute} is {shortened(by_name)}; give a dict by name, as in {_EXAMPLES[attribute]}"
+                    f"{attribute} is {shortened(named_values)}; give a dict by name,"
+                    f" as in {_EXAMPLES[attribute]}"
                 )
         if not 0 <= self.time_ns <= LATEST_NS:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
@@ -171,12 +172,12 @@ class Sample:
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
         # the sample's time is the default; storing it would make equal samples differ
-        other_times = {
+        report_times_ns = {
             name: reported_ns
             for name, reported_ns in self.reported_ns.items()
             if reported_ns != self.time_ns and name not in self.unknown
         }
-        object.__setattr__(self, "reported_ns", MappingProxyType(other_times))
+        object.__setattr__(self, "reported_ns", MappingProxyType(report_times_ns))
         object.__setattr__(self, "lasting", frozenset(self.lasting) & objects.keys())
 
     def _check_report_time(self, name: str, reported_ns: object) -> None:
@@ -398,8 +399,8 @@ class Trace(Displayed):
         object.__setattr__(self, "signals", MappingProxyType(signals))
         if self.reported_ns is not None:
             object.__setattr__(self, "reported_ns", read_only_integers(self.reported_ns))
-        reported = {name: read_only_integers(times) for name, times in self.signals_reported_ns.items()}
-        object.__setattr__(self, "signals_reported_ns", MappingProxyType(reported))
+        signal_times = {name: read_only_integers(times) for name, times in self.signals_reported_ns.items()}
+        object.__setattr__(self, "signals_reported_ns", MappingProxyType(signal_times))
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         _check_shapes(self)
         _check_times(self.times_ns)

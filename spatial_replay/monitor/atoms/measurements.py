@@ -117,8 +117,8 @@ def _region(term: Term) -> str | None:
 
 def _without_region_name(term: Term) -> Term:
     if isinstance(term, Enlarged | Centre):
-        inner: Any = _without_region_name(term.term)
-        return replace(term, term=inner)
+        inner_term: Any = _without_region_name(term.term)
+        return replace(term, term=inner_term)
     return RegionName("") if _region(term) is not None else term
 
 

@@ -68,6 +68,13 @@ def _slide(
     """Compute an extremum over a sliding window.
 
     The ring is a monotonic queue: it holds the positions that can still attain the extremum.
+
+    Args:
+        row: row of the window in `rows`.
+        target: row of the window in the history.
+        times: times of the recent samples, then the rings.
+        offset: position in the run of place 0 of the history.
+        begin, count: first place, and number of places, to compute.
     """
     operand, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]
     near_distance, far_distance = rows[row, codes.SIGNAL_LOW], rows[row, codes.SIGNAL_HIGH]

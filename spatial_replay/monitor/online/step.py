@@ -311,7 +311,12 @@ def run_sample(
 
 
 class _OpenPart:
-    """State of one part with windows in one channel, for `run_windows`."""
+    """State of one part with windows in one channel, for `run_windows`.
+
+    Args:
+        rows: rows of the part's nodes, then the row of the part.
+        room: capacity in recent samples.
+    """
 
     def __init__(self, rows: Integers, room: int) -> None:
         node_count, part, timed_count = len(rows) - 1, rows[-1], int(rows[:-1, codes.NODE_TIMED].max()) + 1

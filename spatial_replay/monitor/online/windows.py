@@ -12,8 +12,8 @@ past operator looks ahead, the past operator has a table, too. This table gives 
 one position, its *state*.
 
 Columns exist in up to three sets: for a run that ends with the newest sample, for the lowest later values,
-and for the highest later values. Positions are indices of the recent samples, and `last` is the newest
-sample.
+and for the highest later values. The *mode* of a set is `OPEN_END`, `OPEN_LOW` or `OPEN_HIGH`. Positions are
+indices of the recent samples.
 """
 
 from __future__ import annotations
@@ -119,30 +119,32 @@ def window_of(rows: Integers, node: int) -> tuple[bool, int, int, int, int]:
 
 
 @inlined
-def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the first position in the window of `position`; last + 1 if the window has not begun."""
+def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last_sample: int) -> int:
+    """Return the first position in the window of `position`; `last_sample` + 1 if it has not begun."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
-        return int(min(state[times_row, position], last + 1))
-    return min(position + near_end, last + 1) if is_ahead else max(position - far_end, 0)
+        return int(min(state[times_row, position], last_sample + 1))
+    return min(position + near_end, last_sample + 1) if is_ahead else max(position - far_end, 0)
 
 
 @inlined
-def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
-    """Return the last position in the window of `position`, plus one, at most last + 1."""
+def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last_sample: int) -> int:
+    """Return the last position in the window of `position`, plus one, at most `last_sample` + 1."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
-        return int(min(state[times_row + 1, position], last + 1))
-    return min(position + far_end, last) + 1 if is_ahead else position - near_end + 1
+        return int(min(state[times_row + 1, position], last_sample + 1))
+    return min(position + far_end, last_sample) + 1 if is_ahead else position - near_end + 1
 
 
 @inlined
-def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
+def _first_holding(
+    state: Integers, window: tuple[bool, int, int, int, int], position: int, last_sample: int
+) -> int:
     """Return the first position whose window ends at `position` or later."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit == codes.SAMPLES:
         return max(position - far_end, 0) if is_ahead else position + near_end
-    low, high = 0, last + 1
+    low, high = 0, last_sample + 1
     while low < high:
         middle = (low + high) >> 1
         if state[times_row + 1, middle] <= position:
@@ -154,13 +156,13 @@ def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], pos
 
 @inlined
 def _first_starting(
-    state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int
+    state: Integers, window: tuple[bool, int, int, int, int], position: int, last_sample: int
 ) -> int:
     """Return the first position whose window ahead starts at `position` or later."""
     _, unit, near_end, _, times_row = window
     if unit == codes.SAMPLES:
         return max(position - near_end, 0)
-    low, high = 0, last + 1
+    low, high = 0, last_sample + 1
     while low < high:
         middle = (low + high) >> 1
         if state[times_row, middle] < position:
@@ -171,17 +173,19 @@ def _first_starting(
 
 
 @inlined
-def _first_open(state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int) -> int:
+def _first_open(
+    state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last_sample: int
+) -> int:
     """Return the first position whose window ahead may get a later sample."""
     _, unit, _, far_end, times_row = window
     if unit == codes.SAMPLES:
-        return max(last - far_end + 1, 0)
+        return max(last_sample - far_end + 1, 0)
     next_close = state[HEAD, NEXT + times_row + 1 - STARTS]
-    return int(next_close + 1 if stamps[last] - stamps[next_close] == far_end else next_close)
+    return int(next_close + 1 if stamps[last_sample] - stamps[next_close] == far_end else next_close)
 
 
 @inlined
-def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
+def _enter(rows: Integers, stamps: Integers, state: Integers, last_sample: int) -> None:
     """Store the positions at which windows in seconds begin or end with the newest samples."""
     for node in range(len(rows) - 1):
         if rows[node, codes.NODE_TIMED] < 0:
@@ -191,7 +195,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
             state[HEAD, NEXT + times_row - STARTS],
             state[HEAD, NEXT + times_row + 1 - STARTS],
         )
-        for position in range(state[HEAD, ENTERED], last + 1):
+        for position in range(state[HEAD, ENTERED], last_sample + 1):
             time_ns = stamps[position]
             if is_ahead:
                 state[times_row, position] = state[times_row + 1, position] = _NEVER
@@ -212,7 +216,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
             next_begin,
             next_close,
         )
-    state[HEAD, ENTERED] = last + 1
+    state[HEAD, ENTERED] = last_sample + 1
 
 
 # -------------------------------------------------------------------------------------- columns of the nodes
@@ -221,7 +225,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
 @inlined
 def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    operand_column: int, column: int, scratch_row: int, begin: int, end: int, last: int,
+    operand_column: int, column: int, scratch_row: int, begin: int, end: int, last_sample: int,
 ) -> int:  # fmt: skip
     """Compute extrema over the windows of positions begin … end - 1.
 
@@ -229,32 +233,32 @@ def _slide(
     first windows, and later positions are scanned forwards for the last windows.
 
     Returns:
-        the first position whose number changes; last + 1 without a change.
+        the first position whose number changes; `last_sample` + 1 without a change.
     """
-    neutral, first_change = -np.inf if is_greatest else np.inf, last + 1
+    neutral, first_change = -np.inf if is_greatest else np.inf, last_sample + 1
     while begin < end:
-        scan_end, stop = _after(state, window, begin, last), end
-        scan_begin = _start(state, window, end - 1, last)
+        scan_end, stop = _after(state, window, begin, last_sample), end
+        scan_begin = _start(state, window, end - 1, last_sample)
         if scan_begin >= scan_end:
-            stop, scan_begin = begin + 1, _start(state, window, begin, last)
-            while stop < end and _start(state, window, stop, last) < scan_end:
-                scan_begin = _start(state, window, stop, last)
+            stop, scan_begin = begin + 1, _start(state, window, begin, last_sample)
+            while stop < end and _start(state, window, stop, last_sample) < scan_end:
+                scan_begin = _start(state, window, stop, last_sample)
                 stop += 1
         value = extremum(is_greatest, columns, operand_column, scan_begin, scan_end, neutral)
         for position in range(stop - 1, begin - 1, -1):
-            window_start = _start(state, window, position, last)
+            window_start = _start(state, window, position, last_sample)
             while scan_begin > window_start:
                 scan_begin -= 1
                 value = better(is_greatest, value, columns[operand_column, scan_begin])
             columns[scratch_row, position - begin] = value
         value = neutral
         for position in range(begin, stop):
-            window_end = _after(state, window, position, last)
+            window_end = _after(state, window, position, last_sample)
             while scan_end < window_end:
                 value = better(is_greatest, value, columns[operand_column, scan_end])
                 scan_end += 1
             number = better(is_greatest, columns[scratch_row, position - begin], value)
-            if first_change > last and columns[column, position] != number:
+            if first_change > last_sample and columns[column, position] != number:
                 first_change = position
             columns[column, position] = number
         begin = stop
@@ -264,7 +268,7 @@ def _slide(
 @inlined
 def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    operand_column: int, column: int, begin: int, first_change: int, last: int, is_fresh: bool,
+    operand_column: int, column: int, begin: int, first_change: int, last_sample: int, is_fresh: bool,
 ) -> int:  # fmt: skip
     """Update the windows that reach to the last sample, from the last window backwards.
 
@@ -274,25 +278,28 @@ def _run_open(
         the first position whose number changes.
     """
     value, is_same = -np.inf if is_greatest else np.inf, False
-    for position in range(begin if is_fresh else last, last + 1):
+    for position in range(begin if is_fresh else last_sample, last_sample + 1):
         columns[column, position] = value
     # windows that begin after the newest sample are empty, so they are skipped
-    position, scan_begin = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
+    position, scan_begin = (
+        min(_first_starting(state, window, last_sample + 1, last_sample), last_sample + 1),
+        last_sample + 1,
+    )
     while position > begin and not is_same:
         stop = max(position - STRIDE, begin)
-        stride_start = _start(state, window, stop, last)
+        stride_start = _start(state, window, stop, last_sample)
         if (
-            scan_begin <= last
+            scan_begin <= last_sample
             and extremum(is_greatest, columns, operand_column, stride_start, scan_begin, value) == value
         ):
             # no number in these windows exceeds the extremum, so all these windows have this extremum
-            window_start = _start(state, window, position - 1, last)
+            window_start = _start(state, window, position - 1, last_sample)
             is_same = not is_fresh and window_start <= first_change and columns[column, position - 1] == value
             for index in range(position if is_same else stop, position):
                 columns[column, index] = value
             position, scan_begin = position if is_same else stop, stride_start
         while position > stop and not is_same:
-            window_start = _start(state, window, position - 1, last)
+            window_start = _start(state, window, position - 1, last_sample)
             while scan_begin > window_start:
                 scan_begin -= 1
                 value = better(is_greatest, value, columns[operand_column, scan_begin])
@@ -339,11 +346,11 @@ def _changing_windows(
 
 @inlined
 def _run_window(
-    rows: Integers, node: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
-    is_fresh: bool,
+    rows: Integers, node: int, stamps: Integers, state: Integers, columns: Floats, mode: int,
+    last_sample: int, is_fresh: bool,
 ) -> tuple[int, int]:  # fmt: skip
     """Update the column of a bounded operator, and return the begin and the end of the changed positions."""
-    code, window, lowest, node_count = (
+    code, window, lowest_position, node_count = (
         rows[node, codes.NODE_CODE],
         window_of(rows, node),
         state[LOWS, node],
@@ -358,20 +365,25 @@ def _run_window(
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     # whether the bound of an open window is infinite, regardless of the window's numbers so far
     is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
-    open_begin = last + 1
+    open_begin = last_sample + 1
     if is_decided:
-        open_begin = _first_open(state, stamps, window, last)
+        open_begin = _first_open(state, stamps, window, last_sample)
     elif is_ahead:
-        open_begin = _first_holding(state, window, last, last)
-    begin, open_begin = lowest, min(max(open_begin, lowest), last + 1)
+        open_begin = _first_holding(state, window, last_sample, last_sample)
+    begin, open_begin = lowest_position, min(max(open_begin, lowest_position), last_sample + 1)
     end = open_begin
     if not is_fresh:
-        begin = min(max(min(_first_holding(state, window, change_begin, last), last), lowest), open_begin)
+        begin = min(
+            max(min(_first_holding(state, window, change_begin, last_sample), last_sample), lowest_position),
+            open_begin,
+        )
     if is_ahead and not is_fresh:
         closing_begin = open_begin  # windows from this position on close with the newest sample or later
-        if is_decided and last > 0:
-            closing_begin = min(max(_first_holding(state, window, last - 1, last), lowest), open_begin)
-        end = min(_first_starting(state, window, change_end, last), closing_begin)
+        if is_decided and last_sample > 0:
+            closing_begin = min(
+                max(_first_holding(state, window, last_sample - 1, last_sample), lowest_position), open_begin
+            )
+        end = min(_first_starting(state, window, change_end, last_sample), closing_begin)
         begin, end = _changing_windows(
             is_greatest, columns, operand_column, column, seen_column, change_begin, change_end, begin, end
         )
@@ -380,7 +392,7 @@ def _run_window(
     if is_ahead:
         for index in range(change_begin, change_end):
             columns[seen_column, index] = columns[operand_column, index]
-        columns[seen_column, last] = columns[operand_column, last]
+        columns[seen_column, last_sample] = columns[operand_column, last_sample]
     first_change = _slide(
         is_greatest,
         window,
@@ -391,12 +403,12 @@ def _run_window(
         EXTRA * node_count + BEFORE,
         begin,
         end,
-        last,
+        last_sample,
     )
     if is_decided:
-        for position in range(open_begin if is_fresh else max(open_begin, last), last + 1):
+        for position in range(open_begin if is_fresh else max(open_begin, last_sample), last_sample + 1):
             columns[column, position] = beyond(mode, 0)
-    elif open_begin <= last:
+    elif open_begin <= last_sample:
         first_open_change = _run_open(
             is_greatest,
             window,
@@ -406,26 +418,26 @@ def _run_window(
             column,
             open_begin,
             change_begin,
-            last,
+            last_sample,
             is_fresh,
         )
-        if first_open_change < last:
-            first_change, end = min(first_change, first_open_change), last
-    return (lowest, last) if is_fresh else (first_change, min(end, last))
+        if first_open_change < last_sample:
+            first_change, end = min(first_change, first_open_change), last_sample
+    return (lowest_position, last_sample) if is_fresh else (first_change, min(end, last_sample))
 
 
 @inlined
 def _run_since(
     is_strong: bool, has_left: bool, columns: Floats, left_column: int, right_column: int, column: int,
-    value: float, begin: int, last: int,
+    value: float, begin: int, last_sample: int,
 ) -> int:  # fmt: skip
     """Run a since or trigger forwards from `begin`, given its previous value, and return the first change."""
     first_change, is_same = begin, True
-    for position in range(begin, last + 1):
+    for position in range(begin, last_sample + 1):
         if has_left:
             value = better(not is_strong, columns[left_column, position], value)
         value = better(is_strong, columns[right_column, position], value)
-        is_same = is_same and position < last and columns[column, position] == value
+        is_same = is_same and position < last_sample and columns[column, position] == value
         first_change += is_same
         columns[column, position] = value
     return first_change
@@ -452,12 +464,14 @@ def _set_point(
     columns: Floats,
     column: int,
     mode: int,
-    last: int,
+    last_sample: int,
     tables: Floats,
 ) -> None:
     """Store a node's value at the boundary as the coordinate of the node's variable in the point."""
     boundary = state[BOUNDARY, node]
-    value = columns[column, boundary] if boundary <= last else beyond(mode, rows[node, codes.NODE_WEAK])
+    value = (
+        columns[column, boundary] if boundary <= last_sample else beyond(mode, rows[node, codes.NODE_WEAK])
+    )
     tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[node, codes.NODE_VARIABLE]] = value
 
 
@@ -471,7 +485,7 @@ def has_column(rows: Integers) -> bool:
 @inlined
 def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
-    mode: int, last: int, is_fresh: bool,
+    mode: int, last_sample: int, is_fresh: bool,
 ) -> None:  # fmt: skip
     """Update the columns of one set to the last sample. If `is_fresh`, all numbers are computed."""
     node_count, first_column = len(rows) - 1, mode * (len(rows) - 1)
@@ -481,10 +495,10 @@ def _bring_up(
             rows[node, codes.NODE_A],
             rows[node, codes.NODE_B],
         )
-        column, begin, end, lowest = first_column + node, last, last, state[LOWS, node]
+        column, begin, end, lowest_position = first_column + node, last_sample, last_sample, state[LOWS, node]
         if code == codes.LITERAL:
-            begin = lowest if is_fresh else last
-            for index in range(begin, last + 1):
+            begin = lowest_position if is_fresh else last_sample
+            for index in range(begin, last_sample + 1):
                 columns[column, index] = history[left_operand, index]
         elif code in (codes.PART_AND, codes.PART_OR):
             is_or, left_column, right_column = (
@@ -492,7 +506,7 @@ def _bring_up(
                 first_column + left_operand,
                 first_column + right_operand,
             )
-            begin = max(min(state[CHANGED, left_operand], state[CHANGED, right_operand]), lowest)
+            begin = max(min(state[CHANGED, left_operand], state[CHANGED, right_operand]), lowest_position)
             end = max(state[CHANGED_END, left_operand], state[CHANGED_END, right_operand])
             while (
                 begin < end
@@ -512,36 +526,43 @@ def _bring_up(
             else:
                 for index in range(len(values)):
                     values[index] = min(left_values[index], right_values[index])
-            columns[column, last] = better(is_or, columns[left_column, last], columns[right_column, last])
+            columns[column, last_sample] = better(
+                is_or, columns[left_column, last_sample], columns[right_column, last_sample]
+            )
         elif code in (codes.UNTIL, codes.RELEASE):
             left_column, right_column, is_strong = (
                 first_column + max(left_operand, 0),
                 first_column + right_operand,
                 code == codes.UNTIL,
             )
-            first_change, begin = state[CHANGED, right_operand], last + 1
+            first_change, begin = state[CHANGED, right_operand], last_sample + 1
             if left_operand >= 0:
                 first_change = min(first_change, state[CHANGED, left_operand])
             value, is_same = beyond(mode, rows[node, codes.NODE_WEAK]), False
-            while begin > lowest and not is_same:
+            while begin > lowest_position and not is_same:
                 if left_operand >= 0:
                     value = better(not is_strong, columns[left_column, begin - 1], value)
                 value = better(is_strong, columns[right_column, begin - 1], value)
                 is_same = (
-                    not is_fresh and begin <= min(first_change, last) and columns[column, begin - 1] == value
+                    not is_fresh
+                    and begin <= min(first_change, last_sample)
+                    and columns[column, begin - 1] == value
                 )
                 if not is_same:
                     begin -= 1
                     columns[column, begin] = value
             if rows[node, codes.NODE_VARIABLE] >= 0:
-                _set_point(rows, node, state, columns, column, mode, last, tables)
+                _set_point(rows, node, state, columns, column, mode, last_sample, tables)
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
             left_column, right_column, state_position = (
                 first_column + max(left_operand, 0),
                 first_column + right_operand,
                 state[STATE, node],
             )
-            value, begin = _start_of_past(rows, node, state, tables), min(state[CHANGED, right_operand], last)
+            value, begin = (
+                _start_of_past(rows, node, state, tables),
+                min(state[CHANGED, right_operand], last_sample),
+            )
             if left_operand >= 0:
                 begin = min(begin, state[CHANGED, left_operand])
             # the start value comes from a table, so it may depend on later samples
@@ -559,37 +580,43 @@ def _bring_up(
                 column,
                 value,
                 begin,
-                last,
+                last_sample,
             )
-            begin = lowest if is_fresh else first_change
+            begin = lowest_position if is_fresh else first_change
         elif code in (codes.SHIFT, codes.PAST_DELAY):
             window, operand_column = window_of(rows, node), first_column + left_operand
             missing_value = beyond(mode if window[0] else codes.OPEN_END, rows[node, codes.NODE_WEAK])
             if is_fresh:
-                begin = lowest
+                begin = lowest_position
             elif window[0]:
                 begin = max(
-                    min(_first_starting(state, window, state[CHANGED, left_operand], last), last), lowest
+                    min(
+                        _first_starting(state, window, state[CHANGED, left_operand], last_sample), last_sample
+                    ),
+                    lowest_position,
                 )
             else:
                 begin = max(
-                    min(_first_holding(state, window, state[CHANGED, left_operand], last), last), lowest
+                    min(
+                        _first_holding(state, window, state[CHANGED, left_operand], last_sample), last_sample
+                    ),
+                    lowest_position,
                 )
-            for index in range(begin, last + 1):
+            for index in range(begin, last_sample + 1):
                 source_position = (
-                    _start(state, window, index, last)
+                    _start(state, window, index, last_sample)
                     if window[0]
-                    else _after(state, window, index, last) - 1
+                    else _after(state, window, index, last_sample) - 1
                 )
                 columns[column, index] = (
                     columns[operand_column, source_position]
-                    if 0 <= source_position <= last
+                    if 0 <= source_position <= last_sample
                     else missing_value
                 )
         else:
-            begin, end = _run_window(rows, node, stamps, state, columns, mode, last, is_fresh)
+            begin, end = _run_window(rows, node, stamps, state, columns, mode, last_sample, is_fresh)
         if begin >= end:
-            begin, end = last, 0
+            begin, end = last_sample, 0
         state[CHANGED, node], state[CHANGED_END, node] = begin, end
     if not has_column(rows):
         body = rows[node_count - 1, codes.NODE_B]
@@ -597,7 +624,7 @@ def _bring_up(
             rows[node_count - 1, codes.NODE_CODE] == codes.UNTIL,
             EXTRA * node_count + JOINED + mode,
         )
-        neutral, block_count = -np.inf if is_until else np.inf, (last + 1) // BLOCK
+        neutral, block_count = -np.inf if is_until else np.inf, (last_sample + 1) // BLOCK
         for index in range(state[CHANGED, body] // BLOCK, block_count):
             if index == block_count - 1 or index * BLOCK < state[CHANGED_END, body]:
                 columns[joined_row, index] = extremum(
@@ -622,7 +649,7 @@ def _join_blocks(
 
 @inlined
 def _at_first(
-    rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, last: int
+    rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, last_sample: int
 ) -> float:
     """Return the root's value at the first sample, from the columns of a set."""
     node_count, base = len(rows) - 1, state[HEAD, BASE]
@@ -634,9 +661,9 @@ def _at_first(
             first_column + rows[root, codes.NODE_B],
         )
         value = _join_blocks(
-            is_until, columns, body_column, EXTRA * node_count + JOINED + mode, value, base, last + 1
+            is_until, columns, body_column, EXTRA * node_count + JOINED + mode, value, base, last_sample + 1
         )
-    elif base <= last:
+    elif base <= last_sample:
         value = columns[first_column + root, base]
     if state[HEAD, IS_BEGUN]:
         variable_count, point_row = (
@@ -682,7 +709,7 @@ def run_windows(
         rows[node_count, codes.PART_HAS_NOW] > 0,
     )
     for index in range(count):
-        last = begin + index
+        last_sample = begin + index
         if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corner_count - 1]:
             # the extreme corners are equal, so no later sample can change the value
             columns[first_result, index] = columns[first_result + 2, index] = columns[
@@ -690,7 +717,7 @@ def run_windows(
             ] = tables[0, 0]
             continue
         if state.shape[0] > STARTS:
-            _enter(rows, stamps, state, last)
+            _enter(rows, stamps, state, last_sample)
         for mode in range(SETS):
             result_row = first_result + mode + (mode != codes.OPEN_END)
             if mode != codes.OPEN_END and not bounds >> (mode - 1) & 1:
@@ -700,23 +727,23 @@ def run_windows(
                 columns[result_row, index] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
                 continue
             # columns are computed again if they lack the previous sample
-            is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
-            state[HEAD, KNOWN + mode] = last
+            is_fresh = state[HEAD, KNOWN + mode] != last_sample - 1 or last_sample == 0
+            state[HEAD, KNOWN + mode] = last_sample
             if is_fresh:
-                find_lows(rows, state, stamps, last)
-            _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
-            columns[result_row, index] = _at_first(rows, columns, state, tables, mode, last)
+                find_lows(rows, state, stamps, last_sample)
+            _bring_up(rows, history, stamps, columns, state, tables, mode, last_sample, is_fresh)
+            columns[result_row, index] = _at_first(rows, columns, state, tables, mode, last_sample)
         if has_now and has_column(rows):
-            columns[first_result + RESULT_NOW, index] = columns[root, last]
+            columns[first_result + RESULT_NOW, index] = columns[root, last_sample]
         elif has_now:
             columns[first_result + RESULT_NOW, index] = better(
                 is_until,
-                columns[rows[root, codes.NODE_B], last],
+                columns[rows[root, codes.NODE_B], last_sample],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
             )
         # counted from the first sample of the run, so that the length of a tile does not matter
-        if (state[HEAD, OFFSET] + last) % CLOSING == CLOSING - 1:
-            _absorb(rows, stamps, columns, state, tables, last)
+        if (state[HEAD, OFFSET] + last_sample) % CLOSING == CLOSING - 1:
+            _absorb(rows, stamps, columns, state, tables, last_sample)
 
 
 # ------------------------------------------------------------------------------ closed positions go to tables
@@ -724,7 +751,7 @@ def run_windows(
 
 @piece
 def _reach(
-    rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last: int
+    rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last_sample: int
 ) -> bool:
     """Find the positions of each node that the root needs at its positions root_low … root_high.
 
@@ -754,17 +781,19 @@ def _reach(
             continue
         window = window_of(rows, node)
         if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
-            is_closed = is_closed and high < _first_open(state, stamps, window, last)
-            high = _after(state, window, high, last) - 1
+            is_closed = is_closed and high < _first_open(state, stamps, window, last_sample)
+            high = _after(state, window, high, last_sample) - 1
         elif code == codes.SHIFT:
-            shifted_position = _start(state, window, high, last)
-            is_closed = is_closed and shifted_position <= last
-            farthest_position = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted_position
-            high = min(max(shifted_position, farthest_position), last)
+            shifted_position = _start(state, window, high, last_sample)
+            is_closed = is_closed and shifted_position <= last_sample
+            farthest_position = (
+                _after(state, window, high, last_sample) - 1 if window[3] >= 0 else shifted_position
+            )
+            high = min(max(shifted_position, farthest_position), last_sample)
         elif code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
-            low = _start(state, window, min(low, last), last)
+            low = _start(state, window, min(low, last_sample), last_sample)
         elif code == codes.PAST_DELAY:
-            low = max(_after(state, window, min(low, last), last) - 1, 0)
+            low = max(_after(state, window, min(low, last_sample), last_sample) - 1, 0)
         if left_operand >= 0:
             state[LOW, left_operand] = min(state[LOW, left_operand], low)
             state[HIGH, left_operand] = max(state[HIGH, left_operand], high, state[HIGH, node])
@@ -779,16 +808,22 @@ def _reach(
 
 
 @piece
-def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> None:
+def find_lows(rows: Integers, state: Integers, stamps: Integers, last_sample: int) -> None:
     """Store the first position of each node that is still needed."""
-    _reach(rows, state, stamps, min(state[HEAD, BASE], last), last, last)
+    _reach(rows, state, stamps, min(state[HEAD, BASE], last_sample), last_sample, last_sample)
     for node in range(len(rows) - 1):
         state[LOWS, node] = state[LOW, node]
 
 
 @piece
 def _run_corner(
-    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
+    rows: Integers,
+    stamps: Integers,
+    columns: Floats,
+    state: Integers,
+    tables: Floats,
+    corner: int,
+    last_sample: int,
 ) -> None:
     """Compute the nodes that depend on a variable or a table, at `LOW` … `HIGH`, for one corner."""
     node_count = len(rows) - 1
@@ -846,12 +881,14 @@ def _run_corner(
             window, missing_value = window_of(rows, node), beyond(codes.OPEN_END, rows[node, codes.NODE_WEAK])
             for position in range(low, high + 1):
                 source_position = (
-                    _start(state, window, position, last)
+                    _start(state, window, position, last_sample)
                     if window[0]
-                    else _after(state, window, position, last) - 1
+                    else _after(state, window, position, last_sample) - 1
                 )
                 columns[column, position] = (
-                    columns[left_column, source_position] if 0 <= source_position <= last else missing_value
+                    columns[left_column, source_position]
+                    if 0 <= source_position <= last_sample
+                    else missing_value
                 )
         else:
             is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
@@ -866,19 +903,19 @@ def _run_corner(
                 scratch_row,
                 low,
                 high + 1,
-                last,
+                last_sample,
             )
 
 
 @piece
 def _renew_tables(
-    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last_sample: int
 ) -> None:
     """Compute the tables of a part again, with the positions from its base to the root's `HIGH`."""
     node_count = len(rows) - 1
     table_count, variable_count = rows[node_count, codes.PART_TABLES], rows[node_count, codes.PART_VARIABLES]
     for corner in range(1 << variable_count):
-        _run_corner(rows, stamps, columns, state, tables, corner, last)
+        _run_corner(rows, stamps, columns, state, tables, corner, last_sample)
         if state[HEAD, IS_BEGUN]:
             tables[table_count, corner] = read_table(tables, 0, 0, variable_count, tables, 2 * table_count)
         else:
@@ -902,7 +939,7 @@ def _renew_tables(
 
 
 @inlined
-def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last: int) -> None:
+def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last_sample: int) -> None:
     """Move the base over positions that cannot change the root any more, although their windows are open.
 
     The table bounds `G x` from above. A position has no effect once x is at least this bound, because x
@@ -912,24 +949,26 @@ def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floa
     is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, rows[root, codes.NODE_B]
     # docs/design/monitor.md shows an example; few positions stay open in most recordings
     limit = tables[0, 0] if is_until else tables[0, 1]
-    while base <= last and not _outdoes(is_until, columns[body, base], limit):
+    while base <= last_sample and not _outdoes(is_until, columns[body, base], limit):
         base += 1
     state[HEAD, BASE] = state[BOUNDARY, root] = base
 
 
 @piece
 def _absorb(
-    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last_sample: int
 ) -> None:
     """Move the base over all positions whose windows have all closed."""
     # large runs first, so that the tables are computed once for many positions
     size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]
-        if base + size > last + 1 or not _reach(rows, state, stamps, base, base + size - 1, last):
+        if base + size > last_sample + 1 or not _reach(
+            rows, state, stamps, base, base + size - 1, last_sample
+        ):
             size //= 2
             continue
-        _renew_tables(rows, stamps, columns, state, tables, last)
+        _renew_tables(rows, stamps, columns, state, tables, last_sample)
         for node in range(len(rows) - 1):
             if rows[node, codes.NODE_VARIABLE] >= 0:
                 state[BOUNDARY, node] = state[HIGH, node] + 1
@@ -937,6 +976,6 @@ def _absorb(
                 state[STATE, node] = max(state[STATE, node], state[PLAIN, node] - 1)
         state[HEAD, BASE], state[HEAD, IS_BEGUN] = base + size, 1
     if rows[len(rows) - 1, codes.PART_IS_MONOTONE] and state[HEAD, IS_BEGUN]:
-        _pass_outdone(rows, columns, state, tables, last)
+        _pass_outdone(rows, columns, state, tables, last_sample)
     if state[HEAD, BASE] > old_base:
-        find_lows(rows, state, stamps, last)
+        find_lows(rows, state, stamps, last_sample)

@@ -764,8 +764,8 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
 def _of_member(term: Term, name: str) -> Term:
     if not isinstance(term, DerivedTerm):
         return TrackedName(name)
-    inner: Any = _of_member(term.term, name)
-    return replace(term, term=inner)
+    inner_term: Any = _of_member(term.term, name)
+    return replace(term, term=inner_term)
 
 
 def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
@@ -776,8 +776,12 @@ def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
                 contact(first_footprint, second_footprint) if first_footprint and second_footprint else None
             )
         case Protrusion():
-            inner, outer = _footprint(scene, part.inner), _footprint(scene, part.outer)
-            return protrusion_contact(inner, outer) if inner and outer else None
+            inner_footprint, outer_footprint = _footprint(scene, part.inner), _footprint(scene, part.outer)
+            return (
+                protrusion_contact(inner_footprint, outer_footprint)
+                if inner_footprint and outer_footprint
+                else None
+            )
     return None
 
 

@@ -304,7 +304,7 @@ class _Search:
         self._evidence = evidence
         self._evaluate = evaluate_prefix if goes_on else evaluate_offline
         self._verdict_of = online_verdict if goes_on else final_verdict
-        self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
+        self._formula, self._leaf_order = evidence.instance.formula, evidence.instance.program.leaves
         self._leaves, self._times_ns, self._node = leaves, times_ns, node
         self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
         atoms = filter(self._is_meant, iter_atoms(self._formula))
@@ -312,7 +312,7 @@ class _Search:
         # slopes come from the formula, because equal leaves share an index although their spans differ
         self._moving_leaves: dict[int, Atom | Quantified] = {}
         self._slopes: dict[int, float] = {}
-        for index, leaf in enumerate(self._order):
+        for index, leaf in enumerate(self._leaf_order):
             bare_atom_and_sign = _bare(leaf)
             if bare_atom_and_sign is not None and (
                 atom_slopes := slopes_by_expression.get(bare_atom_and_sign[0].expression)
@@ -346,7 +346,7 @@ class _Search:
         }
         # a violated formula has to rise, and a satisfied formula has to fall
         self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
-        low, high = self._evaluate(self._formula, self._order, leaves, times_ns).interval(node)
+        low, high = self._evaluate(self._formula, self._leaf_order, leaves, times_ns).interval(node)
         distance_from_flip = abs(high if verdict is Verdict.VIOLATED else low)
         steepest_slope = max(
             (abs(slope) for atom_slopes in slopes_by_expression.values() for slope in atom_slopes),
@@ -386,7 +386,7 @@ class _Search:
         atom = self._deciding.atom
         for variant in _variants(atom, margin):
             formula = self._change_atoms(variant)
-            added_leaves = new_leaves(formula, self._order)
+            added_leaves = new_leaves(formula, self._leaf_order)
             # the verdict is computed, because heights or rounding may decide instead of the margin
             if self._is_flipped(self._verdict_with(formula, added_leaves, self._columns(added_leaves))):
                 changed_atom = variant(atom)
@@ -406,7 +406,7 @@ class _Search:
             return replace(atom, expression=Sum(atom.expression, Number(far_shift)))
 
         formula = self._change_atoms(change)
-        added_leaves = new_leaves(formula, self._order)
+        added_leaves = new_leaves(formula, self._leaf_order)
         verdict = self._verdict_with(formula, added_leaves, self._columns(added_leaves))
         if self._is_flipped(verdict):
             return "limits"
@@ -489,7 +489,7 @@ class _Search:
                 rounding.
         """
         formulas = [self._formula_at(number) for number in numbers]
-        added_leaves = [new_leaves(formula, self._order) for formula in formulas]
+        added_leaves = [new_leaves(formula, self._leaf_order) for formula in formulas]
         if self._is_uniform and is_shifted:
             columns = [
                 self._shift_columns(leaves, number)
@@ -549,7 +549,7 @@ class _Search:
         self, formula: Formula, added_leaves: Sequence[Atom | Quantified], columns: Floats
     ) -> Verdict:
         all_leaves = joined_channels([self._leaves, columns], axis=1)
-        nodes = self._evaluate(formula, (*self._order, *added_leaves), all_leaves, self._times_ns)
+        nodes = self._evaluate(formula, (*self._leaf_order, *added_leaves), all_leaves, self._times_ns)
         return self._verdict_of(*nodes.interval(self._node))
 
 

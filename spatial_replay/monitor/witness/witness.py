@@ -327,7 +327,7 @@ def _while_present(
     None if an object is in no sample.
     """
     instance, bindings = evidence.instance, evidence.instance.bindings
-    formula, order = instance.formula, instance.program.leaves
+    formula, leaf_order = instance.formula, instance.program.leaves
     nodes = nodes_of(formula)
     operator_nodes = [
         step.node for step in path.steps if operator_of(nodes[step.node]) in ("G", "H", "F", "O")
@@ -352,7 +352,7 @@ def _while_present(
     body = Boolean(connective, (condition, *operands_of(operator)))
     guarded_formula = with_operands(formula, operator_nodes[-1], (body,))
     all_leaves = joined_channels([leaves, presence_columns], axis=1)
-    guarded_nodes = evaluate_offline(guarded_formula, (*order, *conditions), all_leaves, times_ns)
+    guarded_nodes = evaluate_offline(guarded_formula, (*leaf_order, *conditions), all_leaves, times_ns)
     # the ids of nodes before and around the operator are unchanged
     verdict = final_verdict(*guarded_nodes.interval(node))
     if verdict is Verdict.UNKNOWN:
@@ -371,8 +371,8 @@ def time_of_least(
         settled_ns: time at which the violation became certain.
         least: upper end of the node's interval on the finished log.
     """
-    order = instance.program.leaves
-    nodes = evaluate_offline(instance.formula, order, leaves, times_ns)
+    leaf_order = instance.program.leaves
+    nodes = evaluate_offline(instance.formula, leaf_order, leaves, times_ns)
     path = deciding_path(nodes, node, End.HIGH)
     # the robustness depends on all samples of its path
     earliest_sample = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
@@ -380,7 +380,7 @@ def time_of_least(
     def is_reached(sample: int) -> bool:
         prefix_slice = slice(sample + 1)
         prefix_nodes = evaluate_prefix(
-            instance.formula, order, leaves[..., prefix_slice], times_ns[prefix_slice]
+            instance.formula, leaf_order, leaves[..., prefix_slice], times_ns[prefix_slice]
         )
         return bool(prefix_nodes.ends(node)[1][0] <= least)
 
