@@ -54,23 +54,27 @@ def specification_html(specification: Specification) -> Html:
     """Return a specification's declarations, the trees of its results and its first five warnings."""
     title = element("b", specification.filename)
     results = specification.results
-    about = quiet(f" {plural(len(results), 'result')}, profile {specification.profile}")
-    kinds = ("constants", "regions", "groups")
-    names = {kind: ", ".join(getattr(specification, kind)) for kind in kinds}
-    declared = [
-        element("div", f"{kind}: {joined_names}") for kind, joined_names in names.items() if joined_names
+    summary = quiet(f" {plural(len(results), 'result')}, profile {specification.profile}")
+    declaration_kinds = ("constants", "regions", "groups")
+    names_by_kind = {kind: ", ".join(getattr(specification, kind)) for kind in declaration_kinds}
+    declarations = [
+        element("div", f"{kind}: {joined_names}")
+        for kind, joined_names in names_by_kind.items()
+        if joined_names
     ]
     warnings = [element("div", f"warning: {warning.message}") for warning in specification.warnings[:5]]
-    return element("div", element("div", title, about), *declared, _formula_trees(results), *warnings)
+    return element("div", element("div", title, summary), *declarations, _formula_trees(results), *warnings)
 
 
 def _formula_trees(results: Sequence[NamedSpec]) -> Html:
     """Return the trees one below the other, with `_MOST_FORMULAS` nodes at most."""
-    left = _MOST_FORMULAS
+    remaining_nodes = _MOST_FORMULAS
     rows: list[tuple[str]] = []
     for spec in results:
-        cells = [(tree_cell(stem, node),) for _, stem, node in islice(iter_branches(spec.formula), left)]
-        left -= len(cells)
+        cells = [
+            (tree_cell(stem, node),) for _, stem, node in islice(iter_branches(spec.formula), remaining_nodes)
+        ]
+        remaining_nodes -= len(cells)
         rows += cells
     return element("div", table(["tree"], rows), _left_out(results, len(rows)))
 
@@ -82,24 +86,26 @@ def tree_cell(stem: str, node: Formula) -> Html:
     return code(indented, *name, title_of(node))
 
 
-def _left_out(results: Sequence[NamedSpec], rows: int) -> Html:
-    nodes = _size(results)
-    return quiet(f"… and {plural(nodes - rows, 'node')} more") if rows < nodes else Html("")
+def _left_out(results: Sequence[NamedSpec], row_count: int) -> Html:
+    node_count = _size(results)
+    return (
+        quiet(f"… and {plural(node_count - row_count, 'node')} more") if row_count < node_count else Html("")
+    )
 
 
-class _Place(NamedTuple):
+class _NodePosition(NamedTuple):
     """A node in a drawing.
 
     Attributes:
         x: level from the left.
         y: row from the top.
-        above: x and y of its parent; None for a root.
+        parent: x and y of the parent; None for a root.
     """
 
     node: Formula
     x: float
     y: float
-    above: tuple[float, float] | None
+    parent: tuple[float, float] | None
 
 
 @plot.register(Specification)
@@ -109,38 +115,46 @@ def draw_specification(specification: Specification, ax: Axes | None = None) -> 
     Raises:
         UsageError: matplotlib is not installed.
     """
-    places = list(_places(specification.results))
-    rows = 1 + max((place.y for place in places), default=0.0)
-    levels = 1 + max((place.x for place in places), default=0.0)
+    positions = list(_positions(specification.results))
+    row_count = 1 + max((position.y for position in positions), default=0.0)
+    level_count = 1 + max((position.x for position in positions), default=0.0)
     if ax is None:
-        ax = new_panel((min(3.0 + 0.85 * levels, 14.0), 0.6 + 0.32 * rows))
+        ax = new_panel((min(3.0 + 0.85 * level_count, 14.0), 0.6 + 0.32 * row_count))
     ax.set_axis_off()
-    ax.set_xlim(-0.2, levels + 2.5)
-    ax.set_ylim(rows - 0.4, -0.9)
-    for place in places:
-        if place.above is not None:
-            (x, y), bend = place.above, place.x - 0.5
-            ax.plot([x, bend, bend, place.x], [y, y, place.y, place.y], color=NEUTRAL, linewidth=1, zorder=1)
-        _draw_node(ax, place)
-    nodes = _size(specification.results)
-    more = f", the first {len(places)} of {plural(nodes, 'node')}" if len(places) < nodes else ""
-    ax.set_title(plain(specification.filename + more), loc="left", fontsize=10)
+    ax.set_xlim(-0.2, level_count + 2.5)
+    ax.set_ylim(row_count - 0.4, -0.9)
+    for position in positions:
+        if position.parent is not None:
+            (x, y), bend = position.parent, position.x - 0.5
+            ax.plot(
+                [x, bend, bend, position.x],
+                [y, y, position.y, position.y],
+                color=NEUTRAL,
+                linewidth=1,
+                zorder=1,
+            )
+        _draw_node(ax, position)
+    node_count = _size(specification.results)
+    left_out_text = (
+        f", the first {len(positions)} of {plural(node_count, 'node')}" if len(positions) < node_count else ""
+    )
+    ax.set_title(plain(specification.filename + left_out_text), loc="left", fontsize=10)
     return ax
 
 
-def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
+def _positions(results: Sequence[NamedSpec]) -> Iterator[_NodePosition]:
     """Yield the first `_MOST_DRAWN` nodes with their positions, one tree below the other."""
-    left, first_row = _MOST_DRAWN, 0.0
+    remaining_nodes, first_row = _MOST_DRAWN, 0.0
     for spec in results:
-        nodes = list(islice(iter_nodes(spec.formula), left))
-        left -= len(nodes)
-        rows, used = _rows([parent for _, parent, _ in nodes], first_row)
-        first_row += used + _ROW_GAP
+        nodes = list(islice(iter_nodes(spec.formula), remaining_nodes))
+        remaining_nodes -= len(nodes)
+        rows, row_count = _rows([parent for _, parent, _ in nodes], first_row)
+        first_row += row_count + _ROW_GAP
         levels: list[int] = []
         for identifier, parent, node in nodes:
             levels.append(0 if parent is None else levels[parent] + 1)
-            above = None if parent is None else (float(levels[parent]), rows[parent])
-            yield _Place(node, float(levels[identifier]), rows[identifier], above)
+            parent_position = None if parent is None else (float(levels[parent]), rows[parent])
+            yield _NodePosition(node, float(levels[identifier]), rows[identifier], parent_position)
 
 
 def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float], int]:
@@ -148,32 +162,34 @@ def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float],
 
     Each leaf has its own row. Parents are halfway between their first and their last child.
     """
-    below: list[list[int]] = [[] for _ in parents]
+    operands_by_node: list[list[int]] = [[] for _ in parents]
     for identifier, parent in enumerate(parents):
         if parent is not None:
-            below[parent].append(identifier)
+            operands_by_node[parent].append(identifier)
     rows = [0.0] * len(parents)
-    leaves = [identifier for identifier, operands in enumerate(below) if not operands]
-    for number, leaf in enumerate(leaves):
-        rows[leaf] = first_row + number
+    leaf_ids = [identifier for identifier, operands in enumerate(operands_by_node) if not operands]
+    for leaf_row, leaf in enumerate(leaf_ids):
+        rows[leaf] = first_row + leaf_row
     # `iter_nodes` yields parents first, so that the reverse order places children before their parents
     for identifier in reversed(range(len(parents))):
-        if below[identifier]:
-            rows[identifier] = (rows[below[identifier][0]] + rows[below[identifier][-1]]) / 2
-    return rows, len(leaves)
+        if operands_by_node[identifier]:
+            rows[identifier] = (
+                rows[operands_by_node[identifier][0]] + rows[operands_by_node[identifier][-1]]
+            ) / 2
+    return rows, len(leaf_ids)
 
 
-def _draw_node(ax: Axes, place: _Place) -> None:
-    node = place.node
-    box = {"boxstyle": "round,pad=0.3", "facecolor": _PAPER, "edgecolor": NEUTRAL, "linewidth": 0.8}
+def _draw_node(ax: Axes, position: _NodePosition) -> None:
+    node = position.node
+    box_style = {"boxstyle": "round,pad=0.3", "facecolor": _PAPER, "edgecolor": NEUTRAL, "linewidth": 0.8}
     is_leaf = not operands_of(node)
     ax.text(
-        place.x, place.y, plain(label_of(node) if is_leaf else title_of(node)),
-        ha="left" if is_leaf else "center", va="center", fontsize=8.5, color=INK, bbox=box, zorder=2,
+        position.x, position.y, plain(label_of(node) if is_leaf else title_of(node)),
+        ha="left" if is_leaf else "center", va="center", fontsize=8.5, color=INK, bbox=box_style, zorder=2,
     )  # fmt: skip
     if node.name is not None and not is_leaf:
         ax.text(
-            place.x, place.y - 0.36, plain(node.name),
+            position.x, position.y - 0.36, plain(node.name),
             ha="center", va="bottom", fontsize=8, fontweight="bold", zorder=2,
         )  # fmt: skip
 
@@ -196,11 +212,11 @@ _STEPS: Final = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6, 4.8, -4.8)
 @html.register(Trace)
 def trace_html(trace: Trace) -> Html:
     """Return the length of a trace, and the number of samples of each object."""
-    counts = (trace.rows >= 0).sum(axis=0).tolist()
-    rows = [(name, f"{count:,}") for name, count in zip(trace.names, counts, strict=True) if count]
-    more = [quiet(f"… and {len(rows) - _MOST_ROWS:,} objects more")] if len(rows) > _MOST_ROWS else []
+    sample_counts = (trace.rows >= 0).sum(axis=0).tolist()
+    rows = [(name, f"{count:,}") for name, count in zip(trace.names, sample_counts, strict=True) if count]
+    left_out = [quiet(f"… and {len(rows) - _MOST_ROWS:,} objects more")] if len(rows) > _MOST_ROWS else []
     return element(
-        "div", element("b", _trace_title(trace)), table(("object", "samples"), rows[:_MOST_ROWS]), *more
+        "div", element("b", _trace_title(trace)), table(("object", "samples"), rows[:_MOST_ROWS]), *left_out
     )
 
 
@@ -222,12 +238,12 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
             ax.fill(*ring.T, facecolor=NEUTRAL, alpha=0.15, edgecolor=NEUTRAL, linewidth=1.0)
             right, top = ring.max(axis=0).tolist()
             ax.text(right, top, plain(name), fontsize=8, ha="right", va="bottom")
-    ends: list[tuple[float, float, str]] = []
+    end_labels: list[tuple[float, float, str]] = []
     columns = [column for column in range(len(trace.names)) if (trace.rows[:, column] >= 0).any()]
-    for number, column in enumerate(columns):
+    for colour_index, column in enumerate(columns):
         rows = trace.rows[:, column]
         rows = rows[rows >= 0]
-        colour = CURVES[number % len(CURVES)]
+        colour = CURVES[colour_index % len(CURVES)]
         sampled_rows = rows[np.unique(np.linspace(0, len(rows) - 1, _MOST_POINTS).astype(np.int64))]
         ax.plot(*_centres(trace, sampled_rows).T, color=colour, linewidth=1.0)
         for ring in _rings(trace, rows[:1]):
@@ -236,8 +252,8 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
             ax.fill(*ring.T, facecolor=colour, edgecolor=colour, alpha=0.5)
         if len(columns) <= _MOST_LABELS:
             [(x, y)] = _centres(trace, rows[-1:]).tolist()
-            ends.append((x, y, plain(trace.names[column])))
-    _write_names(ax, ends)
+            end_labels.append((x, y, plain(trace.names[column])))
+    _write_names(ax, end_labels)
     unit = plain(trace.units.get("", "footprint units"))
     ax.set_xlabel(f"x [{unit}]")
     ax.set_ylabel(f"y [{unit}]")
@@ -245,25 +261,25 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
     return ax
 
 
-def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+def _write_names(ax: Axes, end_labels: Sequence[tuple[float, float, str]]) -> None:
     """Write each name at its position (x, y, name), moved up or down if an earlier name is in its way."""
     # the transformation is final only after the aspect is applied
     ax.apply_aspect()
-    inches = ax.transData + ax.figure.dpi_scale_trans.inverted()
+    inches_from_data = ax.transData + ax.figure.dpi_scale_trans.inverted()
     labels: list[tuple[float, float, float]] = []
-    for x, y, name in ends:
-        across, up = (72.0 * inches.transform((x, y))).tolist()
+    for x, y, name in end_labels:
+        label_x, label_y = (72.0 * inches_from_data.transform((x, y))).tolist()
         # estimated half width: 0.6 of the font size per character
-        half = 0.3 * _NAME_SIZE * len(name)
+        half_width = 0.3 * _NAME_SIZE * len(name)
         for step in _STEPS:
             is_free = all(
-                abs(across - label_across) > half + label_half
-                or abs(up + step * _NAME_SIZE - row) >= _NAME_SIZE
-                for label_across, row, label_half in labels
+                abs(label_x - other_x) > half_width + other_half
+                or abs(label_y + step * _NAME_SIZE - other_y) >= _NAME_SIZE
+                for other_x, other_y, other_half in labels
             )
             if is_free:
                 break
-        labels.append((across, up + step * _NAME_SIZE, half))
+        labels.append((label_x, label_y + step * _NAME_SIZE, half_width))
         ax.annotate(
             name,
             (x, y),
@@ -290,9 +306,9 @@ def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
 def _centres(trace: Trace, rows: Integers) -> Floats:
     """Return (R, 2), the centre of each observation's bounding box."""
     rings = rings_of(trace.footprints.select(rows), 0.0)
-    begins = np.asarray(rings.start)[: len(rows)]
-    low, high = (reduce.reduceat(rings.points, begins, axis=0) for reduce in (np.minimum, np.maximum))
-    return np.asarray((low + high) / 2.0)
+    ring_begins = np.asarray(rings.start)[: len(rows)]
+    lows, highs = (reduce.reduceat(rings.points, ring_begins, axis=0) for reduce in (np.minimum, np.maximum))
+    return np.asarray((lows + highs) / 2.0)
 
 
 @singledispatch
@@ -327,9 +343,9 @@ def _of_result(result: SpecResult) -> Any:
             f"the numbers of each sample of {result.title!r} were not kept; evaluate() keeps them"
         )
     columns = {"seconds": (result.times_ns - result.evidence.first_ns()) / 1e9}
-    names = [node.name or f"{node.id}: {node.text}" for node in result.nodes]
-    for name, node in zip(names, result.nodes, strict=True):
-        title = name if names.count(name) == 1 else f"{node.id}: {name}"
+    node_names = [node.name or f"{node.id}: {node.text}" for node in result.nodes]
+    for name, node in zip(node_names, result.nodes, strict=True):
+        title = name if node_names.count(name) == 1 else f"{node.id}: {name}"
         for quantity in ("value", "now", "lower", "upper"):
             columns[f"{title} {quantity}"] = np.array(getattr(node, quantity))
     return pandas.DataFrame(columns, index=pandas.Index(np.array(result.times_ns), name="time_ns"))
@@ -361,10 +377,14 @@ def evaluation_html(evaluation: Evaluation) -> Html:
     """Return the verdict, the table of results, and each result's tree with its final numbers."""
     name = element("b", evaluation.specification.filename)
     title = element("div", name, " ", verdict_mark(evaluation.verdict))
-    worst = _worst_of(evaluation.results, _MOST_RESULTS)
-    left_out = len(evaluation.results) - len(worst)
-    more = quiet(f"… and {plural(left_out, 'result')} more, none of them worse") if left_out else Html("")
-    return element("div", title, _results_table(worst), more, *_trees(worst))
+    worst_results = _worst_of(evaluation.results, _MOST_RESULTS)
+    left_out_count = len(evaluation.results) - len(worst_results)
+    left_out_note = (
+        quiet(f"… and {plural(left_out_count, 'result')} more, none of them worse")
+        if left_out_count
+        else Html("")
+    )
+    return element("div", title, _results_table(worst_results), left_out_note, *_trees(worst_results))
 
 
 @html.register(SpecResult)
@@ -378,9 +398,9 @@ def _results_table(results: Sequence[SpecResult]) -> Html:
     for result in results:
         robustness = interval_text(result.robustness, result.lower, result.upper, result.unit)
         name, verdict = element("b", result.title), verdict_mark(result.verdict)
-        marks = ", ".join([result.tested, *["doubtful"] * bool(result.doubts)])
-        tested = element("span", marks, title=" ".join(result.remarks))
-        rows.append((name, verdict, robustness, _first_satisfied_text(result), tested))
+        tested_text = ", ".join([result.tested, *["doubtful"] * bool(result.doubts)])
+        tested_cell = element("span", tested_text, title=" ".join(result.remarks))
+        rows.append((name, verdict, robustness, _first_satisfied_text(result), tested_cell))
     return table(["result", "verdict", "robustness", "first satisfied", "tested"], rows)
 
 
@@ -393,16 +413,16 @@ def _first_satisfied_text(result: SpecResult) -> str:
 
 def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
     """Yield the trees of results, with `_MOST_NODES` nodes at most."""
-    left = _MOST_NODES
+    remaining_nodes = _MOST_NODES
     for result in results:
-        if left <= 0:
+        if remaining_nodes <= 0:
             return
-        rows = list(islice(_tree_rows(result), left))
-        left -= len(rows)
-        left_out = len(result.final) - len(rows)
-        more = quiet(f"… and {plural(left_out, 'node')} more") if left_out else Html("")
-        nodes = table(["verdict", "robustness", "node"], rows)
-        yield details(f"tree of {result.title}, each node at the first sample", nodes, more)
+        rows = list(islice(_tree_rows(result), remaining_nodes))
+        remaining_nodes -= len(rows)
+        left_out_count = len(result.final) - len(rows)
+        left_out_note = quiet(f"… and {plural(left_out_count, 'node')} more") if left_out_count else Html("")
+        node_table = table(["verdict", "robustness", "node"], rows)
+        yield details(f"tree of {result.title}, each node at the first sample", node_table, left_out_note)
 
 
 def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
@@ -441,16 +461,16 @@ def draw_evaluation(evaluation: Evaluation, ax: Axes | Iterable[Axes] | None = N
     if ax is not None:
         axes = np.array(list(ax) if isinstance(ax, Iterable) else [ax], object)
         return _draw_results(evaluation.results, tuple(axes.flat))
-    worst = _worst_of(evaluation.results, _MOST_PANELS)
-    if not worst:
+    worst_results = _worst_of(evaluation.results, _MOST_PANELS)
+    if not worst_results:
         return ()
-    size = (_WIDTH, 0.4 + _HEIGHT * len(worst))
-    panels = _draw_results(worst, new_panels(len(worst), 1, size, same_x=True))
+    size = (_WIDTH, 0.4 + _HEIGHT * len(worst_results))
+    panels = _draw_results(worst_results, new_panels(len(worst_results), 1, size, same_x=True))
     for panel in panels:
         panel.label_outer()
-    if len(worst) < len(evaluation.results):
-        left_out = plural(len(evaluation.results) - len(worst), "result")
-        panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\nand {left_out} more, none worse")
+    if len(worst_results) < len(evaluation.results):
+        left_out_text = plural(len(evaluation.results) - len(worst_results), "result")
+        panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\nand {left_out_text} more, none worse")
     return panels
 
 
@@ -473,19 +493,19 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     ax = new_panel((_WIDTH, 0.4 + _HEIGHT)) if ax is None else ax
     seconds = (result.times_ns - result.evidence.first_ns()) / 1e9
     curves = _curves(result)
-    low, high = _limits([curve.values for curve in curves])
+    axis_low, axis_high = _limits([curve.values for curve in curves])
     _, _, lower, upper = result.series[0]
     ax.set_xlim(seconds[0], seconds[-1] if len(seconds) > 1 else 1.0)
-    ax.set_ylim(low, high)
+    ax.set_ylim(axis_low, axis_high)
     ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
     has_band = bool((lower < upper).any())
     ax.fill_between(
-        seconds, np.clip(lower, low, high), np.clip(upper, low, high),
+        seconds, np.clip(lower, axis_low, axis_high), np.clip(upper, axis_low, axis_high),
         color=curves[0].colour, alpha=_SHADE, linewidth=0,
     )  # fmt: skip
-    for number, curve in enumerate(curves):
+    for curve_index, curve in enumerate(curves):
         # the result's curve is thicker, so that it stays visible below an equal curve of a named spec
-        ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if number else 3.0)
+        ax.plot(seconds, curve.values, color=curve.colour, linewidth=1.2 if curve_index else 3.0)
     _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
     ax.set_xlabel("time from the first sample in s")
@@ -498,13 +518,15 @@ def _curves(result: SpecResult) -> list[_Curve]:
     """Return the curves of a result and of the first named specs in it."""
     colours = {Verdict.SATISFIED: POSITIVE, Verdict.VIOLATED: NEGATIVE}
     verdict_colour = hexadecimal(colours.get(result.verdict, NEUTRAL))
-    named = {node.name: number for number, _, node in reversed(list(iter_nodes(result.formula))) if node.name}
-    parts = sorted((number, name) for name, number in named.items() if number)
+    ids_by_name = {
+        node.name: node_id for node_id, _, node in reversed(list(iter_nodes(result.formula))) if node.name
+    }
+    named_nodes = sorted((node_id, name) for name, node_id in ids_by_name.items() if node_id)
     # the first two colours mean satisfied and violated
-    others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
+    coloured_nodes = zip(named_nodes, CURVES[2 : _MOST_CURVES + 1], strict=False)
     return [
         _Curve(result.title, _finite(result, 0), verdict_colour),
-        *(_Curve(name, _finite(result, number), colour) for (number, name), colour in others),
+        *(_Curve(name, _finite(result, node_id), colour) for (node_id, name), colour in coloured_nodes),
     ]
 
 
@@ -517,31 +539,31 @@ def _finite(result: SpecResult, node: int) -> Floats:
 def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
     """Return the limits of a panel's robustness axis, which always includes 0."""
     values = np.concatenate([[0.0], *(curve[~np.isnan(curve)] for curve in curves)])
-    low, high = float(values.min()), float(values.max())
-    margin = 0.1 * (high - low) or 1.0
-    return low - margin, high + margin
+    least, greatest = float(values.min()), float(values.max())
+    margin = 0.1 * (greatest - least) or 1.0
+    return least - margin, greatest + margin
 
 
 def _name_curves(ax: Axes, curves: Sequence[_Curve], has_band: bool) -> None:
     """Write each curve's name to its right, and the name of the interval at the bottom, without overlap."""
-    low, high = ax.get_ylim()
-    ends = [(_last(curve.values) - low) / (high - low) for curve in curves]
-    *places, bottom = _apart([*ends, 0.0])
-    for place, curve in zip(places, curves, strict=True):
-        _draw_key(ax, place, curve.name, curve.colour, is_bold=curve is curves[0])
+    axis_low, axis_high = ax.get_ylim()
+    end_heights = [(_last(curve.values) - axis_low) / (axis_high - axis_low) for curve in curves]
+    *label_heights, band_height = _apart([*end_heights, 0.0])
+    for height, curve in zip(label_heights, curves, strict=True):
+        _draw_key(ax, height, curve.name, curve.colour, is_bold=curve is curves[0])
     if has_band:
-        _draw_key(ax, bottom, "still possible", curves[0].colour, alpha=2 * _SHADE)
+        _draw_key(ax, band_height, "still possible", curves[0].colour, alpha=2 * _SHADE)
 
 
 def _draw_key(
-    ax: Axes, place: float, name: str, colour: str, *, alpha: float = 1.0, is_bold: bool = False
+    ax: Axes, height: float, name: str, colour: str, *, alpha: float = 1.0, is_bold: bool = False
 ) -> None:
     """Draw a coloured square to the right of the axes, with its name."""
     weight = "bold" if is_bold else "normal"
-    mark, word = {"color": colour, "alpha": alpha}, {"fontweight": weight}
-    for text, points, style in (("■", 5, mark), (plain(name, _LONGEST_NAME), 17, word)):
+    square_style, name_style = {"color": colour, "alpha": alpha}, {"fontweight": weight}
+    for text, offset_points, style in (("■", 5, square_style), (plain(name, _LONGEST_NAME), 17, name_style)):
         ax.annotate(
-            text, (1.0, place), (points, 0), xycoords="axes fraction", textcoords="offset points",
+            text, (1.0, height), (offset_points, 0), xycoords="axes fraction", textcoords="offset points",
             va="center", fontsize=9, **style,
         )  # fmt: skip
 
@@ -552,17 +574,17 @@ def _last(values: Floats) -> float:
     return float(finite[-1]) if len(finite) else 0.0
 
 
-def _apart(places: Sequence[float]) -> list[float]:
+def _apart(heights: Sequence[float]) -> list[float]:
     """Return places moved apart by at least `_GAP`, in the same order, and at most 1."""
-    apart = list(places)
-    order = sorted(range(len(places)), key=places.__getitem__)
+    moved_heights = list(heights)
+    height_order = sorted(range(len(heights)), key=heights.__getitem__)
     below = -np.inf
-    for number in order:
-        below = apart[number] = max(apart[number], below + _GAP)
+    for index in height_order:
+        below = moved_heights[index] = max(moved_heights[index], below + _GAP)
     above = 1.0 + _GAP
-    for number in reversed(order):
-        above = apart[number] = min(apart[number], above - _GAP)
-    return apart
+    for index in reversed(height_order):
+        above = moved_heights[index] = min(moved_heights[index], above - _GAP)
+    return moved_heights
 
 
 def _title(result: SpecResult) -> str:
@@ -590,11 +612,15 @@ def automaton_html(automaton: Automaton) -> Html:
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))
     drawing = automaton_svg(automaton)
     content = quiet("install Graphviz to see it drawn") if drawing is None else Html(drawing)
-    words = words_text(automaton).split("\n")
-    lines = [element("div", code(line)) for line in words[:_MOST_LINES]]
-    more = [quiet(f"… and {len(words) - _MOST_LINES:,} lines more")] if len(words) > _MOST_LINES else []
+    text_lines = words_text(automaton).split("\n")
+    line_elements = [element("div", code(line)) for line in text_lines[:_MOST_LINES]]
+    left_out = (
+        [quiet(f"… and {len(text_lines) - _MOST_LINES:,} lines more")]
+        if len(text_lines) > _MOST_LINES
+        else []
+    )
     picture = element("div", content, style="overflow-x:auto")
-    return element("div", title, picture, details("in words", *lines, *more))
+    return element("div", title, picture, details("in words", *line_elements, *left_out))
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
@@ -624,10 +650,10 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
         UsageError: Graphviz or matplotlib is not installed.
         OutputError: Graphviz fails or reaches its timeout.
     """
-    short = abbreviate(automaton)
-    layout = json.loads(layout_text(short))
+    short_automaton = abbreviate(automaton)
+    layout = json.loads(layout_text(short_automaton))
     width, height = _point(layout["bb"].removeprefix("0,0,"))
-    legend = meanings(short)
+    legend = meanings(short_automaton)
     if ax is None:
         inches = max(width / _INCH, 5.0), 0.5 + height / _INCH + 0.2 * len(legend)
         ax = new_panel((min(inches[0], _LONGEST_SIDE), min(inches[1], _LONGEST_SIDE)))
@@ -640,9 +666,15 @@ def draw_automaton(automaton: Automaton, ax: Axes | None = None) -> Axes:
     for node in layout["objects"]:
         _draw_state(ax, automaton, node)
     ax.set_title(plain(f"{automaton.name}: {size_words(automaton)}"), loc="left", fontsize=10)
-    text = "\n".join(plain(line, 100) for line in legend)
+    legend_text = "\n".join(plain(line, 100) for line in legend)
     ax.annotate(
-        text, (0, 0), (0, -6), xycoords="axes fraction", textcoords="offset points", va="top", fontsize=8.5
+        legend_text,
+        (0, 0),
+        (0, -6),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        va="top",
+        fontsize=8.5,
     )
     return ax
 
@@ -653,9 +685,9 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
     radius = float(node["width"]) * _INCH / 2
     is_state = node["name"].isdecimal()
     colour = state_colour(automaton, int(node["name"])) if is_state else INK
-    outlines = [radius, radius - 4.0] if is_state and int(node["name"]) in automaton.accepting else [radius]
-    for outline in outlines:
-        draw_disc(ax, (x, y), outline, colour)
+    radii = [radius, radius - 4.0] if is_state and int(node["name"]) in automaton.accepting else [radius]
+    for circle_radius in radii:
+        draw_disc(ax, (x, y), circle_radius, colour)
     if is_state:
         ax.text(x, y, node["name"], ha="center", va="center", fontsize=11, color=INK)
 
@@ -663,10 +695,10 @@ def _draw_state(ax: Axes, automaton: Automaton, node: Mapping[str, Any]) -> None
 def _draw_edge(ax: Axes, edge: Mapping[str, Any]) -> None:
     """Draw a curve with an arrow head, and the guard next to it."""
     # Graphviz writes the tip of the head first, as e,X,Y: https://graphviz.org/docs/attr-types/splineType/
-    head, *points = (_point(point.removeprefix("e,")) for point in edge["pos"].split())
+    tip, *points = (_point(point.removeprefix("e,")) for point in edge["pos"].split())
     draw_curve(ax, points, _ARROW)
     ax.annotate(
-        "", head, points[-1],
+        "", tip, points[-1],
         arrowprops={"arrowstyle": "-|>", "color": _ARROW, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 9},
     )  # fmt: skip
     if edge.get("label"):

@@ -52,21 +52,21 @@ def tuning_html(tuning: Tuning) -> Html:
     """Return the constants found with the runs by margin, or the reason why no constants fit."""
     name = element("b", tuning.specification.filename)
     if tuning.conflict is not None:
-        none = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
-        about = " ".join(
-            f"{what.capitalize()}: {'; '.join(needs)}." for what, needs in tuning.conflict.sections
+        failure_text = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
+        conflict_text = " ".join(
+            f"{heading.capitalize()}: {'; '.join(needs)}." for heading, needs in tuning.conflict.sections
         )
-        return element("div", name, f": {none} all runs. {about}")
-    rows = [
+        return element("div", name, f": {failure_text} all runs. {conflict_text}")
+    constant_rows = [
         (constant.name, str(constant.value), str(constant.written), f"{constant.low} to {constant.high}")
         for constant in tuning.constants
     ]
-    closest = sorted(tuning.runs, key=lambda run: run.margin)
-    runs = [
+    closest_runs = sorted(tuning.runs, key=lambda run: run.margin)
+    run_rows = [
         (run.name, "good" if run.is_good else "bad", verdict_mark(run.verdict), f"{run.robustness:.6g}")
-        for run in closest[:_MOST_RUNS]
+        for run in closest_runs[:_MOST_RUNS]
     ]
-    left_out = len(closest) - len(runs)
+    left_out_count = len(closest_runs) - len(run_rows)
     return element(
         "div",
         element(
@@ -74,9 +74,9 @@ def tuning_html(tuning: Tuning) -> Html:
             name,
             f": margin {tuning.margin:.6g}{'' if tuning.is_widest else ', as far as was searched'}",
         ),
-        table(["constant", "value", "as written", "every value that fits"], rows),
-        table(["run", "is", "verdict", "robustness"], runs),
-        quiet(f"… and {plural(left_out, 'run')} more") if left_out else Html(""),
+        table(["constant", "value", "as written", "every value that fits"], constant_rows),
+        table(["run", "is", "verdict", "robustness"], run_rows),
+        quiet(f"… and {plural(left_out_count, 'run')} more") if left_out_count else Html(""),
     )
 
 
@@ -120,9 +120,9 @@ def write_surface(tuning: Tuning, output: Path) -> None:
         UsageError: matplotlib is not installed.
         OutputError: the file cannot be written.
     """
-    ending = output.suffix.lower()
-    data = picture(draw_tuning(tuning), "png" if ending == ".png" else "svg")
-    if ending == ".html":
+    suffix = output.suffix.lower()
+    data = picture(draw_tuning(tuning), "png" if suffix == ".png" else "svg")
+    if suffix == ".html":
         drawing = data.decode("utf-8")
         head = '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Tuning</title></head>\n'
         body = f"<body style='font-family:system-ui,sans-serif'>{drawing[drawing.index('<svg') :]}\n"
@@ -144,22 +144,24 @@ def _draw_curves(surface: Surface, ax: Axes) -> None:
 
 
 def _draw_colours(surface: Surface, ax: Axes) -> None:
-    least = _finite(surface.least)
-    most = float(np.abs(least).max()) or 1.0
+    least_margins = _finite(surface.least)
+    colour_limit = float(np.abs(least_margins).max()) or 1.0
     # values that fit often have margins little above 0, which margins far below 0 would fade
-    most = min(most, 3 * float(least.max())) if least.max() > 0 else most
-    mesh = ax.pcolormesh(
+    colour_limit = (
+        min(colour_limit, 3 * float(least_margins.max())) if least_margins.max() > 0 else colour_limit
+    )
+    colour_mesh = ax.pcolormesh(
         surface.x,
         surface.y,
-        least,
+        least_margins,
         cmap=signed_colours(),
-        vmin=-most,
-        vmax=most,
+        vmin=-colour_limit,
+        vmax=colour_limit,
         alpha=0.6,
         shading="nearest",
     )
-    extend = "min" if least.min() < -most else "neither"
-    ax.figure.colorbar(mesh, ax=ax, label="least margin of all runs (robustness)", extend=extend)
+    extend = "min" if least_margins.min() < -colour_limit else "neither"
+    ax.figure.colorbar(colour_mesh, ax=ax, label="least margin of all runs (robustness)", extend=extend)
     for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
         # matplotlib refuses contours of less than 2 x 2 values, and warns of levels outside the data
         if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
@@ -183,17 +185,17 @@ def _axis_label(surface: Surface, axis: int) -> str:
 
 
 def _name_runs(surface: Surface, ax: Axes) -> None:
-    good = sum(is_good for _, is_good in surface.runs)
-    bad = len(surface.runs) - good
-    runs = plural(good, "good run") + (f", {plural(bad, 'bad run')}" if bad else "")
-    ax.set_title(plain(f"{runs}: margin over {' and '.join(surface.names)}"), loc="left", fontsize=10)
+    good_count = sum(is_good for _, is_good in surface.runs)
+    bad_count = len(surface.runs) - good_count
+    runs_text = plural(good_count, "good run") + (f", {plural(bad_count, 'bad run')}" if bad_count else "")
+    ax.set_title(plain(f"{runs_text}: margin over {' and '.join(surface.names)}"), loc="left", fontsize=10)
 
 
 def _finite(margins: Floats) -> Floats:
     """Return margins, with infinite ones replaced by the largest finite magnitude."""
-    finite = np.abs(margins[np.isfinite(margins)])
-    most = float(finite.max()) if len(finite) else 1.0
-    clipped: Floats = np.clip(margins, -most, most)
+    magnitudes = np.abs(margins[np.isfinite(margins)])
+    largest = float(magnitudes.max()) if len(magnitudes) else 1.0
+    clipped: Floats = np.clip(margins, -largest, largest)
     return clipped
 
 
@@ -246,16 +248,18 @@ def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
     Raises:
         UsageError: no spec was evaluated, or matplotlib is not installed.
     """
-    sides = tuple(zip(diff.traces, (diff.alignment.a, diff.alignment.b), strict=True))
+    traces_and_indices = tuple(zip(diff.traces, (diff.alignment.a, diff.alignment.b), strict=True))
     seconds = (diff.traces[0].times_ns[diff.alignment.a] - diff.zeros_ns[0]) / 1e9
     pairs = []
     for spec in diff.specs:
-        columns = []
-        for result, (trace, indices) in zip((spec.a, spec.b), sides, strict=True):
-            value = np.full(len(trace), np.nan)
-            value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
-            columns.append(value[indices])
-        pairs.append(_Pair(spec.a.title, ("A", "B"), (seconds, seconds), (columns[0], columns[1])))
+        aligned_values = []
+        for result, (trace, indices) in zip((spec.a, spec.b), traces_and_indices, strict=True):
+            values = np.full(len(trace), np.nan)
+            values[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
+            aligned_values.append(values[indices])
+        pairs.append(
+            _Pair(spec.a.title, ("A", "B"), (seconds, seconds), (aligned_values[0], aligned_values[1]))
+        )
     return _draw(pairs)
 
 
@@ -273,15 +277,15 @@ def _draw(pairs: Sequence[_Pair]) -> tuple[Axes, ...]:
     panels = new_panels(len(drawn_pairs), 1, (_WIDTH, 0.4 + _HEIGHT * len(drawn_pairs)), same_x=True)
     for ax, pair in zip(panels, drawn_pairs, strict=True):
         ax.axhline(0.0, color=NEUTRAL, linewidth=0.8, zorder=1)
-        for number in range(2):
-            values = np.where(np.isfinite(pair.values[number]), pair.values[number], np.nan)
+        for curve_index in range(2):
+            values = np.where(np.isfinite(pair.values[curve_index]), pair.values[curve_index], np.nan)
             # the first curve is thicker, so that it stays visible below an equal second curve
             ax.plot(
-                pair.seconds[number],
+                pair.seconds[curve_index],
                 values,
-                color=CURVES[2 + number],
-                linewidth=1.2 if number else 3.0,
-                label=pair.names[number],
+                color=CURVES[2 + curve_index],
+                linewidth=1.2 if curve_index else 3.0,
+                label=pair.names[curve_index],
             )
         ax.set_title(pair.title, loc="left", fontsize=10)
         ax.set_ylabel("robustness")
@@ -308,13 +312,17 @@ def map_html(gradient: GradientMap) -> Html:
     """Return the size of a map, its best robustness, and the number of blocked cells by reason."""
     grid = gradient.grid
     size = f"{grid.columns} x {grid.rows} cells of {grid.cell_size:g}"
-    turned = f", {plural(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
-    best = gradient.best()
-    words = "no free cell" if best == -math.inf else f"robustness {best:.4g} at the best free cell"
-    counts = np.bincount(gradient.blocked.ravel(), minlength=len(REASONS)).tolist()
-    rows = [(f"{count:,}", reason) for count, reason in zip(counts, REASONS, strict=True) if count]
-    title = element("div", "gradient map of ", element("b", gradient.name), quiet(f" {size}{turned}"))
-    return element("div", title, element("div", words), table(["cells", "which are"], rows))
+    turns_text = f", {plural(len(gradient.turns), 'orientation')}" if len(gradient.turns) > 1 else ""
+    best_robustness = gradient.best()
+    best_text = (
+        "no free cell"
+        if best_robustness == -math.inf
+        else f"robustness {best_robustness:.4g} at the best free cell"
+    )
+    blocked_counts = np.bincount(gradient.blocked.ravel(), minlength=len(REASONS)).tolist()
+    rows = [(f"{count:,}", reason) for count, reason in zip(blocked_counts, REASONS, strict=True) if count]
+    title = element("div", "gradient map of ", element("b", gradient.name), quiet(f" {size}{turns_text}"))
+    return element("div", title, element("div", best_text), table(["cells", "which are"], rows))
 
 
 @plot.register(GradientMap)
@@ -343,7 +351,7 @@ def draw_map(
     ax = new_panel((6.4, 5.2)) if ax is None else ax
     if turn is None:
         turn = _best_turn(gradient, None if target is None else target.turn)
-    image = _draw_cells(gradient, ax, turn, _reach_of([gradient]), margin)
+    image = _draw_cells(gradient, ax, turn, _colour_limit([gradient]), margin)
     _draw_scene(ax, gradient, sample)
     if target is not None:
         _draw_target(ax, target_message(target), sample)
@@ -351,9 +359,16 @@ def draw_map(
     ax.set_title(plain(f"where {gradient.name} could go"), loc="left", fontsize=10)
     ax.set_xlabel("x in the unit of the log")
     ax.set_ylabel("y in the unit of the log")
-    if keys := _hatch_keys(ax, [gradient]):
-        place = (0.0, -0.14)
-        ax.legend(handles=keys, loc="upper left", bbox_to_anchor=place, ncols=2, frameon=False, fontsize=8.5)
+    if legend_entries := _hatch_keys(ax, [gradient]):
+        legend_position = (0.0, -0.14)
+        ax.legend(
+            handles=legend_entries,
+            loc="upper left",
+            bbox_to_anchor=legend_position,
+            ncols=2,
+            frameon=False,
+            fontsize=8.5,
+        )
     return ax
 
 
@@ -361,28 +376,30 @@ def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
     """Return the index of the target's orientation, or without a target that of the best free cell."""
     if target_turn is not None:
         return int(np.abs(gradient.turns - target_turn).argmin())
-    best = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
-    return int(best.argmax())
+    best_by_turn = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
+    return int(best_by_turn.argmax())
 
 
-def _reach_of(maps: Sequence[GradientMap]) -> float:
+def _colour_limit(maps: Sequence[GradientMap]) -> float:
     """Return the greatest absolute robustness in some maps, which gets the full colours."""
     values = np.abs(np.concatenate([gradient.values.ravel() for gradient in maps]))
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
 
-def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin: float | None) -> AxesImage:
+def _draw_cells(
+    gradient: GradientMap, ax: Axes, turn: int, colour_limit: float, margin: float | None
+) -> AxesImage:
     """Draw the cells of one orientation.
 
     Args:
-        reach: absolute robustness that gets the full colours.
+        colour_limit: absolute robustness that gets the full colours.
         margin: robustness at which a line is drawn.
     """
     grid = gradient.grid
     right, top = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
     ax.set_facecolor(_BLOCKED)
     image = ax.imshow(
-        gradient.values[turn], cmap=signed_colours(), vmin=-reach, vmax=reach, origin="lower",
+        gradient.values[turn], cmap=signed_colours(), vmin=-colour_limit, vmax=colour_limit, origin="lower",
         extent=(grid.xmin, right, grid.ymin, top), interpolation="nearest",
     )  # fmt: skip
     x, y = (axis.reshape(grid.shape) for axis in grid.centres().T)
@@ -391,20 +408,20 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float, margin
     if margin is not None and min(values.shape) > 1 and np.nanmin(values, initial=margin) < margin:
         ax.contour(x, y, values, levels=[margin], colors=[INK], linewidths=[1.0])
     for reason, hatch in enumerate(_HATCHES):
-        cells = gradient.blocked[turn] == reason
-        if hatch and cells.any() and min(cells.shape) > 1:
-            hatched = ax.contourf(x, y, cells, levels=[0.5, 1.5], colors="none", hatches=[hatch])
-            hatched.set(edgecolor=_HATCH, linewidth=0.0)
+        is_blocked = gradient.blocked[turn] == reason
+        if hatch and is_blocked.any() and min(is_blocked.shape) > 1:
+            contours = ax.contourf(x, y, is_blocked, levels=[0.5, 1.5], colors="none", hatches=[hatch])
+            contours.set(edgecolor=_HATCH, linewidth=0.0)
     return image
 
 
 def _draw_scene(ax: Axes, gradient: GradientMap, sample: Sample | None) -> None:
     """Draw obstacles in grey, regions dotted, and the objects of a sample; the moved object is bold."""
-    maps = gradient.made_of.now
-    for name, obstacle in maps.static.items():
+    current_maps = gradient.made_of.now
+    for name, obstacle in current_maps.static.items():
         _draw_footprint(ax, obstacle, 1.0, colour=_HATCH)
         _name(ax, name, obstacle)
-    for name, outline in maps.about.regions.items():
+    for name, outline in current_maps.about.regions.items():
         region = footprint_from_outline(outline)
         _draw_footprint(ax, region, 1.0, ":")
         _name(ax, name, region)
@@ -430,16 +447,20 @@ def _draw_target(ax: Axes, target: PlanTarget, sample: Sample | None) -> None:
     ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
     tracked = None if sample is None else sample.objects.get(target.object)
     if tracked is not None:
-        moved = moved_object(tracked, target.x, target.y, target.turn)
-        _draw_footprint(ax, moved.footprint, 1.5, "--")
+        moved_target = moved_object(tracked, target.x, target.y, target.turn)
+        _draw_footprint(ax, moved_target.footprint, 1.5, "--")
 
 
 def _hatch_keys(ax: Axes, maps: Sequence[GradientMap]) -> list[Artist]:
     """Return the legend's entries for the reasons that block cells in some maps."""
-    reasons = np.unique(np.concatenate([gradient.blocked.ravel() for gradient in maps])).tolist()
+    reason_codes = np.unique(np.concatenate([gradient.blocked.ravel() for gradient in maps])).tolist()
     style: dict[str, Any] = {"facecolor": _BLOCKED, "edgecolor": _HATCH}
-    filled = (ax.fill([], [], hatch=_HATCHES[r], label=REASONS[r], **style) for r in reasons if r != FREE)
-    return [entry for (entry,) in filled]
+    patches = (
+        ax.fill([], [], hatch=_HATCHES[reason], label=REASONS[reason], **style)
+        for reason in reason_codes
+        if reason != FREE
+    )
+    return [entry for (entry,) in patches]
 
 
 def _draw_footprint(
@@ -481,34 +502,40 @@ def _draw_decision(
     decision: PlanDecision, maps: Sequence[Sequence[GradientMap]], sample: Sample | None, margin: float | None
 ) -> tuple[Axes, ...]:
     """Draw the maps of a decision; see `draw_step`."""
-    numbers = [number for number, edge in enumerate(decision.considered) if edge.candidates][-_MOST_EDGES:]
-    edges = [decision.considered[number] for number in numbers]
+    edge_numbers = [edge_number for edge_number, edge in enumerate(decision.considered) if edge.candidates][
+        -_MOST_EDGES:
+    ]
+    edges = [decision.considered[edge_number] for edge_number in edge_numbers]
     if not edges:
         return ()
-    columns = min(max(len(edge.candidates) for edge in edges), _MOST_CANDIDATES)
-    size = (0.8 + _PANEL * columns, 0.5 + _PANEL * len(edges))
-    panels = new_panels(len(edges), columns, size)
-    places = [
-        (row * columns + column, edge, candidate, gradient)
-        for row, (number, edge) in enumerate(zip(numbers, edges, strict=True))
+    column_count = min(max(len(edge.candidates) for edge in edges), _MOST_CANDIDATES)
+    size = (0.8 + _PANEL * column_count, 0.5 + _PANEL * len(edges))
+    panels = new_panels(len(edges), column_count, size)
+    panel_contents = [
+        (row * column_count + column, edge, candidate, gradient)
+        for row, (edge_number, edge) in enumerate(zip(edge_numbers, edges, strict=True))
         for column, (candidate, gradient) in enumerate(
-            zip(edge.candidates[:columns], maps[number][:columns], strict=True)
+            zip(edge.candidates[:column_count], maps[edge_number][:column_count], strict=True)
         )
     ]
-    drawn_maps = [gradient for *_, gradient in places]
+    drawn_maps = [gradient for *_, gradient in panel_contents]
     for panel in panels:
         panel.set_axis_off()
-    used_panels = tuple(panels[place] for place, *_ in places)
-    reach = _reach_of(drawn_maps)
+    used_panels = tuple(panels[panel_index] for panel_index, *_ in panel_contents)
+    colour_limit = _colour_limit(drawn_maps)
     images = [
-        _draw_candidate(panel, edge, candidate, gradient, sample, reach, margin)
-        for panel, (_, edge, candidate, gradient) in zip(used_panels, places, strict=True)
+        _draw_candidate(panel, edge, candidate, gradient, sample, colour_limit, margin)
+        for panel, (_, edge, candidate, gradient) in zip(used_panels, panel_contents, strict=True)
     ]
     used_panels[0].figure.colorbar(images[0], ax=panels, label="robustness of what is to hold", shrink=0.6)
-    keys = _hatch_keys(used_panels[0], drawn_maps)
-    if keys:
+    legend_entries = _hatch_keys(used_panels[0], drawn_maps)
+    if legend_entries:
         used_panels[0].figure.legend(
-            handles=keys, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=8.5
+            handles=legend_entries,
+            loc="outside lower left",
+            ncols=len(legend_entries),
+            frameon=False,
+            fontsize=8.5,
         )
     return used_panels
 
@@ -519,14 +546,14 @@ def _draw_candidate(
     candidate: PlanCandidate,
     gradient: GradientMap,
     sample: Sample | None,
-    reach: float,
+    colour_limit: float,
     margin: float | None,
 ) -> AxesImage:
     """Draw one map, with the planner's choice in its title."""
     target = candidate.target if candidate.HasField("target") else None
     ax.set_axis_on()
     turn = _best_turn(gradient, None if target is None else target.turn)
-    image = _draw_cells(gradient, ax, turn, reach, margin)
+    image = _draw_cells(gradient, ax, turn, colour_limit, margin)
     _draw_scene(ax, gradient, sample)
     if target is not None:
         _draw_target(ax, target, sample)

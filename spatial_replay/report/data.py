@@ -86,10 +86,10 @@ class ReportedResult:
     @property
     def specs(self) -> Iterator[NodeResult]:
         """Yield the first node of each named spec within the formula, in the order of the text."""
-        names = {self.result.nodes[0].name}
+        reported_names = {self.result.nodes[0].name}
         for node in self.result.nodes[1:]:
-            if node.name is not None and node.name not in names:
-                names.add(node.name)
+            if node.name is not None and node.name not in reported_names:
+                reported_names.add(node.name)
                 yield node
 
     @property
@@ -103,7 +103,9 @@ class ReportedResult:
         if self.witness is None:
             return None
         path = self.witness.closest_path or self.witness.path
-        return next((step for step, below in pairwise(path) if below.time_ns < step.time_ns), path[-1])
+        return next(
+            (step for step, next_step in pairwise(path) if next_step.time_ns < step.time_ns), path[-1]
+        )
 
     @property
     def deciding(self) -> DecidingAtom | None:
@@ -206,53 +208,62 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
         times_ns: (T,) int64, times of all samples.
         most: limit, at least 8 and at least 4 per curve.
     """
-    count = len(times_ns)
-    if count <= most:
-        return np.arange(count)
+    sample_count = len(times_ns)
+    if sample_count <= most:
+        return np.arange(sample_count)
     starts = [int(np.searchsorted(times_ns, curve.times_ns[0])) for curve in curves]
-    is_chosen = np.zeros(count, np.bool_)
-    is_chosen[np.linspace(0, count - 1, most // 4).astype(np.int64)] = True
+    is_chosen = np.zeros(sample_count, np.bool_)
+    is_chosen[np.linspace(0, sample_count - 1, most // 4).astype(np.int64)] = True
     for start, curve in zip(starts, curves, strict=True):
         is_chosen[[start, start + len(curve.times_ns) - 1]] = True
-    stretches = max(1, most // 16)
-    for limit, found_in in ((most * 5 // 8, _turns), (most, lambda series: _extremes(series, stretches))):
+    stretch_count = max(1, most // 16)
+    for limit, find_samples in (
+        (most * 5 // 8, _turns),
+        (most, lambda series: _extremes(series, stretch_count)),
+    ):
         for start, curve in zip(starts, curves, strict=True):
-            _choose(is_chosen, start + found_in(curve.series), limit)
+            _choose(is_chosen, start + find_samples(curve.series), limit)
     return np.flatnonzero(is_chosen)
 
 
-def _choose(chosen: NDArray[np.bool_], samples: Integers, most: int) -> None:
-    """Mark samples as chosen, up to `most` in all; if there are too many, mark evenly spread ones."""
-    new = samples[~chosen[samples]]
-    room = max(0, most - int(np.count_nonzero(chosen)))
-    if len(new) > room:
-        new = new[np.linspace(0, len(new), room, endpoint=False).astype(np.int64)]
-    chosen[new] = True
+def _choose(is_chosen: NDArray[np.bool_], samples: Integers, limit: int) -> None:
+    """Mark samples as chosen, up to `limit` in all. Of too many samples, mark evenly spread samples."""
+    new_samples = samples[~is_chosen[samples]]
+    free_count = max(0, limit - int(np.count_nonzero(is_chosen)))
+    if len(new_samples) > free_count:
+        new_samples = new_samples[
+            np.linspace(0, len(new_samples), free_count, endpoint=False).astype(np.int64)
+        ]
+    is_chosen[new_samples] = True
 
 
 def _turns(series: Floats) -> Integers:
     """Return the samples on both sides of each change of sign of a value, `now`, or end of an interval."""
-    turns = [np.empty(0, np.int64)]
+    change_samples = [np.empty(0, np.int64)]
     for numbers in series.reshape(-1, series.shape[-1]):
-        sign = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
-        after = np.flatnonzero(np.diff(sign)) + 1
-        turns += [after - 1, after]
-    return np.unique(np.concatenate(turns))
+        signs = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))
+        samples_after = np.flatnonzero(np.diff(signs)) + 1
+        change_samples += [samples_after - 1, samples_after]
+    return np.unique(np.concatenate(change_samples))
 
 
-def _extremes(series: Floats, stretches: int) -> Integers:
+def _extremes(series: Floats, stretch_count: int) -> Integers:
     """Return the samples with the least and the greatest value and `now` within each stretch."""
-    count = series.shape[-1]
-    starts = np.unique(np.linspace(0, count, stretches, endpoint=False).astype(np.int64))
+    sample_count = series.shape[-1]
+    starts = np.unique(np.linspace(0, sample_count, stretch_count, endpoint=False).astype(np.int64))
     extremes = [np.empty(0, np.int64)]
-    for numbers in series[:, :2].reshape(-1, count):
-        for infinite, extreme in ((np.inf, np.minimum), (-np.inf, np.maximum)):
-            comparable = np.where(np.isnan(numbers), infinite, numbers)
-            best = np.repeat(extreme.reduceat(comparable, starts), np.diff([*starts, count]))
-            hits = np.flatnonzero(comparable == best)
+    for numbers in series[:, :2].reshape(-1, sample_count):
+        for placeholder, extreme in ((np.inf, np.minimum), (-np.inf, np.maximum)):
+            comparable = np.where(np.isnan(numbers), placeholder, numbers)
+            stretch_extremes = np.repeat(
+                extreme.reduceat(comparable, starts), np.diff([*starts, sample_count])
+            )
+            extreme_samples = np.flatnonzero(comparable == stretch_extremes)
             # the first sample with the extreme number in each stretch
-            _, first = np.unique(np.searchsorted(starts, hits, side="right"), return_index=True)
-            extremes.append(hits[first])
+            _, first_hits = np.unique(
+                np.searchsorted(starts, extreme_samples, side="right"), return_index=True
+            )
+            extremes.append(extreme_samples[first_hits])
     return np.unique(np.concatenate(extremes))
 
 
@@ -317,33 +328,33 @@ def page_data(report: RunReport) -> PageData:
     return PageData(facts, packing.text(), omissions)
 
 
-def _room(results: Sequence[ReportedResult], samples: int) -> int:
+def _room(results: Sequence[ReportedResult], sample_count: int) -> int:
     """Return the limit of samples in the page."""
-    values = sum(
+    value_count = sum(
         4 * len(shown_nodes(reported.result.formula)) * len(reported.result.times_ns) for reported in results
     )
-    return max(_FEWEST_SAMPLES, MOST_VALUES * max(samples, 1) // max(values, 1))
+    return max(_FEWEST_SAMPLES, MOST_VALUES * max(sample_count, 1) // max(value_count, 1))
 
 
 def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
     """Return the indices on the page of (result, node), for all drawn results and shown nodes."""
     return {
-        (number, node): (index, place)
-        for index, number in enumerate(report.drawn_numbers)
-        for place, node in enumerate(shown_nodes(report.results[number].result.formula))
+        (result_number, node): (page_index, node_index)
+        for page_index, result_number in enumerate(report.drawn_numbers)
+        for node_index, node in enumerate(shown_nodes(report.results[result_number].result.formula))
     }
 
 
-def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
+def _shown_times(report: RunReport, times_ns: Integers, count_limit: int) -> Integers:
     """Return times that the page always has: times in sentences, of further events, and of the scene.
 
-    They are at most `most`, unless the times in sentences alone exceed it. Frames of the scene are evenly
+    They are at most `count_limit`, unless the times in sentences alone exceed it. Frames of the scene are evenly
     spaced. All panels have these times, because a cursor shows one sample.
     """
-    events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: most // 2]
+    events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: count_limit // 2]
     shown_ns = np.array(sorted({*report.marked_ns, *events_ns}), np.int64)
-    room = max(most - len(shown_ns), 2)
-    scene_ns = report.scene.times_ns[:: max(1, -(-len(report.scene.times_ns) // room))]
+    scene_limit = max(count_limit - len(shown_ns), 2)
+    scene_ns = report.scene.times_ns[:: max(1, -(-len(report.scene.times_ns) // scene_limit))]
     return np.intersect1d(np.concatenate([shown_ns, scene_ns]), times_ns)
 
 
@@ -356,7 +367,7 @@ def _result_value(
     times_ns = reported.result.times_ns[samples]
     # (shown nodes, 4, samples)
     series = reported.result.series[list(shown_nodes(reported.result.formula))][:, :, samples]
-    value: dict[str, Any] = {
+    result_facts: dict[str, Any] = {
         **json_fields(reported.result, "title", "name", "object", "verdict"),
         "pointer": _pointer_value(reported, first_ns, report.axes.unit),
         "fault": None if reported.fault_ns is None else (reported.fault_ns - first_ns) / 1e9,
@@ -374,13 +385,13 @@ def _result_value(
         "no_automaton": sentence_parts(reported.compiled.reason),
     }
     if reported.compiled.automaton is not None:
-        inside = np.searchsorted(reported.path.times_ns, times_ns)
-        value["automaton"] = {
+        path_indices = np.searchsorted(reported.path.times_ns, times_ns)
+        result_facts["automaton"] = {
             **automaton_value(reported.compiled.automaton, reported.path, reported.tree.with_object_name),
             "sets": list(reported.path.sets),
-            "path": packing.add(np.array(reported.path.codes)[inside], "i4"),
+            "path": packing.add(np.array(reported.path.codes)[path_indices], "i4"),
         }
-    return value
+    return result_facts
 
 
 def _place_of(reported: ReportedResult) -> int | None:
@@ -412,12 +423,12 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
     number, pair = deciding.value * divisor_of(deciding.atom), pair_of(deciding.atom)
     is_response = witness.closest is not None
     # the same words as at the arrow in the log's scene
-    holds = "must not hold, holds by " if number >= 0 else ""
+    holds_text = "must not hold, holds by " if number >= 0 else ""
     return {
         "time": (reported.fault_ns - first_ns) / 1e9,
         "ends": [*map(float, (*contact.first, *contact.second))],
         "text": deciding.text,
-        "label": open_text(witness) or f"{holds}{with_unit(number, lengths)}",
+        "label": open_text(witness) or f"{holds_text}{with_unit(number, lengths)}",
         "number": json_number(number),
         "is_condition": not is_response and witness.missed is not None and witness.missed.is_condition,
         "is_response": is_response,
@@ -426,11 +437,11 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
     }
 
 
-def _omissions(report: RunReport, samples: int, page_samples: int, maps: int) -> Iterator[str]:
-    if page_samples < samples:
+def _omissions(report: RunReport, sample_count: int, page_sample_count: int, map_count: int) -> Iterator[str]:
+    if page_sample_count < sample_count:
         yield (
-            f"Curves and tree have {page_samples:,} of {samples:,} samples: those at equal distances, those "
-            "around changes of sign, and the extremes of every curve in between."
+            f"Curves and tree have {page_sample_count:,} of {sample_count:,} samples: those at equal"
+            " distances, those around changes of sign, and the extremes of every curve in between."
         )
     if report.scene.stride > 1:
         yield (
@@ -451,5 +462,5 @@ def _omissions(report: RunReport, samples: int, page_samples: int, maps: int) ->
         yield f"The first {MOST_EVENTS:,} of {len(report.events):,} events are listed."
     if len(report.ticks) > MOST_TICKS:
         yield f"The first {MOST_TICKS:,} of {len(report.ticks):,} ticks of the behaviour tree are shown."
-    if maps:
-        yield f"{maps:,} gradient maps are left out."
+    if map_count:
+        yield f"{map_count:,} gradient maps are left out."

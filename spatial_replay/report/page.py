@@ -43,9 +43,11 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
     Args:
         omissions: sentences on data that the page leaves out to limit its size.
     """
-    counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
+    counts_html = (
+        element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
+    )
     title = element(
-        "div", element("h1", text(report.replayed.log)), _chip_of(report), counts, **{"class": "title"}
+        "div", element("h1", text(report.replayed.log)), _chip_of(report), counts_html, **{"class": "title"}
     )
     return element(
         "header",
@@ -126,15 +128,15 @@ def _decisions_link(report: RunReport) -> Iterator[Html]:
 def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
     replayed = report.replayed
     if replayed.faults:
-        what = "The log is damaged: verdicts are over what could be read."
-        yield _notice("alert", what, replayed.faults)
+        message = "The log is damaged: verdicts are over what could be read."
+        yield _notice("alert", message, replayed.faults)
     doubts = [doubt.text for doubt in replayed.doubts if not doubt.is_accepted]
     if doubts:
         yield _notice("alert", "The log contradicts how it was read; verdicts may be wrong:", doubts)
     if replayed.unreadable:
         verb = "holds" if replayed.unreadable == 1 else "hold"
-        what = f"{plural(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
-        yield _notice("note", what, replayed.remarks)
+        message = f"{plural(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
+        yield _notice("note", message, replayed.remarks)
     elif replayed.remarks:
         yield _notice("note", "The log says of its samples:", replayed.remarks)
     if report.gaps:
@@ -145,9 +147,9 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
         yield _notice("note", "The run is large, and the page leaves something out:", omissions)
 
 
-def _notice(role: str, what: str, details: Sequence[str]) -> Html:
+def _notice(role: str, message: str, details: Sequence[str]) -> Html:
     detail_list = element("ul", *(element("li", text(detail)) for detail in details)) if details else Html("")
-    return element("div", element("strong", what), detail_list, role=role, **{"class": f"notice {role}"})
+    return element("div", element("strong", message), detail_list, role=role, **{"class": f"notice {role}"})
 
 
 def panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
@@ -162,22 +164,24 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     first_ns = report.replayed.first_ns
     for part in report.replayed.vacuous:
         yield element("p", *sentence_html(part.message, first_ns))
-    places = {id(result): place for place, result in enumerate(report.drawn)}
+    page_indices = {id(result): index for index, result in enumerate(report.drawn)}
     are_many = len(report.results) > MANY
     if are_many:
         yield element("p", text(_counts(report)), id="counts", **{"class": "counts"})
-    worst = worst_first(report.replayed.results)
-    for number, reported in enumerate(report.results[place] for place in worst):
+    worst_indices = worst_first(report.replayed.results)
+    for position, reported in enumerate(report.results[index] for index in worst_indices):
         # the script shows this result in all panels after a click on the verdict
-        result_attribute = {"data-result": str(places[id(reported)])} if id(reported) in places else {}
+        result_attribute = (
+            {"data-result": str(page_indices[id(reported)])} if id(reported) in page_indices else {}
+        )
         is_reported = reported.result.verdict == report.replayed.verdict or bool(reported.result.remarks)
-        is_unfolded = is_reported and not (are_many and number)
-        unfolded = {"open": ""} if reported.sentences and is_unfolded else {}
+        is_unfolded = is_reported and not (are_many and position)
+        open_attribute = {"open": ""} if reported.sentences and is_unfolded else {}
         attributes = {
             "class": "verdict",
             "data-verdict": str(reported.result.verdict),
             **result_attribute,
-            **unfolded,
+            **open_attribute,
         }
         sentences = [sentence for sentence in reported.sentences if not _HEADLINE.fullmatch(sentence)]
         content = [element("p", *sentence_html(sentence, first_ns)) for sentence in sentences]
@@ -192,23 +196,23 @@ def _counts(report: RunReport) -> str:
 def _summary(reported: ReportedResult, first_ns: int) -> Html:
     """Return the summary line of a result: verdict, requirement, robustness, and since when it is certain."""
     result = reported.result
-    numbers = [f"robustness {reported.robustness_text or 'not determined'}"]
+    number_texts = [f"robustness {reported.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
         if result.least is None and result.least_at_ns is not None:
-            numbers.append(f"least at {Instant(result.least_at_ns, first_ns)}")
-        numbers.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
+            number_texts.append(f"least at {Instant(result.least_at_ns, first_ns)}")
+        number_texts.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
     elif result.satisfied_at_ns is not None:
-        numbers.append(f"satisfied since {Instant(result.satisfied_at_ns, first_ns)}")
+        number_texts.append(f"satisfied since {Instant(result.satisfied_at_ns, first_ns)}")
     elif result.verdict is Verdict.SATISFIED and result.first_satisfied_ns is not None:
-        numbers.append(f"first satisfied at {Instant(result.first_satisfied_ns, first_ns)}")
-    mark = _mark(result)
-    marks = [element("span", mark, **{"class": "chip is-vacuous"})] if mark else []
+        number_texts.append(f"first satisfied at {Instant(result.first_satisfied_ns, first_ns)}")
+    flaws = _mark(result)
+    flaw_chips = [element("span", flaws, **{"class": "chip is-vacuous"})] if flaws else []
     return element(
         "summary" if reported.sentences else "div",
         chip(result.verdict, is_sound=_is_sound(result)),
-        *marks,
+        *flaw_chips,
         *_requirement(result.spec.id, result.title, result.spec.title),
-        element("span", text(with_signs(", ".join(numbers))), **{"class": "numbers"}),
+        element("span", text(with_signs(", ".join(number_texts))), **{"class": "numbers"}),
         **{"class": "summary"},
     )
 
@@ -220,13 +224,13 @@ def _is_sound(result: SpecResult) -> bool:
 
 def _mark(result: SpecResult) -> str:
     """Return the flaws of a verdict in words; "" without flaws."""
-    marks = ["doubtful"] if result.doubts else []
+    flaws = ["doubtful"] if result.doubts else []
     if result.tested == "nothing":
-        return ", ".join([*marks, "tested by nothing"])
+        return ", ".join([*flaws, "tested by nothing"])
     if result.vacuous:
-        marks.append("a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing")
-    marks += ["the end of the log cut a window"] if result.tested == "cut" else []
-    return ", ".join(marks)
+        flaws.append("a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing")
+    flaws += ["the end of the log cut a window"] if result.tested == "cut" else []
+    return ", ".join(flaws)
 
 
 def _requirement(identifier: str | None, name: str, title: str | None) -> Iterator[Html]:
@@ -240,23 +244,28 @@ def _requirement(identifier: str | None, name: str, title: str | None) -> Iterat
 
 def _specs(reported: ReportedResult, first_ns: int) -> Html:
     """Return a row for each named spec within a result, and a sentence on mixed units."""
-    named = {spec.name: spec for spec in reported.file.specs}
+    specs_by_name = {spec.name: spec for spec in reported.file.specs}
     rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(reported.result.formula)}
     for node in reported.specs:
         settled_ns = settled_time(reported.result.settled_ns, node.id)
-        spec = named.get(node.name or "")
-        about = (None, None) if spec is None else (spec.id, spec.title)
+        spec = specs_by_name.get(node.name or "")
+        id_and_title = (None, None) if spec is None else (spec.id, spec.title)
         unit = declared_unit(formulas[node.id], reported.result.evidence.units)
-        numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
+        numbers_text = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
         if settled_ns is not None:
-            numbers += f", violated since {Instant(settled_ns, first_ns)}"
-        line = element("span", text(with_signs(numbers)), **{"class": "numbers"})
+            numbers_text += f", violated since {Instant(settled_ns, first_ns)}"
+        numbers_html = element("span", text(with_signs(numbers_text)), **{"class": "numbers"})
         rows.append(
-            element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
+            element(
+                "li",
+                chip(node.verdict),
+                *_requirement(id_and_title[0], node.name or "", id_and_title[1]),
+                numbers_html,
+            )
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
-    if words := units_text(units_of(reported.result.formula)):
-        parts.append(element("p", text(words), **{"class": "units"}))
+    if units_sentence := units_text(units_of(reported.result.formula)):
+        parts.append(element("p", text(units_sentence), **{"class": "units"}))
     return element("div", *parts)
 
 
@@ -266,8 +275,8 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
         if isinstance(part, Instant):
             yield element("span", str(part), **{"data-time-ns": str(part.time_ns - first_ns)})
             continue
-        for number, piece in enumerate(sentence_parts(part)):
-            yield element("code", text(piece)) if number % 2 else text(piece)
+        for piece_index, piece in enumerate(sentence_parts(part)):
+            yield element("code", text(piece)) if piece_index % 2 else text(piece)
 
 
 def chip(verdict: str, *, is_sound: bool = True) -> Html:
@@ -401,7 +410,7 @@ def html_page(
         marks: attributes of the root element.
     """
     style = "\n".join([theme(), *map(asset, styles)])
-    whole = [
+    page_parts = [
         f'<!doctype html>\n<html lang="en"{marks}><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{_policy(scripts, style, has_pictures)}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
@@ -412,7 +421,7 @@ def html_page(
         *(f"<script>{script}</script>" for script in scripts),
         "</body></html>\n",
     ]
-    return "".join(whole).encode("utf-8")
+    return "".join(page_parts).encode("utf-8")
 
 
 def asset(name: str) -> str:

@@ -127,9 +127,9 @@ def unpack_array(reference: Reference, data: bytes) -> NDArray[Any]:
 def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return numbers in single precision. Negative numbers stay negative, because the sign is the verdict."""
     with np.errstate(over="ignore", under="ignore"):
-        near = numbers.astype(np.float32)
+        rounded = numbers.astype(np.float32)
     smallest = np.finfo(np.float32).smallest_subnormal
-    return np.where((numbers < 0.0) & (near == 0.0), -smallest, near)
+    return np.where((numbers < 0.0) & (rounded == 0.0), -smallest, rounded)
 
 
 def json_text(value: Any) -> str:
@@ -139,8 +139,8 @@ def json_text(value: Any) -> str:
     https://html.spec.whatwg.org/multipage/scripting.html#restrictions-for-contents-of-script-elements
     """
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    for sign in "<>&":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
     return text
 
 
@@ -187,10 +187,10 @@ def shown_nodes(formula: Formula) -> tuple[int, ...]:
     nodes = list(iter_nodes(formula))
     if len(nodes) <= MOST_NODES:
         return tuple(range(len(nodes)))
-    depth: list[int] = []
+    depths: list[int] = []
     for _, parent, _ in nodes:
-        depth.append(0 if parent is None else depth[parent] + 1)
-    uppermost = sorted(range(len(nodes)), key=lambda identifier: (depth[identifier], identifier))
+        depths.append(0 if parent is None else depths[parent] + 1)
+    uppermost = sorted(range(len(nodes)), key=lambda identifier: (depths[identifier], identifier))
     return tuple(sorted(uppermost[:MOST_NODES]))
 
 
@@ -217,23 +217,23 @@ def tree_value(
     """
     # a template's parameter is replaced by the object of the instance
     formula = result.evidence.bound(result.formula)
-    nodes, initial = shown_nodes(formula), initial_nodes(formula)
-    place = {identifier: index for index, identifier in enumerate(nodes)}
+    nodes, initial_ids = shown_nodes(formula), initial_nodes(formula)
+    index_by_id = {identifier: index for index, identifier in enumerate(nodes)}
     return [
         {
             "id": identifier,
-            "parent": None if parent is None else place[parent],
+            "parent": None if parent is None else index_by_id[parent],
             "name": node.name or "",
             "head": cut(calls.get(identifier) or _head(node, relations), _LONGEST),
             "text": cut(format_formula(node, relations=relations), _LONGEST),
             "unit": unit_of(node, units),
             "divisor": divisor_of(node),
-            "initial": identifier in initial,
+            "initial": identifier in initial_ids,
             "verdict": str(final_verdict(*result.final[identifier].tolist())),
             "value": final_text(float(result.values[identifier]), *result.final[identifier].tolist()),
         }
         for identifier, parent, node in iter_nodes(formula)
-        if identifier in place
+        if identifier in index_by_id
     ]
 
 
@@ -243,19 +243,19 @@ def requirement_values(result: SpecResult, samples: Integers, packing: Packing) 
     Args:
         samples: (S,) indices of the samples on the page.
     """
-    place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
-    settles = result.semantics == "ltlf"
+    index_by_id = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
+    has_final_verdicts = result.semantics == "ltlf"
     return [
         {
-            "node": place[requirement.node],
+            "node": index_by_id[requirement.node],
             "is_condition": requirement.is_condition,
             "is_invariant": requirement.is_invariant,
             "obligation": requirement.obligation
-            and {"node": place[requirement.obligation.node], "sign": requirement.obligation.sign},
+            and {"node": index_by_id[requirement.obligation.node], "sign": requirement.obligation.sign},
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),
         }
-        for requirement in requirements_of(result.formula, result.object, settles=settles)
-        if requirement.node in place
+        for requirement in requirements_of(result.formula, result.object, settles=has_final_verdicts)
+        if requirement.node in index_by_id
     ]
 
 
@@ -317,7 +317,7 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
         named: replaces a template's parameter by the object in a text.
     """
     visited = {state for states in path.sets for state in states}
-    drawing, short = draw_automaton(automaton, visited), abbreviate(automaton)
+    drawing, short_automaton = draw_automaton(automaton, visited), abbreviate(automaton)
     return {
         **json_fields(drawing, "summary", "left_out"),
         "states": [
@@ -329,10 +329,12 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
         ],
         # arrows have the same words, and the legend is the same, as in a drawing by Graphviz
         "moves": [
-            {**move._asdict(), "guard": named(move.guard), "label": named(brief.guard)}
-            for move, brief in zip(drawing.moves, draw_automaton(short, visited).moves, strict=True)
+            {**move._asdict(), "guard": named(move.guard), "label": named(short_move.guard)}
+            for move, short_move in zip(
+                drawing.moves, draw_automaton(short_automaton, visited).moves, strict=True
+            )
         ],
-        "legend": list(map(named, meanings(short))),
+        "legend": list(map(named, meanings(short_automaton))),
     }
 
 
@@ -399,10 +401,10 @@ def pictures_of(
     topic = _image_topic(path) if isinstance(path, LogFile) else None
     if topic is None or not isinstance(path, LogFile):
         return NO_PICTURES
-    decided = sorted(decided_ns)[: MOST_PICTURES // 2]
-    others = np.linspace(*span_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
+    decided_times_ns = sorted(decided_ns)[: MOST_PICTURES // 2]
+    spaced_times_ns = np.linspace(*span_ns, MOST_PICTURES - len(decided_times_ns)).astype(np.int64).tolist()
     try:
-        frames = ImageTopic(path, topic).frames_at(sorted({*decided, *others}))
+        frames = ImageTopic(path, topic).frames_at(sorted({*decided_times_ns, *spaced_times_ns}))
         pictures = [(frame.time_ns, _small(frame.image)) for frame in frames]
     except (LogError, UsageError) as error:
         return {**NO_PICTURES, "topic": topic, "reason": f"The pictures of {topic} are not shown: {error}."}
@@ -411,7 +413,7 @@ def pictures_of(
         "reason": "" if pictures else f"No picture of {topic} can be decoded.",
         "times": [(time_ns - first_ns) / 1e9 for time_ns, _ in pictures],
         "pictures": [
-            f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}" for _, data in pictures
+            f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}" for _, jpeg in pictures
         ],
     }
 
@@ -434,13 +436,13 @@ def _image_topic(path: LogFile) -> str | None:
 
 def _small(image: Image) -> bytes:
     # Base64 writes 3 bytes as 4 characters; 64 bytes are room for the head of the URL
-    most = MOST_PICTURE_BYTES * 3 // 4 // MOST_PICTURES - 64
-    data = b""
+    byte_limit = MOST_PICTURE_BYTES * 3 // 4 // MOST_PICTURES - 64
+    jpeg = b""
     for width, quality in _FORMS:
-        data = encode_jpeg(image, width, quality)
-        if len(data) <= most:
+        jpeg = encode_jpeg(image, width, quality)
+        if len(jpeg) <= byte_limit:
             break
-    return data
+    return jpeg
 
 
 MOST_FRAMES: Final = 3_000
@@ -472,8 +474,10 @@ class ReportedScene:
         """Add the next frames."""
         # `add_frame` drops all other frames, so they are not computed
         frame_numbers = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
-        repeats_last = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
-        frames = replace(frames, chosen=np.union1d(frame_numbers, [0]) if repeats_last else frame_numbers)
+        has_repeated_time = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
+        frames = replace(
+            frames, chosen=np.union1d(frame_numbers, [0]) if has_repeated_time else frame_numbers
+        )
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
@@ -501,8 +505,8 @@ class ReportedScene:
     def insert(self, frames: SceneFrames) -> None:
         """Insert frames at times that were not collected."""
         for index, time_ns in enumerate(frames.times_ns.tolist()):
-            at = bisect_left(self.frames, time_ns, key=itemgetter(0))
-            self.frames.insert(at, (time_ns, frames.frame(index)))
+            position = bisect_left(self.frames, time_ns, key=itemgetter(0))
+            self.frames.insert(position, (time_ns, frames.frame(index)))
 
     @property
     def times_ns(self) -> Integers:
@@ -543,18 +547,20 @@ def scene_value(
     ]
     entities = _entities(frames)
     # a frame has at most one arrow per result
-    results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
-    result_numbers = sorted(results, key=results.__getitem__)
-    most = max(1, MOST_ARROWS // max(len(frames), 1))
+    page_index_by_result = dict(
+        sorted((result, page_index) for (result, _), (page_index, _) in places.items())
+    )
+    result_numbers = sorted(page_index_by_result, key=page_index_by_result.__getitem__)
+    result_limit = max(1, MOST_ARROWS // max(len(frames), 1))
     numbered_arrows = [
-        (number, arrow)
-        for number, frame in enumerate(frames)
-        for result, place in results.items()
-        if place < most and (arrow := frame.violation(result)) is not None
+        (frame_index, arrow)
+        for frame_index, frame in enumerate(frames)
+        for result, page_index in page_index_by_result.items()
+        if page_index < result_limit and (arrow := frame.violation(result)) is not None
     ]
     arrows = [arrow for _, arrow in numbered_arrows]
     outlines = list(dict.fromkeys(arrow.dashes for arrow in arrows))
-    names = list(dict.fromkeys(arrow.names for arrow in arrows))
+    name_groups = list(dict.fromkeys(arrow.names for arrow in arrows))
     box = _box(entities, arrows)
     return {
         "times": packing.add((times_ns[is_kept] - first_ns) / 1e9, "f8"),
@@ -563,11 +569,11 @@ def scene_value(
         "low": box.low.tolist(),
         "high": (box.low + box.size).tolist(),
         "entities": [
-            _entity_value(identifier, by_frame, len(frames), result_numbers, box, packing)
-            for identifier, by_frame in sorted(entities.items(), key=_drawing_order)
+            _entity_value(identifier, entity_by_frame, len(frames), result_numbers, box, packing)
+            for identifier, entity_by_frame in sorted(entities.items(), key=_drawing_order)
         ],
         "violations": {
-            "frames": packing.add(np.array([number for number, _ in numbered_arrows]), "i4"),
+            "frames": packing.add(np.array([frame_index for frame_index, _ in numbered_arrows]), "i4"),
             "points": packing.add(box.steps(_join_points([arrow.ends for arrow in arrows])), "u2"),
             "labels": [arrow.label for arrow in arrows],
             "atoms": [arrow.atom for arrow in arrows],
@@ -575,8 +581,8 @@ def scene_value(
             "holds": packing.add(np.array([arrow.holds for arrow in arrows]), "u1"),
             "outlines": outlines,
             "outline": packing.add(np.array([outlines.index(arrow.dashes) for arrow in arrows]), "i4"),
-            "names": names,
-            "name": packing.add(np.array([names.index(arrow.names) for arrow in arrows]), "i4"),
+            "names": name_groups,
+            "name": packing.add(np.array([name_groups.index(arrow.names) for arrow in arrows]), "i4"),
             # times of earlier samples, for arrows at those
             "moments": [
                 None if arrow.moment_ns is None else (arrow.moment_ns - first_ns) / 1e9 for arrow in arrows
@@ -584,7 +590,10 @@ def scene_value(
             # indices of result and node on the page, -1 for a node that the page leaves out
             "places": packing.add(
                 np.array(
-                    [places.get((arrow.result, arrow.node), (results[arrow.result], -1)) for arrow in arrows]
+                    [
+                        places.get((arrow.result, arrow.node), (page_index_by_result[arrow.result], -1))
+                        for arrow in arrows
+                    ]
                 ),
                 "i4",
             ),
@@ -600,18 +609,23 @@ def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
 def _entities(frames: Sequence[SceneFrame]) -> Mapping[str, dict[int, DrawnEntity]]:
     """Return the drawn entities by id and by number of the frame."""
     frames_by_entity: dict[str, dict[int, DrawnEntity]] = {}
-    for number, frame in enumerate(frames):
+    for frame_index, frame in enumerate(frames):
         for identifier, entity in frame.entities.items():
-            frames_by_entity.setdefault(identifier, {})[number] = entity
+            frames_by_entity.setdefault(identifier, {})[frame_index] = entity
     return frames_by_entity
 
 
 def _box(entities: Mapping[str, Mapping[int, DrawnEntity]], arrows: Sequence[DrawnViolation]) -> _Box:
-    rings = [ring for by_frame in entities.values() for entity in by_frame.values() for ring in entity.rings]
-    everything = _join_points([*rings, *(arrow.ends for arrow in arrows)])
-    if not len(everything):
+    rings = [
+        ring
+        for entity_by_frame in entities.values()
+        for entity in entity_by_frame.values()
+        for ring in entity.rings
+    ]
+    points = _join_points([*rings, *(arrow.ends for arrow in arrows)])
+    if not len(points):
         return _Box(np.zeros(2), np.ones(2))
-    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
+    low, size = points.min(axis=0), np.ptp(points, axis=0)
     return _Box(low, np.where(size > 0.0, size, 1.0))
 
 
@@ -633,27 +647,27 @@ def _entity_value(
     Args:
         results: indices of the page's results, in the order of the shades.
     """
-    forms: dict[tuple[tuple[int, ...], bool], int] = {}
+    form_numbers: dict[tuple[tuple[int, ...], bool], int] = {}
     form_of_frame = np.full(frame_count, _ABSENT, np.int64)
     for frame, entity in entities.items():
         form = tuple(len(ring) for ring in entity.rings), entity.is_last
-        form_of_frame[frame] = forms.setdefault(form, len(forms))
-    kind, _, name = identifier.partition("/")
+        form_of_frame[frame] = form_numbers.setdefault(form, len(form_numbers))
+    entity_kind, _, name = identifier.partition("/")
     rings = [ring for entity in entities.values() for ring in entity.rings]
     has_shades = all(entity.shades for entity in entities.values())
-    shades = [
+    frame_shades = [
         np.frombuffer(entity.shades, np.uint8)[list(results)] for entity in entities.values() if has_shades
     ]
     return {
-        "kind": kind,
+        "kind": entity_kind,
         "name": name,
-        "forms": [rings for rings, _ in forms],
+        "forms": [rings for rings, _ in form_numbers],
         # forms of the last outline of a missing object
-        "last": [form_number for (_, is_last), form_number in forms.items() if is_last],
+        "last": [form_number for (_, is_last), form_number in form_numbers.items() if is_last],
         "form": packing.add(form_of_frame, "u2"),
         "points": packing.add(box.steps(_join_points(rings)), "u2"),
         "colours": packing.add(np.array([entity.colour for entity in entities.values()]), "u1"),
-        "shades": packing.add(np.array(shades), "u1") if has_shades else None,
+        "shades": packing.add(np.array(frame_shades), "u1") if has_shades else None,
     }
 
 
@@ -694,14 +708,14 @@ class _Owner(NamedTuple):
     """The candidate that a map belongs to.
 
     Attributes:
-        edge: index of the edge in the decision.
-        place: index of the candidate in the edge.
+        edge_index: index of the edge in the decision.
+        candidate_index: index of the candidate in the edge.
         turn: turn of the object in radians.
         is_joint: whether the edge takes several motions.
     """
 
-    edge: int
-    place: int
+    edge_index: int
+    candidate_index: int
     candidate: PlanCandidate
     turn: float
     is_joint: bool
@@ -712,10 +726,10 @@ class _Owner(NamedTuple):
         candidate = self.candidate
         if not candidate.HasField("target"):
             return None
-        nearest = min(
+        nearest_turn = min(
             (map_turn.turn for map_turn in candidate.maps), key=lambda turn: abs(turn - candidate.target.turn)
         )
-        return candidate.target if nearest == self.turn else None
+        return candidate.target if nearest_turn == self.turn else None
 
 
 class _Drawn(NamedTuple):
@@ -751,20 +765,20 @@ def decisions_value(
     """
     maps_by_decision = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept_maps = _maps_that_fit([drawn_map for maps in maps_by_decision for drawn_map in maps], most_cells)
-    others = {redone_decision.number: redone_decision for redone_decision in redone.decisions}
+    redone_by_number = {redone_decision.number: redone_decision for redone_decision in redone.decisions}
     decisions = []
     for decision, maps in zip(plan.decisions, maps_by_decision, strict=True):
-        values = [_map_value(drawn_map, packing) for drawn_map in maps if id(drawn_map) in kept_maps]
-        value = _decision_value(decision, values, first_ns, packing)
-        redone_decision = others.get(decision.number)
+        map_values = [_map_value(drawn_map, packing) for drawn_map in maps if id(drawn_map) in kept_maps]
+        facts = _decision_value(decision, map_values, first_ns, packing)
+        redone_decision = redone_by_number.get(decision.number)
         if redone_decision is not None and _outcome(redone_decision) != _outcome(decision):
             redone_values = [
                 _map_value(drawn_map, packing)
                 for drawn_map in _maps_of(redone, redone_decision)
                 if drawn_map.is_chosen
             ]
-            value["redone"] = _decision_value(redone_decision, redone_values, first_ns, packing)
-        decisions.append(value)
+            facts["redone"] = _decision_value(redone_decision, redone_values, first_ns, packing)
+        decisions.append(facts)
     return {"decisions": decisions, "maps_left_out": sum(map(len, maps_by_decision)) - len(kept_maps)}
 
 
@@ -775,10 +789,10 @@ def _outcome(decision: PlanDecision) -> tuple[object, ...]:
 def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
     """Return the ids (`id`) of the maps within the limit. Maps of chosen targets come first."""
     kept_maps: set[int] = set()
-    cells = 0
+    cell_count = 0
     for drawn_map in sorted(maps, key=lambda drawn_map: not drawn_map.is_chosen):
-        if cells + drawn_map.values.size <= most_cells:
-            cells += drawn_map.values.size
+        if cell_count + drawn_map.values.size <= most_cells:
+            cell_count += drawn_map.values.size
             kept_maps.add(id(drawn_map))
     return kept_maps
 
@@ -786,10 +800,10 @@ def _maps_that_fit(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
 def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
     """Yield the maps of a decision, or the maps of its time if the log does not record the owners of maps."""
     owners = {
-        named.number: _Owner(edge, place, candidate, named.turn, considered.joint)
-        for edge, considered in enumerate(decision.considered)
-        for place, candidate in enumerate(considered.candidates)
-        for named in candidate.maps
+        map_reference.number: _Owner(edge_index, candidate_index, candidate, map_reference.turn, edge.joint)
+        for edge_index, edge in enumerate(decision.considered)
+        for candidate_index, candidate in enumerate(edge.candidates)
+        for map_reference in candidate.maps
     }
     owned_grids: list[tuple[_Owner | None, Grid]] = [
         (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
@@ -806,39 +820,39 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
             yield drawn_map
 
 
-def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
+def _is_chosen(owner: _Owner | None, decision: PlanDecision, map_count: int) -> bool:
     """Return whether a decision's target was chosen on a map. Without an owner, an only map is the one."""
     if not decision.HasField("target"):
         return False
     if owner is None:
-        return maps == 1
-    is_last = owner.edge == len(decision.considered) - 1
+        return map_count == 1
+    is_last = owner.edge_index == len(decision.considered) - 1
     return is_last and owner.candidate.chosen and owner.target is not None
 
 
 def _draw_map(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
     """Return a map as numbers; None if its message has inconsistent or empty sizes."""
     fields = map_fields(grid)
-    numbers = fields.get("robustness")
-    if numbers is None:
+    robustness = fields.get("robustness")
+    if robustness is None:
         return None
-    rows, columns = numbers.shape
+    rows, columns = robustness.shape
     x, y = grid.pose.position.x, grid.pose.position.y
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
     if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
         return None
-    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen, fields)
+    return _Drawn(robustness.astype(np.float64), (x, y), high, owner, is_chosen, fields)
 
 
-def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
-    finite = drawn.values[np.isfinite(drawn.values)]
-    value: dict[str, Any] = {
-        "columns": drawn.values.shape[1],
-        "low": drawn.low,
-        "high": drawn.high,
+def _map_value(drawn_map: _Drawn, packing: Packing) -> Mapping[str, Any]:
+    finite = drawn_map.values[np.isfinite(drawn_map.values)]
+    map_facts: dict[str, Any] = {
+        "columns": drawn_map.values.shape[1],
+        "low": drawn_map.low,
+        "high": drawn_map.high,
         "scale": float(np.abs(finite).max(initial=0.0)),
-        "values": packing.add(singles(drawn.values), "f4"),
-        "chosen": drawn.is_chosen,
+        "values": packing.add(singles(drawn_map.values), "f4"),
+        "chosen": drawn_map.is_chosen,
         "edge": None,
         "candidate": None,
         "object": "",
@@ -847,15 +861,15 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         "rule": "",
         "joint": False,
     }
-    owner = drawn.owner
+    owner = drawn_map.owner
     if owner is None:
-        return value
+        return map_facts
     candidate = owner.candidate
     turn_text = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
-    value |= _layer_values(drawn, owner, packing)
-    return value | {
-        "edge": owner.edge,
-        "candidate": owner.place,
+    map_facts |= _layer_values(drawn_map, owner, packing)
+    return map_facts | {
+        "edge": owner.edge_index,
+        "candidate": owner.candidate_index,
         "object": candidate.object,
         "title": f"{candidate.object}{turn_text}",
         "target": None if owner.target is None else _target_value(owner.target),
@@ -864,34 +878,37 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
     }
 
 
-def _layer_values(drawn: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:
+def _layer_values(drawn_map: _Drawn, owner: _Owner, packing: Packing) -> dict[str, Any]:
     """Return the limiting conjunct and the blocking cause of each cell, and layers of the chosen map."""
-    if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
+    if not {"limited_by", "blocked_by"} <= drawn_map.fields.keys() or drawn_map.values.size > _MOST_LAYERED:
         return {}
     candidate = owner.candidate
-    named = [
+    numbered_conjuncts = [
         (number, f"{number}: {conjunct.text}", plain(demand_words(conjunct)))
         for number, conjunct in enumerate(candidate.conjuncts, 1)
     ]
     layers = [
-        {"number": number, "title": title, "values": packing.add(drawn.fields[name], "f4")}
-        for number, name, title in named
-        if drawn.is_chosen and name in drawn.fields and np.ptp(drawn.fields[name]) != 0.0
+        {"number": number, "title": title, "values": packing.add(drawn_map.fields[name], "f4")}
+        for number, name, title in numbered_conjuncts
+        if drawn_map.is_chosen and name in drawn_map.fields and np.ptp(drawn_map.fields[name]) != 0.0
     ]
-    value: dict[str, Any] = {
-        "limited": packing.add(drawn.fields["limited_by"], "u2"),
-        "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
+    layer_facts: dict[str, Any] = {
+        "limited": packing.add(drawn_map.fields["limited_by"], "u2"),
+        "blocked": packing.add(drawn_map.fields["blocked_by"], "u2"),
         "limits": [sentence_parts(demand_words(conjunct)) for conjunct in candidate.conjuncts],
         "blocks": [sentence_parts(cause.words) for cause in candidate.causes],
         "layers": layers,
     }
     if owner.target is not None:
-        value["at_target"] = [_finite(conjunct, "at_target") for conjunct in candidate.conjuncts]
-    if drawn.is_chosen and candidate.HasField("least_way") and "way" in drawn.fields:
-        value |= {"way": packing.add(drawn.fields["way"], "f4"), "least_way": candidate.least_way}
-    if drawn.is_chosen and candidate.HasField("least_room") and "room" in drawn.fields:
-        value |= {"room": packing.add(drawn.fields["room"], "f4"), "least_room": candidate.least_room}
-    return value
+        layer_facts["at_target"] = [_finite(conjunct, "at_target") for conjunct in candidate.conjuncts]
+    if drawn_map.is_chosen and candidate.HasField("least_way") and "way" in drawn_map.fields:
+        layer_facts |= {"way": packing.add(drawn_map.fields["way"], "f4"), "least_way": candidate.least_way}
+    if drawn_map.is_chosen and candidate.HasField("least_room") and "room" in drawn_map.fields:
+        layer_facts |= {
+            "room": packing.add(drawn_map.fields["room"], "f4"),
+            "least_room": candidate.least_room,
+        }
+    return layer_facts
 
 
 def _finite(message: Message, name: str) -> float | None:
@@ -904,7 +921,7 @@ def _decision_value(
     decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
 ) -> dict[str, Any]:
     aim = aim_of(decision)
-    value: dict[str, Any] = {
+    facts: dict[str, Any] = {
         **json_fields(decision, "number", "specification", "reason"),
         "time": (decision.time_ns - first_ns) / 1e9,
         "kind": kind_text(decision),
@@ -917,13 +934,13 @@ def _decision_value(
     }
     if decision.HasField("outcome"):
         outcome = decision.outcome
-        value["outcome"] = {
+        facts["outcome"] = {
             **json_fields(outcome, "succeeded", "reason"),
             "time": (outcome.end_ns - first_ns) / 1e9,
             "states": list(outcome.states),
             "travelled": packing.add(np.array(outcome.travelled), "f8"),
         }
-    return value
+    return facts
 
 
 def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
@@ -940,20 +957,20 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
 
 
 def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
-    best = best_robustness(candidate)
-    limits = [
+    largest_robustness = best_robustness(candidate)
+    limit_bars = [
         (conjunct.limits, sentence_parts(demand_words(conjunct)))
         for conjunct in limiting_conjuncts(candidate)
     ]
-    blocks = [(cause.cells, sentence_parts(cause.words)) for cause in candidate.causes]
+    cause_bars = [(cause.cells, sentence_parts(cause.words)) for cause in candidate.causes]
     return {
         **json_fields(candidate, "object", "rejected"),
-        "best": best if math.isfinite(best) else None,
+        "best": largest_robustness if math.isfinite(largest_robustness) else None,
         "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
-        "cells": sum(cells for cells, _ in (*limits, *blocks)),
+        "cells": sum(cells for cells, _ in (*limit_bars, *cause_bars)),
         "bars": [
             {"kind": kind, "words": words, "cells": cells}
-            for kind, bars in (("limited by", limits), ("blocked", blocks))
+            for kind, bars in (("limited by", limit_bars), ("blocked", cause_bars))
             for cells, words in bars[:MOST_LISTED]
         ],
         "room": room_sentence(candidate),
@@ -965,11 +982,11 @@ def _target_value(target: PlanTarget) -> Mapping[str, Any]:
     """Return a target in words, with the points of its path if all are finite."""
     points = [target.x, target.y, *target.waypoints]
     is_drawn = bool(np.isfinite(points).all())
-    turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
+    turn_text = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
     return {
         "object": target.object,
         "at": points[:2] if is_drawn else None,
-        "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
+        "words": f"({target.x:.4g}, {target.y:.4g}){turn_text}",
         "turn": target.turn,
         "robustness": _finite(target, "robustness"),
         "way": points[2:] if is_drawn else [],

@@ -21,19 +21,19 @@ def ticks_value(payloads: Sequence[bytes], first_ns: int) -> Sequence[Mapping[st
     """
     ticks = _iter_ticks(payloads[:MOST_TICKS])
     values = []
-    for nodes, group in groupby(ticks, key=_shape):
-        stretch = list(group)
+    for nodes, tick_group in groupby(ticks, key=_shape):
+        equal_ticks = list(tick_group)
         depths: list[int] = []
         for index, (_, _, parent) in enumerate(nodes):
             depths.append(depths[parent] + 1 if parent is not None and parent < index else 0)
         values.append(
             {
                 "nodes": [
-                    {"name": name, "type": kind, "depth": depth}
-                    for (name, kind, _), depth in zip(nodes, depths, strict=True)
+                    {"name": name, "type": node_type, "depth": depth}
+                    for (name, node_type, _), depth in zip(nodes, depths, strict=True)
                 ],
-                "times": [(tick.time_ns - first_ns) / 1e9 for tick in stretch],
-                "statuses": ["".join(str(node.status % 10) for node in tick.nodes) for tick in stretch],
+                "times": [(tick.time_ns - first_ns) / 1e9 for tick in equal_ticks],
+                "statuses": ["".join(str(node.status % 10) for node in tick.nodes) for tick in equal_ticks],
             }
         )
     return values

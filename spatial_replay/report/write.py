@@ -69,8 +69,10 @@ class Collector:
 
     def add(self, messages: Messages) -> None:
         """Add the next messages of the replay."""
-        collected = messages.of_topics(_COLLECTED)
-        for topic, (_, sequence, time_ns, _, payload) in zip(collected.topics, collected.rows(), strict=True):
+        report_messages = messages.of_topics(_COLLECTED)
+        for topic, (_, sequence, time_ns, _, payload) in zip(
+            report_messages.topics, report_messages.rows(), strict=True
+        ):
             match topic:
                 case log_topics.AUTOMATON:
                     state = AutomatonState.FromString(payload)
@@ -169,10 +171,10 @@ def _results(
     replay: Replay, replayed: Replayed, collector: Collector, declared: Mapping[str, str]
 ) -> Iterator[ReportedResult]:
     # under the paper's semantics, none can be explained
-    explained = frozenset(worst_results(replayed.results) if replayed.semantics == "ltlf" else ())
+    explained_indices = frozenset(worst_results(replayed.results) if replayed.semantics == "ltlf" else ())
     for index, result in enumerate(replayed.results):
         tree, unit = replay.trees[index], unit_of(result.formula, declared)
-        is_explained = index in explained
+        is_explained = index in explained_indices
         witness = (
             (result.causes[0].robustness_witness if result.causes else result.worst) if is_explained else None
         )
@@ -236,11 +238,11 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
     decision = None if isinstance(diff, SpecificationDiff) else diff.decision
     is_same = "nothing differs" if diff.is_empty else "different"
     title = element("div", element("h1", text(" → ".join(labels))), **{"class": "title"})
-    about = element(
+    about_html = element(
         "p", text(f"{_about(diff)} · {is_same} · spatial-replay {__version__}"), **{"class": "about"}
     )
     parts = [
-        element("header", title, about, **{"class": "top"}),
+        element("header", title, about_html, **{"class": "top"}),
         element(
             "main",
             panel("verdicts", "What differs", *_changes(diff, (a.replayed.first_ns, b.replayed.first_ns))),
@@ -289,8 +291,8 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
             if spec_diff.edits or spec_diff.is_different:
                 verdicts = spec_diff.old.verdict, spec_diff.new.verdict
                 yield _change(spec_diff.title, verdicts, list(spec_diff.sentences(diff.first_ns)), first_ns)
-        for names, where in ((diff.removed, diff.old), (diff.added, diff.new)):
-            yield from (element("p", text(f"{name}: only in {where.filename}")) for name in names)
+        for names, specification in ((diff.removed, diff.old), (diff.added, diff.new)):
+            yield from (element("p", text(f"{name}: only in {specification.filename}")) for name in names)
         return
     if diff.is_empty:
         return
@@ -301,9 +303,9 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
         yield _change("who moved differently", (), diff.movements, first_ns)
     if diff.signals:
         yield _change("signals with other values", (), diff.signal_changes, first_ns)
-    for which, names in (("A", diff.only_a), ("B", diff.only_b)):
+    for run_name, names in (("A", diff.only_a), ("B", diff.only_b)):
         if names:
-            yield element("p", text(f"Only in {which}: {', '.join(names)}"))
+            yield element("p", text(f"Only in {run_name}: {', '.join(names)}"))
     if diff.decision is not None:
         title = f"decision {diff.decision.number} is the first that differs"
         yield _change(title, (), list(map(Sentence, diff.decision.lines())), first_ns)
@@ -313,8 +315,8 @@ def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> 
     """Return a panel per run for the first decision that differs, to be filled by the page's script."""
     if decision is None:
         return []
-    names = zip(("decision-a", "decision-b"), labels, strict=True)
-    return [panel(name, text(f"{label}: decision {decision.number}")) for name, label in names]
+    names_and_labels = zip(("decision-a", "decision-b"), labels, strict=True)
+    return [panel(name, text(f"{label}: decision {decision.number}")) for name, label in names_and_labels]
 
 
 def _is_flipped(old: SpecResult, new: SpecResult) -> bool:
@@ -325,11 +327,11 @@ def _change(
     title: str, verdicts: Sequence[str], sentences: Sequence[Sentence], first_ns: tuple[int, int]
 ) -> Html:
     """Return one change with its verdict, or with both verdicts if they differ."""
-    marks = [mark for verdict in dict.fromkeys(verdicts) for mark in (text(" → "), chip(verdict))][1:]
-    name = element("span", text(title), **{"class": "name"})
-    summary = element("div", *marks, name, **{"class": "summary"})
-    lines = [element("p", *_with_run(sentence, first_ns)) for sentence in sentences]
-    return element("div", summary, *lines, **{"class": "verdict change"})
+    verdict_chips = [mark for verdict in dict.fromkeys(verdicts) for mark in (text(" → "), chip(verdict))][1:]
+    title_html = element("span", text(title), **{"class": "name"})
+    summary = element("div", *verdict_chips, title_html, **{"class": "summary"})
+    sentence_lines = [element("p", *_with_run(sentence, first_ns)) for sentence in sentences]
+    return element("div", summary, *sentence_lines, **{"class": "verdict change"})
 
 
 def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
@@ -346,22 +348,22 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
     """Return the pairs of curves, the alignment of both clocks, and the time at which the page opens."""
     first_ns: int | None = None
     decision: DecisionDiff | None = None
-    nodes: list[dict[str, Any]] = []
-    places = [_places(report) for report in (a, b)]
+    node_pairs: list[dict[str, Any]] = []
+    page_places = [_places(report) for report in (a, b)]
     if isinstance(diff, SpecificationDiff):
-        knots = [[0.0, (a.replayed.first_ns - b.replayed.first_ns) / 1e9]]
+        clock_knots = [[0.0, (a.replayed.first_ns - b.replayed.first_ns) / 1e9]]
         for spec in diff.specs:
             if first_ns is None and spec.first is not None:
                 first_ns = spec.first.time_ns
             titles = spec.old.title, spec.new.title
-            nodes += _node_pairs(spec.title, titles, (spec.old, spec.new), places)
+            node_pairs += _node_pairs(spec.title, titles, (spec.old, spec.new), page_places)
             for edit in spec.cause:
                 if edit.old_nodes and edit.new_nodes and edit.old_nodes[0]:
-                    pair = edit.old_nodes[0], edit.new_nodes[0]
-                    nodes += _node_pair(f"{spec.title}: {edit.new}", titles, pair, places)
+                    node_ids = edit.old_nodes[0], edit.new_nodes[0]
+                    node_pairs += _node_pair(f"{spec.title}: {edit.new}", titles, node_ids, page_places)
     else:
         decision = diff.decision
-        knots = [
+        clock_knots = [
             [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
             for knot in diff.alignment.knots
         ]
@@ -374,14 +376,14 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
                 *(object_diff.first_ns for object_diff in diff.signals),
             ],
         )
-        known_ns = ([at for at in times_ns if at is not None] for times_ns in candidates_ns)
-        first_ns = next((min(times_ns) for times_ns in known_ns if times_ns), None)
+        time_groups = ([time_ns for time_ns in times_ns if time_ns is not None] for times_ns in candidates_ns)
+        first_ns = next((min(times_ns) for times_ns in time_groups if times_ns), None)
         for run_spec in diff.specs:
             titles = run_spec.a.title, run_spec.b.title
-            nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)
+            node_pairs += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), page_places)
     return {
-        "knots": knots,
-        "nodes": nodes,
+        "knots": clock_knots,
+        "nodes": node_pairs,
         "decision": decision and decision.number,
         "first": None if first_ns is None else (first_ns - a.replayed.first_ns) / 1e9,
     }
@@ -395,7 +397,7 @@ def _places(report: RunReport) -> _Places:
     return {
         reported.result.title: (
             index,
-            {node: place for place, node in enumerate(shown_nodes(reported.result.formula))},
+            {node: node_index for node_index, node in enumerate(shown_nodes(reported.result.formula))},
         )
         for index, reported in enumerate(report.drawn)
     }
@@ -406,22 +408,22 @@ def _node_pairs(
 ) -> Iterator[dict[str, Any]]:
     """Yield the pair of roots of two results, and the pairs of nodes with equal names."""
     yield from _node_pair(title, titles, (0, 0), places)
-    named = {node.name: node.id for node in reversed(results[1].nodes) if node.name and node.id}
-    seen: set[str] = set()
+    ids_by_name = {node.name: node.id for node in reversed(results[1].nodes) if node.name and node.id}
+    seen_names: set[str] = set()
     for node in results[0].nodes[1:]:
-        if node.name in named and node.name not in seen:
-            seen.add(node.name)
-            yield from _node_pair(node.name, titles, (node.id, named[node.name]), places)
+        if node.name in ids_by_name and node.name not in seen_names:
+            seen_names.add(node.name)
+            yield from _node_pair(node.name, titles, (node.id, ids_by_name[node.name]), places)
 
 
 def _node_pair(
     label: str, titles: tuple[str, str], ids: tuple[int, int], places: Sequence[_Places]
 ) -> Iterator[dict[str, Any]]:
     """Yield a pair of nodes by their indices on the page, if the page shows both."""
-    shown_nodes_of_pair = [
+    page_nodes = [
         [places_of_report[title][0], places_of_report[title][1][identifier]]
         for places_of_report, title, identifier in zip(places, titles, ids, strict=True)
         if title in places_of_report and identifier in places_of_report[title][1]
     ]
-    if len(shown_nodes_of_pair) == 2:
-        yield {"label": label, "a": shown_nodes_of_pair[0], "b": shown_nodes_of_pair[1]}
+    if len(page_nodes) == 2:
+        yield {"label": label, "a": page_nodes[0], "b": page_nodes[1]}
