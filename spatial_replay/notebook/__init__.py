@@ -31,7 +31,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
 )
 """Views by the module whose types they register, relative to this package.
 
-Packages that import this one register their own views."""
+Packages that import this package register their own views."""
 
 
 @singledispatch

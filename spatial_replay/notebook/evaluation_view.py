@@ -299,7 +299,7 @@ def _trace_title(trace: Trace) -> str:
 
 
 def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
-    """Return the outlines of the observation in the only row."""
+    """Return the outlines of one observation; `rows` has only its row."""
     return rings_of(trace.footprints.select(rows), 0.0).rings_of(0)
 
 
@@ -330,7 +330,7 @@ def _of_evaluation(evaluation: Evaluation) -> Any:
         for result in evaluation.results
     ]
     frame = pandas.DataFrame(rows, columns=[*RESULT_COLUMNS, "doubts"])
-    # pandas' nullable integers: a missing time would turn the other times into floats, which lose nanoseconds
+    # nullable integers: with a missing time, other times would become floats, which lose nanoseconds
     return frame.astype({"verdict": str} | dict.fromkeys(RESULT_TIMES, "Int64"))
 
 
@@ -434,7 +434,7 @@ def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
 
 
 def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
-    """Return the `most` worst results, or all results in their order if they are fewer."""
+    """Return the `most` worst results; if there are no more results, return all in their order."""
     if len(results) <= most:
         return results
     return [results[place] for place in worst_first(results)[:most]]
@@ -531,7 +531,7 @@ def _curves(result: SpecResult) -> list[_Curve]:
 
 
 def _finite(result: SpecResult, node: int) -> Floats:
-    """Return the values of a node, with NaN instead of infinite ones."""
+    """Return the values of a node, with NaN instead of infinite values."""
     values = result.series[node, 0]
     return np.where(np.isfinite(values), values, np.nan)
 
@@ -545,7 +545,7 @@ def _limits(curves: Sequence[Floats]) -> tuple[float, float]:
 
 
 def _name_curves(ax: Axes, curves: Sequence[_Curve], has_band: bool) -> None:
-    """Write each curve's name to its right, and the name of the interval at the bottom, without overlap."""
+    """Write names to the right of the curves, and the interval's name at the bottom, without overlap."""
     axis_low, axis_high = ax.get_ylim()
     end_heights = [(_last(curve.values) - axis_low) / (axis_high - axis_low) for curve in curves]
     *label_heights, band_height = _apart([*end_heights, 0.0])
@@ -569,13 +569,13 @@ def _draw_key(
 
 
 def _last(values: Floats) -> float:
-    """Return the last finite number of a curve; 0 if it has none."""
+    """Return the last finite number of a curve; 0 without a finite number."""
     finite = values[~np.isnan(values)]
     return float(finite[-1]) if len(finite) else 0.0
 
 
 def _apart(heights: Sequence[float]) -> list[float]:
-    """Return places moved apart by at least `_GAP`, in the same order, and at most 1."""
+    """Move heights apart by at least `_GAP`. They keep their order, and none exceeds 1."""
     moved_heights = list(heights)
     height_order = sorted(range(len(heights)), key=heights.__getitem__)
     below = -np.inf
@@ -594,7 +594,7 @@ def _title(result: SpecResult) -> str:
 
 _MOST_STATES: Final = 40
 _MOST_CUBES: Final = 100
-"""Limits of states and of cubes on arrows, up to which a cell's output draws an automaton."""
+"""Limits of states and of cubes on arrows; a cell's output does not draw a larger automaton."""
 _MOST_LINES: Final = 200
 """Limit of lines in the list of transitions."""
 _ARROW: Final = hexadecimal(NEUTRAL)
@@ -606,7 +606,7 @@ _LONGEST_SIDE: Final = 40.0
 
 @html.register(Automaton)
 def automaton_html(automaton: Automaton) -> Html:
-    """Return the size of an automaton, and for a small one its drawing and its transitions as text."""
+    """Return the size of an automaton; for a small automaton also its drawing and its transitions."""
     title = element("div", element("b", automaton.name), quiet(f" {size_words(automaton)}"))
     if _is_large(automaton):
         return element("div", title, quiet("too large to be drawn here; plot() draws it, to_dot() writes it"))

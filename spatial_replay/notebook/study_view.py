@@ -44,12 +44,12 @@ _MOST_RUNS: Final = 50
 _MOST_LINES: Final = 40
 """Limit of runs with a line at their change of verdict."""
 _MOST_MARGINS: Final = 10_000
-"""Limit of computed margins, which lowers the resolution for many runs, but not below 25 values."""
+"""Limit of computed margins. With many runs it lowers the resolution, but not below 25 values."""
 
 
 @html.register(Tuning)
 def tuning_html(tuning: Tuning) -> Html:
-    """Return the constants found with the runs by margin, or the reason why no constants fit."""
+    """Return the tuned constants and the runs by margin, or the reason why no constants fit."""
     name = element("b", tuning.specification.filename)
     if tuning.conflict is not None:
         failure_text = "no values fit" if tuning.conflict.is_proven else "found no values that fit"
@@ -86,7 +86,7 @@ def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes
 
     Args:
         names: the constants; without names, the first two.
-        points: number of values of each constant; None for 25 to 60, more for fewer runs.
+        points: number of values per constant; None for 25 to 60 values, with more values for fewer runs.
 
     Raises:
         UsageError: a constant was not varied, or matplotlib is not installed.
@@ -100,8 +100,8 @@ def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes
 def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """Draw the values of constants for which runs have the right verdict.
 
-    One constant gives a curve for each run. Two constants give the least margin as colours, and a line for
-    each run where its verdict changes. Lines of bad runs are dashed. A circle marks the values found.
+    One constant gives a curve for each run. Two constants give the least margin as colours, and for each
+    run a line where its verdict changes. Lines of bad runs are dashed. A circle marks the tuned values.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -114,7 +114,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
 
 
 def write_surface(tuning: Tuning, output: Path) -> None:
-    """Write a picture (.png, .svg) of the margins over the first two constants, or a page (.html) of them.
+    """Write a picture (.png, .svg) of the margins over the first two constants, or a page (.html) with it.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -146,7 +146,7 @@ def _draw_curves(surface: Surface, ax: Axes) -> None:
 def _draw_colours(surface: Surface, ax: Axes) -> None:
     least_margins = _finite(surface.least)
     colour_limit = float(np.abs(least_margins).max()) or 1.0
-    # values that fit often have margins little above 0, which margins far below 0 would fade
+    # values that fit often have margins slightly above 0, and margins far below 0 would make them pale
     colour_limit = (
         min(colour_limit, 3 * float(least_margins.max())) if least_margins.max() > 0 else colour_limit
     )
@@ -192,7 +192,7 @@ def _name_runs(surface: Surface, ax: Axes) -> None:
 
 
 def _finite(margins: Floats) -> Floats:
-    """Return margins, with infinite ones replaced by the largest finite magnitude."""
+    """Replace infinite margins by the largest finite magnitude."""
     magnitudes = np.abs(margins[np.isfinite(margins)])
     largest = float(magnitudes.max()) if len(magnitudes) else 1.0
     clipped: Floats = np.clip(margins, -largest, largest)
@@ -373,7 +373,7 @@ def draw_map(
 
 
 def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
-    """Return the index of the target's orientation, or without a target that of the best free cell."""
+    """Return the index of the target's orientation; without a target, of the best free cell's orientation."""
     if target_turn is not None:
         return int(np.abs(gradient.turns - target_turn).argmin())
     best_by_turn = np.where(gradient.blocked == FREE, gradient.robustness, -np.inf).max(axis=(1, 2))
@@ -381,7 +381,7 @@ def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
 
 
 def _colour_limit(maps: Sequence[GradientMap]) -> float:
-    """Return the greatest absolute robustness in some maps, which gets the full colours."""
+    """Return the greatest absolute robustness in some maps, which has the full colours."""
     values = np.abs(np.concatenate([gradient.values.ravel() for gradient in maps]))
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 
@@ -392,7 +392,7 @@ def _draw_cells(
     """Draw the cells of one orientation.
 
     Args:
-        colour_limit: absolute robustness that gets the full colours.
+        colour_limit: absolute robustness with the full colours.
         margin: robustness at which a line is drawn.
     """
     grid = gradient.grid

@@ -53,11 +53,17 @@ from spatial_replay.text import Sentence, json_fields, json_number, with_unit
 from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
-"""Limit of results on a page without counts and filters; pages with more unfold only one explanation."""
+"""Limit of results on a page without counts and filters.
+
+A page with more results unfolds only one explanation.
+"""
 _MOST_MARKED: Final = 200
 """Limit of events whose samples are always drawn; the earliest events come first."""
 MOST_DRAWN: Final = 24
-"""Limit of results with explanation, tree and curves; the worst come first. All results have a verdict."""
+"""Limit of results with explanation, tree and curves; the worst results come first.
+
+All results have a verdict.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +100,11 @@ class ReportedResult:
 
     @property
     def decided(self) -> WitnessStep | None:
-        """The step that the page opens at; None without an explanation.
+        """The step at which the page opens; None without an explanation.
 
         It is the end of the deciding path, or of the path to the atom closest to a missed response. If an
-        operator on the path takes its number from an earlier sample, it is that operator, because it did not
-        fail before.
+        operator on the path takes its number from an earlier sample, the page opens at that operator, because
+        the operator did not fail before.
         """
         if self.witness is None:
             return None
@@ -109,7 +115,7 @@ class ReportedResult:
 
     @property
     def deciding(self) -> DecidingAtom | None:
-        """The deciding atom, or for a missed response the atom that came closest."""
+        """The deciding atom, or for a missed response the atom closest to fulfilling it."""
         if self.witness is None:
             return None
         return self.witness.deciding if self.witness.closest is None else self.witness.closest[0]
@@ -134,9 +140,9 @@ class RunReport:
         axes: axes of the source; samples are always y-up.
         results: the results of `replayed`.
         gaps: sentences about gaps of unknown results before or after a time.
-        redone: decisions of `plan --redo` that differ from the recorded ones; empty without any.
+        redone: decisions of `plan --redo` that differ from the recorded decisions.
         pictures: pictures of the camera, see `pictures_of`.
-        planned_for: specification file of the decisions, if the report evaluates another one; else "".
+        planned_for: specification file of the decisions, if the report evaluates another file; else "".
         ticks: messages of the robot's behaviour tree.
         obstacles: obstacles of the planner's workspace by name.
     """
@@ -346,10 +352,10 @@ def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
 
 
 def _shown_times(report: RunReport, times_ns: Integers, count_limit: int) -> Integers:
-    """Return times that the page always has: times in sentences, of further events, and of the scene.
+    """Return times that the page always has: times in sentences, starts of events, and times of the scene.
 
-    They are at most `count_limit`, unless the times in sentences alone exceed it. Frames of the scene are evenly
-    spaced. All panels have these times, because a cursor shows one sample.
+    There are at most `count_limit` times, unless the times in sentences alone exceed the limit. Frames of the
+    scene are evenly spaced. All panels have these times, because a cursor shows one sample.
     """
     events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: count_limit // 2]
     shown_ns = np.array(sorted({*report.marked_ns, *events_ns}), np.int64)

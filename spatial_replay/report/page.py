@@ -194,7 +194,7 @@ def _counts(report: RunReport) -> str:
 
 
 def _summary(reported: ReportedResult, first_ns: int) -> Html:
-    """Return the summary line of a result: verdict, requirement, robustness, and since when it is certain."""
+    """Return the summary line of a result: verdict, requirement, robustness, and start of its certainty."""
     result = reported.result
     number_texts = [f"robustness {reported.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
@@ -378,9 +378,9 @@ def document(
 
     Args:
         parts: content of the body above the playback bar.
-        facts: JSON data for the scripts, by the id of the element that holds them.
-        numbers: packed arrays for the scripts, by the id of the element that holds them.
-        script_name: script in browser/ that runs the others.
+        facts: JSON data for the scripts, by the id of their element.
+        numbers: packed arrays for the scripts, by the id of their element.
+        script_name: script in browser/ that runs the other scripts.
         has_pictures: whether the facts have pictures.
     """
     json_kind, packed_kind = "application/json", "application/octet-stream"

@@ -106,8 +106,8 @@ def packed_bytes(array: NDArray[Any], kind: Kind) -> bytes:
     """Return the numbers of an array, by rows, as bytes that compress well; read.js unpacks them.
 
     The bits of a number are read as an unsigned integer. Differences of consecutive integers are written
-    plane by plane: first the lowest bytes of all differences, then the next bytes, and so on. That compresses
-    to 42 % of the size of plain numbers.
+    plane by plane: first the lowest bytes of all differences, then the next bytes, and so on. These bytes
+    compress to 42 % of the size of plain numbers.
     """
     numbers = np.ascontiguousarray(array, f"<{kind}").ravel()
     codes = numbers.view(f"<u{numbers.itemsize}")
@@ -133,7 +133,7 @@ def singles(numbers: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def json_text(value: Any) -> str:
-    """Return JSON that is safe within a script element, whatever texts it contains.
+    """Return JSON that is safe within a script element, with any texts.
 
     Escapes keep texts such as `</script>` from ending the element:
     https://html.spec.whatwg.org/multipage/scripting.html#restrictions-for-contents-of-script-elements
@@ -158,8 +158,8 @@ _CODE: Final = re.compile(
 def sentence_parts(sentence: str) -> list[str]:
     """Split a sentence into alternating text and code, beginning with text.
 
-    Code stands between backquotes; names of objects in it may contain backquotes, too. Numbers in the text
-    are written as `with_signs` writes them.
+    Code is between backquotes; names of objects in code may contain backquotes, too. Numbers in the text have
+    the form of `with_signs`.
     """
     parts = _CODE.split(sentence)
     parts[::2] = map(with_signs, parts[::2])
@@ -195,7 +195,7 @@ def shown_nodes(formula: Formula) -> tuple[int, ...]:
 
 
 def initial_nodes(formula: Formula) -> frozenset[int]:
-    """Return the ids of the nodes without a temporal operator above: they count only at the first sample."""
+    """Return the ids of nodes without a temporal operator above, which count only at the first sample."""
     initial: set[int] = set()
     formulas: list[Formula] = []
     for identifier, parent, node in iter_nodes(formula):
@@ -314,7 +314,7 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
     """Return the drawing of an automaton: states with their positions, transitions with their guards.
 
     Args:
-        named: replaces a template's parameter by the object in a text.
+        named: function that replaces a template's parameter in a text by the object.
     """
     visited = {state for states in path.sets for state in states}
     drawing, short_automaton = draw_automaton(automaton, visited), abbreviate(automaton)
@@ -327,7 +327,7 @@ def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str]
             }
             for state in drawing.states
         ],
-        # arrows have the same words, and the legend is the same, as in a drawing by Graphviz
+        # arrows and legend have the same words as in a drawing by Graphviz
         "moves": [
             {**move._asdict(), "guard": named(move.guard), "label": named(short_move.guard)}
             for move, short_move in zip(
@@ -374,7 +374,7 @@ def _status(facts: Mapping[str, str]) -> str:
 
 
 MOST_PICTURES: Final = 60
-"""Limit of pictures in a page: those of deciding samples, and others at equal intervals."""
+"""Limit of pictures in a page: pictures of deciding samples, and pictures at equal intervals."""
 MOST_PICTURE_BYTES: Final = 1_500_000
 """Limit of all pictures of a page in Base64, characters."""
 
@@ -419,7 +419,7 @@ def pictures_of(
 
 
 def _image_topic(path: LogFile) -> str | None:
-    """Return the topic of images that layouts show, too: the video of the project, or else the first."""
+    """Return the image topic that layouts also show: `CAMERA_VIDEO`, or else the first image topic."""
     if not is_log(path):
         return None
     try:
@@ -583,7 +583,7 @@ def scene_value(
             "outline": packing.add(np.array([outlines.index(arrow.dashes) for arrow in arrows]), "i4"),
             "names": name_groups,
             "name": packing.add(np.array([name_groups.index(arrow.names) for arrow in arrows]), "i4"),
-            # times of earlier samples, for arrows at those
+            # times of earlier samples, for arrows at earlier samples
             "moments": [
                 None if arrow.moment_ns is None else (arrow.moment_ns - first_ns) / 1e9 for arrow in arrows
             ],
@@ -674,7 +674,7 @@ def _entity_value(
 MOST_CELLS: Final = 1_500_000
 """Limit of cells in all maps of a page together; maps of chosen targets come first."""
 _MOST_LAYERED: Final = 50_000
-"""Limit of cells of a map whose page has the layers of limits and causes."""
+"""Limit of cells of a map with layers of limits and causes on the page."""
 
 
 class ReportedDecisions:
@@ -722,7 +722,7 @@ class _Owner(NamedTuple):
 
     @property
     def target(self) -> PlanTarget | None:
-        """The candidate's target, if this map has the nearest orientation to it; else None."""
+        """The candidate's target, if this map has the orientation nearest to the target's; else None."""
         candidate = self.candidate
         if not candidate.HasField("target"):
             return None
@@ -761,7 +761,7 @@ def decisions_value(
     """Return the decisions as the page's script reads them, and the number of maps left out.
 
     Args:
-        redone: decisions of `plan --redo` that differ from the recorded ones.
+        redone: decisions of `plan --redo` that differ from the recorded decisions.
     """
     maps_by_decision = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept_maps = _maps_that_fit([drawn_map for maps in maps_by_decision for drawn_map in maps], most_cells)
@@ -821,7 +821,7 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, map_count: int) -> bool:
-    """Return whether a decision's target was chosen on a map. Without an owner, an only map is the one."""
+    """Return whether a decision's target was chosen on a map. Without an owner, it must be the only map."""
     if not decision.HasField("target"):
         return False
     if owner is None:

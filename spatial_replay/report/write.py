@@ -1,7 +1,7 @@
 """Reports as HTML pages, of one run or of a comparison of two runs under one time cursor.
 
-A replay gives the results, and a `Collector` gathers the other facts from the replay's messages. Together
-they are a `RunReport`, which `page` writes as HTML.
+A replay gives the results, and a `Collector` gathers the other facts from the replay's messages. Results
+and facts form a `RunReport`, which `page` writes as HTML.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def report_of(
 ) -> tuple[Replayed, RunReport]:
     """Evaluate specifications over a source, and return the results with the facts of the page.
 
-    Arguments and errors are those of `write_report`.
+    Arguments and errors are the same as for `write_report`.
     """
     collector = Collector()
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
@@ -161,7 +161,7 @@ def report_of(
         tuple(collector.ticks),
         obstacles=obstacles_of(source) if collector.decisions.decisions else {},
     )
-    # the scene has one of many messages; samples in sentences are drawn in a second pass over the log
+    # the scene keeps one of many messages; a second pass over the log draws the samples in sentences
     missing_ns = sorted(set(report.marked_ns).difference(collector.scene.times_ns.tolist()))
     replay.draw_samples(replayed.results, missing_ns, collector.scene.insert)
     return replayed, report
@@ -170,7 +170,7 @@ def report_of(
 def _results(
     replay: Replay, replayed: Replayed, collector: Collector, declared: Mapping[str, str]
 ) -> Iterator[ReportedResult]:
-    # under the paper's semantics, none can be explained
+    # results under the paper's semantics cannot be explained
     explained_indices = frozenset(worst_results(replayed.results) if replayed.semantics == "ltlf" else ())
     for index, result in enumerate(replayed.results):
         tree, unit = replay.trees[index], unit_of(result.formula, declared)
@@ -335,7 +335,7 @@ def _change(
 
 
 def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
-    """Yield a sentence, with the times of run B marked as such."""
+    """Yield the HTML of a sentence, in which the times of run B are marked."""
     is_b = first_ns[0] != first_ns[1] and any(
         isinstance(part, Instant) and part.first_ns == first_ns[1] for part in sentence.parts
     )
