@@ -147,11 +147,11 @@ class Annotator:
         """Start before the first sample.
 
         Args:
-            instances, automata: one per tree.
+            instances, automata: one instance and one automaton per tree.
             scene: state of a viewer that continues with these messages; None for a new viewer.
             show: function that receives the frames of the scene.
-            arrow: title of the result whose violation has the arrow. A title that no result has, such as "",
-                means the first violated result.
+            arrow: title of the result whose violation has the arrow. An unknown title, such as "", means
+                the first violated result.
             units: declared units, see `unit_of`.
         """
         self._units = units
@@ -206,7 +206,7 @@ class Annotator:
 
     @property
     def _over(self) -> list[str]:
-        """The deciding atom or missed response of each result, "" before its verdict."""
+        """The deciding atom or missed response of each result; "" for a pending result."""
         return [result.reporter.over for result in self._results]
 
     def count_from(self, zero_ns: int) -> None:
@@ -222,7 +222,7 @@ class Annotator:
         """Return the messages that annotate the next samples.
 
         Args:
-            blocks: evaluation of the samples, one block per tree.
+            blocks: evaluations of the samples, one block per tree.
         """
         if not len(trace):
             return []
@@ -265,7 +265,7 @@ class Annotator:
         """Add the next samples, and return only their events and the standing at its last changes.
 
         Args:
-            most_changes: limit of these changes; see `StandingEncoder.encode_changes`.
+            most_changes: limit of changes with a message; see `StandingEncoder.encode_changes`.
         """
         if not len(trace):
             return []
@@ -379,7 +379,7 @@ class Annotator:
     def _recent(self, events: Sequence[EncodedEvent]) -> bytes:
         """Add events of one time, and return a message with the newest events.
 
-        Each message repeats earlier events, because a viewer reads one message of each topic after a seek.
+        Each message repeats earlier events, because after a seek a viewer reads only one message per topic.
         """
         zero_ns = events[0].time_ns if self._scene.zero_ns is None else self._scene.zero_ns
         for event in events:

@@ -124,7 +124,7 @@ class AutomatonRun:
         return join_in_order(indices_and_payloads)
 
     def pass_over(self, block: SeriesBlock) -> None:
-        """Add the next samples, and write no messages for them."""
+        """Add the next samples without writing messages."""
         if len(block.times_ns):
             self._steps(self._values(block))
 
@@ -133,9 +133,9 @@ class AutomatonRun:
         return self._steps(self._values(block))[1]
 
     def step(self, time_ns: int, numbers: Floats, leaves: Callable[[], Floats]) -> tuple[int, ...]:
-        """Add one sample, and return the states after it.
+        """Add one sample, and return the states after the sample.
 
-        If all propositions are known, this takes a hundredth of the time of `states` with one sample.
+        If all propositions are known, `step` takes a hundredth of the time of `states` with one sample.
 
         Args:
             numbers: (N, 4), numbers of the formula's nodes after the sample.
@@ -268,7 +268,7 @@ def states_of_result(
 
 
 def _node_of(proposition: Formula, formula: Formula, node_ids: Mapping[int, int]) -> int:
-    """Return the id of a proposition's node, or of the atom of a rate that the proposition tests."""
+    """Return the id of a proposition's node or, for a proposition that tests a rate, of the rate's atom."""
     if id(proposition) in node_ids:
         return node_ids[id(proposition)]
     if isinstance(proposition, Boolean):
@@ -346,7 +346,7 @@ def automata_of(
     """Return the automaton of each tree's spec. Instances of a template share one automaton.
 
     Args:
-        compiled_before: attachments of a log, whose automata replace compilations with MONA.
+        compiled_before: attachments of a log; automata in the attachments replace compilations with MONA.
         known: compiled automata of specs in these files.
     """
     stored_payloads = [attachment.data for attachment in compiled_before if _is_stored(attachment)]

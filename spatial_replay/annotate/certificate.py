@@ -24,7 +24,7 @@ from spatial_replay.version import __version__
 
 
 class SampleHash:
-    """SHA-256 of samples: all columns of objects and signals, in the order of their names."""
+    """SHA-256 of samples: all columns of objects and signals, sorted by name."""
 
     def __init__(self) -> None:
         self._times = hashlib.sha256()
@@ -113,8 +113,8 @@ class SampleHash:
 class MessageHash:
     """SHA-256 of messages: the times and bytes of each topic's messages, in order.
 
-    The order of messages of different topics does not count. A recorder receives messages from several
-    threads, and may write later messages of one topic before messages of another topic arrive.
+    The order of messages of different topics does not count. Several threads send messages to a
+    recorder, which may write later messages of one topic before earlier messages of another topic.
     """
 
     def __init__(self) -> None:
@@ -145,7 +145,7 @@ PLAN_SHA256 = "plan_sha256"
 
 
 def plan_sha256(plan: Mapping[str, str]) -> str:
-    """Return the SHA-256 of the metadata of a planned run: names and values, in the order of names."""
+    """Return the SHA-256 of the metadata of a planned run: names and values, sorted by name."""
     digest = hashlib.sha256()
     for name, value in sorted(plan.items()):
         digest.update(_text(name) + _text(value))
@@ -163,7 +163,7 @@ def specifications_json(files: Sequence[Specification]) -> str:
 
 
 class EvaluationHashes:
-    """The hashes of an evaluation: of its samples, of the log's other messages, and of its results."""
+    """The hashes of an evaluation: hashes of the samples, the log's other messages, and the results."""
 
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample.

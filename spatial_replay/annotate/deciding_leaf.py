@@ -69,14 +69,14 @@ class LeavesBelow(NamedTuple):
 
 
 class DecidingLeaf(NamedTuple):
-    """A leaf at the sample at which it decides.
+    """A leaf, and the sample at which the leaf decides.
 
     Attributes:
         leaf: index among the program's leaves.
         number: nominal number of the leaf in the sample, with the leaf's own sign.
         end: whether `number` is the low or the high end of the leaf's interval.
         time_ns: time of the sample.
-        node: id of the leaf in the formula's tree; -1 if the leaf was found by its number alone.
+        node: id of the leaf in the formula's tree; -1 if only the leaf's number was compared.
         bound: deciding end of the leaf's interval with uncertainty.
         missed: the failed implication that causes the violation, or None.
         response: for a leaf of the condition, the leaf closest to fulfilling the response, or None.
@@ -93,7 +93,7 @@ class DecidingLeaf(NamedTuple):
 
     @property
     def shown(self) -> DecidingLeaf:
-        """The leaf that arrows point at: for a missed response `response`, otherwise this leaf."""
+        """The leaf at which arrows point: `response` for a missed response, otherwise this leaf."""
         return self if self.response is None else self.response
 
 
@@ -194,7 +194,7 @@ class NewestSamples:
         return (deciding.atom, number) if number in atom_ends else None
 
     def sample(self, time_ns: int, now_ns: int) -> Trace | None:
-        """Return the sample at a time, if it is at most `_RECENT` samples before `now_ns`; else None."""
+        """Return the sample at a time, at most `_RECENT` samples before `now_ns`; None for older samples."""
         sample_distance = 0
         for trace in reversed(self._blocks):
             end_index, now_index = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
@@ -214,9 +214,9 @@ class SettledViolation(NamedTuple):
     """A violation that was certain before the end of a log.
 
     Attributes:
-        time_ns: time of the sample since which the violation is certain.
+        time_ns: time of the sample from which on the violation is certain.
         leaf: deciding leaf, perhaps of an earlier sample; None if no leaf decided.
-        atom: formula of the leaf to point at; for a quantifier its deciding atom, with objects.
+        atom: formula at which the arrow points: a leaf or, for a quantifier, its deciding atom with objects.
         sample: sample of the leaf to point at; None if that sample was not recent at `time_ns`.
     """
 
@@ -281,7 +281,7 @@ class LeafHistory:
     def settling_leaf(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
         """Return the leaf that settled a node's verdict at a sample; None beyond `MOST_NUMBERS`.
 
-        For a violated conjunction, it is the leaf that settled the first violated conjunct.
+        A violated conjunction has the leaf that settled the first violated conjunct.
 
         Args:
             series: (N, 4), numbers of all nodes at that sample.
@@ -298,7 +298,7 @@ class LeafHistory:
     def final_leaf(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return the deciding leaf of a node that was pending at the end; None beyond `MOST_NUMBERS`.
 
-        For a violated conjunction, it is the deciding leaf of the first cause (see `find_causes`).
+        A violated conjunction has the deciding leaf of the first cause (see `find_causes`).
 
         Args:
             values: (N,), each node's value on the whole log.
@@ -354,7 +354,7 @@ class LeafHistory:
 
 
 class Pair(NamedTuple):
-    """Two terms that an atom relates, by their distance or by the protrusion of one from the other."""
+    """Two terms of an atom, related by a distance or by the protrusion of the first term from the second."""
 
     first: Term
     second: Term
@@ -372,10 +372,10 @@ class LeafPairs(NamedTuple):
 
     Attributes:
         leaves: leaves of the program, with the object in place of a template's parameter.
-        pairs: pair of each leaf; None for a leaf that does not relate two things in one sample.
+        pairs: pair of each leaf; None for a leaf without two terms in one sample.
         below: leaves below each requirement of the formula.
         regions: shapes by name.
-        divisors: divisor of each leaf's number by `scale`, 1 without one.
+        divisors: divisor of each leaf's number by `scale`; 1 without `scale`.
         texts: text of each leaf in the language.
         relations: names of relations that texts may use.
     """

@@ -60,12 +60,12 @@ class AnnotatedEvaluation:
 
         Args:
             instances: instances to evaluate, by file.
-            compiled_before: returns the attachments of a log, whose automata replace compilations with MONA.
+            compiled_before: returns attachments of a log; automata in them replace compilations with MONA.
             known: compiled automata of specs in these files.
             show: function that receives the frames of the scene.
             arrow: title of the result whose violation has the arrow; "" for the first violated result.
             units: declared units, see `unit_of`.
-            plan: metadata of the log's plan; its map belongs to the extent of the scene.
+            plan: metadata of the log's plan; the scene's extent includes the plan's map.
 
         Raises:
             UsageError: no result has the title `arrow`.
@@ -119,7 +119,7 @@ class AnnotatedEvaluation:
         axes: Axes = OUR_AXES,
         images: Collection[str] = (),
     ) -> LayoutContents:
-        """Return the contents of an annotated log that its layout shows.
+        """Return the contents of an annotated log that the log's layout shows.
 
         Args:
             extent: bounds of all footprints; None without footprints.
@@ -167,7 +167,7 @@ class AnnotatedEvaluation:
             axes: axes of the source.
             images: topics with images.
             planned_for: specification file of the decisions, if these results are of another file; else "".
-            start: time of the first message that a viewer shows, and name of its log.
+            start: time of the first message in a viewer, and name of the log with that message.
             planned: name of the result that a planner worked for; "" without a plan.
         """
         from spatial_replay.annotate.foxglove_layout import TextZero, layout_attachment
@@ -224,7 +224,7 @@ class AnnotatedEvaluation:
 
     @cached_property
     def annotator(self) -> Annotator:
-        """The encoder of the log's messages, which needs each block of `extend` with its samples."""
+        """The encoder of the log's messages. Pass each block of `extend` to it, with the block's samples."""
         annotator = self.new_annotator(arrow=self._arrow)
         annotator.add_map(self._plan)
         return annotator

@@ -57,7 +57,7 @@ class Period(NamedTuple):
 
     Attributes:
         code: the state.
-        start_ns, end_ns: times of its first and its last sample.
+        start_ns, end_ns: times of the first and the last sample.
         worst: least value in the period; for a final verdict, the deciding end of the interval.
         place: first sample of the block with `worst`, or `OF_CURRENT`, `OF_CANDIDATE`.
     """
@@ -75,7 +75,7 @@ class Change(NamedTuple):
     Attributes:
         node: index among the tracked nodes.
         sample: index in the block of the sample that confirms the change.
-        before: the former period; None if nothing was known before.
+        before: the former period; None if the node had no known state before.
         after: the new period, up to the sample that confirms the change.
     """
 
@@ -87,7 +87,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NodeStates:
-    """The states of some nodes, each with a candidate for the next one.
+    """The states of some nodes, each with a candidate for the next state.
 
     Attributes:
         integers: (K, 6) int64. Columns of the state: code, first time, last time. Columns of the candidate:
@@ -120,11 +120,11 @@ class NodeStates:
 
 
 class TrackedChanges(NamedTuple):
-    """The states of some nodes after a block, and the changes in it.
+    """The states of some nodes after a block, and the changes in the block.
 
     Attributes:
         changes: changes by node, then by time.
-        places: (K, 2) int64, place of each number of `states.worst`: a sample of the block, or `OF_CURRENT`,
+        places: (K, 2) int64, source of each number of `states.worst`: a sample of the block, or `OF_CURRENT`,
             `OF_CANDIDATE`.
     """
 
@@ -288,11 +288,11 @@ class ReportedNode(NamedTuple):
         node: id of the node.
         title: name of the node in sentences.
         name: name of the spec.
-        line: line of the spec in its file, from 1; 0 if it is not in the file.
+        line: line of the spec in the file, from 1; 0 for a spec that is not in the file.
         below: leaves below the node.
         requirement, sentence: id and title of the spec's requirement, or None.
-        is_needed: whether the root needs the node to hold, because only conjunctions are above it.
-        unit: declared unit of its number, or "".
+        is_needed: whether the root needs the node to hold: only conjunctions are above the node.
+        unit: declared unit of the node's number, or "".
     """
 
     node: int
@@ -312,7 +312,7 @@ class PeriodText(NamedTuple):
     Attributes:
         witness: the deciding leaf in words; "" for none.
         sentence: the sentence on the period.
-        decided: the deciding leaf with its node; None if the leaf was found by its number alone.
+        decided: the deciding leaf with its node; None if only the leaf's number was compared.
     """
 
     period: Period
@@ -364,11 +364,11 @@ def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
 class EventReporter:
     """Reports the changes of a result's root and of its named specs, up to the end of the log.
 
-    Between blocks it stores a few numbers and two deciding leaves for each of these nodes. Up to a limit it
-    stores the leaves of all samples (see `LeafHistory`).
+    Between blocks the reporter stores a few numbers and two deciding leaves per node. Up to a limit it stores
+    the leaves of all samples (see `LeafHistory`).
 
     Attributes:
-        settled: the violation of the root that was certain before the end of the log; None without one.
+        settled: the violation of the root that was certain before the end of the log, or None.
         over: the deciding atom or the missed response of the root's verdict; "" before the verdict, or if
             unknown.
     """
@@ -386,8 +386,8 @@ class EventReporter:
 
         Args:
             units: declared units, see `unit_of`.
-            samples: the newest samples, which the caller extends before this object. Without them, sentences
-                name quantifiers without their deciding objects.
+            samples: the newest samples, which the caller extends before this object. Without samples,
+                sentences name quantifiers without deciding objects.
         """
         self._units, self._regions = units, file.regions
         self._samples = samples or NewestSamples()
@@ -469,7 +469,7 @@ class EventReporter:
         ]
 
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> DecidingLeaf | None:
-        """Return the leaf with the worst number of a period; None if no leaf has it."""
+        """Return the leaf with the worst number of a period; None if no leaf has that number."""
         if period.place < 0:
             return self._last_deciding_leaves.get((node, period.place))
         leaves = block.leaves[:, :, period.place]
@@ -587,7 +587,7 @@ class EventReporter:
         )
 
     def _leaf(self, deciding_leaf: DecidingLeaf, now_ns: int) -> tuple[Formula, float]:
-        """Return a leaf with its number; for a quantifier, its deciding atom with the atom's number."""
+        """Return a leaf and its number; for a quantifier, the deciding atom and its number."""
         leaf = substitute(self._leaves[deciding_leaf.leaf], self._bindings)
         atom_and_number = None
         if isinstance(leaf, Quantified):

@@ -1,4 +1,4 @@
-"""The layout of a log for Foxglove and Lichtblick: panels by id, and a tree of splits that arranges them."""
+"""The layout of a log for Foxglove and Lichtblick: panels by id, and a tree of splits around the panels."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
-"""Limits of curves in a plot and of strips of named specs; more cannot be distinguished."""
+"""Limits of curves in a plot and of strips of named specs. Viewers cannot distinguish more."""
 
 _MOST_PLOTS: Final = 3
 _MOST_INDICATORS: Final = 6
@@ -82,7 +82,7 @@ def scene_panel(
 ) -> Panel:
     """Return the scene from above, with the planner's map below it and the planned path above it.
 
-    The planner's redone decisions are hidden; a viewer can show them instead.
+    The planner's redone decisions are hidden; a viewer can show them instead of the recorded decisions.
     """
     settings_by_topic: dict[str, Config] = {
         SCENE: {},
@@ -116,11 +116,11 @@ def scene_panel(
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
-    """Return a light for each of the first results, in the colour of its standing at the cursor.
+    """Return a light for each of the first results, in the colour of the standing at the cursor.
 
     Args:
         outcomes: outcomes over the finished log. The title of a violated result has the worst number
-            and its time.
+            and the number's time.
     """
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
@@ -192,7 +192,7 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
 
 
 def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Panel:
-    """Return a panel with a strip of the standing of each result, then of named specs.
+    """Return a panel with a strip for the standing of each result, and then of each named spec.
 
     Args:
         by_stamp: whether strips use the stamps in message headers. A live source needs these stamps, because
@@ -254,7 +254,7 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
 
 
 def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
-    """Return the title of a light: the result, its worst number if it is violated, then its sentence.
+    """Return the title of a light: the result, the worst number of a violated result, and the sentence.
 
     The sentence comes last, because viewers cut long titles at the end.
     """
@@ -357,7 +357,7 @@ class TextZero(NamedTuple):
 
     @property
     def offset(self) -> str:
-        """The offset between both zeros in words; "" if they are equal."""
+        """The offset between both zeros in words; "" for equal zeros."""
         if self.zero_ns == self.start_ns:
             return ""
         side = "after" if self.zero_ns > self.start_ns else "before"
@@ -380,15 +380,15 @@ class LayoutContents(NamedTuple):
         has_states: whether the log has the states of each tree's automaton.
         extent: bounds of the footprints; None without footprints.
         topics: all topics with messages.
-        axes: axes of the source, named in the scene's title if they differ from the axes of samples.
+        axes: axes of the source; the scene's title names axes that differ from the axes of samples.
         units: declared units, see `unit_of`.
         outcomes: final outcome of each tree; empty before the end of the log.
         images: topics with images.
         order: indices of the trees, the worst first; empty before the end of the log.
         planned_for: specification file of the planner's decisions, if these results are of another file.
         zero: zero of times in texts; None before it is known.
-        planned: name of the result that a planner worked for; "" without one.
-        first_event_ns: time of the first event; None without events, or before it is known.
+        planned: name of the result that a planner worked for; "" without a planner.
+        first_event_ns: time of the first event; None without a known event.
     """
 
     trees: Sequence[ReportedTree]
@@ -452,7 +452,7 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     """Return the layout for a server that replays a log.
 
-    It has the curves of the whole log at all times, and the constants for editing.
+    The layout always has the curves of the whole log, and the constants for editing.
     """
     contents = contents.worst_first()
     details = _details(contents)
@@ -478,7 +478,7 @@ def with_panels(layout: Mapping[str, Any], planned: str = "") -> dict[str, Any]:
 
     Args:
         layout: layout of the log without the extension (see `viewer_layout`).
-        planned: name of the result that a planner worked for, which panels show first; "" without one.
+        planned: name of the result that a planner worked for, which panels show first; "" without a planner.
     """
     panel_state = {"result": planned} if planned else {}
     configs = {"3D!scene": layout["configById"]["3D!scene"]}
@@ -538,7 +538,7 @@ def _details(contents: LayoutContents) -> _Details:
 
 
 def layout_text(layout: Mapping[str, Any]) -> str:
-    """Return a layout as the text of its file."""
+    """Return the text of a layout file."""
     return json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
 
 
@@ -609,7 +609,7 @@ def _tabs(identifier: str, titles_and_panels: Sequence[tuple[str, Panel]]) -> tu
 
 _Tree = str | dict[str, Any]
 _LIT_SHARE: Final = 9.0
-"""Ratio of the height of the panels below the lights to the height of the row of lights."""
+"""Ratio of two heights: the panels below the lights, and the row of lights."""
 
 
 def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:

@@ -1,9 +1,10 @@
 """The requirements of a formula: its demands on objects and regions in a single sample.
 
 A formula without temporal operators concerns only the present sample. The largest such subformulas of a
-specification are its *requirements*. Each has the sign in which the specification needs it. Under a negation,
-or left of an implication, the specification needs low robustness. A requirement counts until its
-*obligation*, the largest temporal subformula around it, is permanently fulfilled.
+specification are its *requirements*. Each requirement has a sign: the sign in which the specification needs
+its robustness. Under a negation, or left of an implication, the specification needs low robustness. A
+requirement counts until its *obligation*, the largest temporal subformula around it, is permanently
+fulfilled.
 
 A requirement that fails now is violated only if its obligation, and the conjunct of the specification around
 it, are permanently violated. A goal that is not reached yet is pending.
@@ -40,7 +41,7 @@ from spatial_replay.spec.walks import base_of, is_spatial, iter_bound, operand_s
 
 
 class Obligation(NamedTuple):
-    """A temporal subformula that is not part of a larger one.
+    """A temporal subformula that is not part of a larger temporal subformula.
 
     Attributes:
         node: id in the formula's tree.
@@ -71,9 +72,9 @@ class Obligation(NamedTuple):
 class Standing(IntEnum):
     """The state of a requirement in a sample.
 
-    `FULFILLED`: the obligation is permanently met, so the requirement no longer counts. `HOLDING`: it holds
-    now. `VIOLATED`: it fails now, and later samples cannot make up for it. `PENDING`: it fails now, and later
-    samples can make up for it. `UNKNOWN`: it is not observed.
+    `FULFILLED`: the obligation is permanently met, so the requirement no longer counts. `HOLDING`: the
+    requirement holds now. `VIOLATED`: the requirement fails now, and later samples cannot repair that.
+    `PENDING`: the requirement fails now, and later samples can repair that. `UNKNOWN`: not observed.
     """
 
     FULFILLED = 0
@@ -96,19 +97,20 @@ class ClassMembers(NamedTuple):
 
 
 class Requirement(NamedTuple):
-    """A subformula without temporal operators that is not part of a larger one.
+    """A largest subformula without temporal operators.
 
     Attributes:
         node: id in the formula's tree.
         sign: 1 if the formula needs the subformula to hold, -1 if it needs the subformula to fail.
-        obligation: the temporal subformula around it; None without one.
+        obligation: the temporal subformula around the requirement, or None.
         objects, regions: names of related objects and regions.
-        groups: open groups, whose members are related, too.
-        conjunct: the conjunct of the formula around it.
-        can_violate: whether its failure can be a violation. False for a goal whose obligation also has
-            invariants, and for all goals under a semantics without final verdicts.
-        is_condition: whether it is left of an implication, which also holds if the condition fails.
-        is_invariant: whether its obligation needs it in every sample, without an alternative.
+        groups: open groups; their members are also related objects.
+        conjunct: the conjunct of the formula around the requirement.
+        can_violate: whether a failure of the requirement can be a violation. False for a goal whose
+            obligation also has invariants, and for all goals under a semantics without final verdicts.
+        is_condition: whether the requirement is left of an implication, which also holds if the condition
+            fails.
+        is_invariant: whether the obligation needs the requirement in every sample, without an alternative.
     """
 
     node: int
@@ -132,7 +134,7 @@ class Requirement(NamedTuple):
         return self._numbers(series, at)[0]
 
     def robustness(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,), its robustness times its sign where it holds or is violated; NaN elsewhere.
+        """Return (S,), robustness times sign where the requirement holds or is violated; NaN elsewhere.
 
         Args:
             series: (N, 4, T): value, now, lower, upper of each node.
@@ -156,7 +158,7 @@ class Requirement(NamedTuple):
         return standing, np.where(is_counted, numbers_now, np.nan)
 
     def outcome(self, series: Floats, at: Integers) -> Floats:
-        """Return (S,), the robustness of its obligation over the finished log, times the obligation's sign.
+        """Return (S,), the obligation's robustness over the finished log, times the obligation's sign.
 
         NaN if the robustness is not known, or if the obligation fails without violating the conjunct.
 
@@ -182,7 +184,7 @@ def requirements_of(
     Args:
         object: object of a template's instance, or None.
         settles: whether the semantics has final verdicts; otherwise a goal is pending up to the end.
-        splits: whether each conjunct of a requirement is a requirement of its own.
+        splits: whether to split each requirement into its conjuncts.
     """
     positions = _positions(formula)
     is_plain = [is_spatial(position.formula) for position in positions]

@@ -1,4 +1,4 @@
-"""A blueprint for Rerun: the panels for an annotated log, which stays unchanged."""
+"""A blueprint for Rerun: panels for an annotated log. The log stays unchanged."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class BlueprintRow(NamedTuple):
 
     Attributes:
         title: name in the messages.
-        unit: unit of its robustness, or "".
-        selector: Rerun's selector of its entry in a message.
-        colour: colour of its curve, "#rrggbb".
+        unit: unit of the robustness, or "".
+        selector: Rerun's selector of the row's entry in a message.
+        colour: colour of the curve, "#rrggbb".
     """
 
     title: str
@@ -42,7 +42,7 @@ class BlueprintRow(NamedTuple):
 
 
 def blueprint_rows(standing: StandingUpdate) -> list[BlueprintRow]:
-    """Return the rows of a message. All messages of its log have equal rows, in the same order."""
+    """Return the rows of a message. All messages of one log have equal rows, in the same order."""
     return [
         BlueprintRow(
             result.name, result.unit, f".results[{result_index}]", CURVES[result_index % len(CURVES)]
@@ -63,7 +63,7 @@ def write_blueprint(
     """Write a blueprint: a view of curves per unit, a lane per result, and the sentences of the events.
 
     Rerun finds the blueprint of a log by the log's name without the suffix. A file with the suffix .rrd also
-    has the log and the outlines of its scenes, because Rerun shows each file as a recording of its own.
+    has the log and the outlines of the scenes, because Rerun shows each file as a separate recording.
 
     Raises:
         UsageError: Rerun is not installed.

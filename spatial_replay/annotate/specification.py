@@ -41,9 +41,9 @@ class ReportedTree(NamedTuple):
     Attributes:
         name: reported name of the result.
         object: object of a template's instance, or None.
-        file: index of its specification among the files.
-        requirement: id of its requirement, or None.
-        sentence: title of its requirement, or None.
+        file: index of the result's specification among the files.
+        requirement: id of the result's requirement, or None.
+        sentence: title of the result's requirement, or None.
         parameter: name of the template's parameter, or None.
     """
 
@@ -124,7 +124,7 @@ def _is_call(node: Formula, written_text: str, defined_names: Collection[str]) -
 def reported_trees(
     files: Sequence[Specification], instances: Sequence[Sequence[Instance]]
 ) -> list[ReportedTree]:
-    """Return the trees of all results. If several specs have one name, the stems of their files are prefixes.
+    """Return the trees of all results. Specs with equal names have their file's stem as prefix.
 
     Args:
         instances: instances of each file, in the order of evaluation.

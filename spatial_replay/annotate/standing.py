@@ -43,7 +43,7 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
 
     Args:
         codes: (R, S), numbers of `Standing`.
-        violated_ns: (R, S), time since which each result is violated, or `LATEST_NS`.
+        violated_ns: (R, S), start of each result's violation, or `LATEST_NS`.
     """
     ranks = _RANKS[codes]
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
@@ -90,8 +90,8 @@ class FinalStanding(NamedTuple):
 
     Attributes:
         standing: number of `Standing`: satisfied, violated or unknown.
-        by: magnitude of the deciding end of its interval; NaN if unknown.
-        at: time of the least upper end of its interval.
+        by: magnitude of the interval's deciding end; NaN if unknown.
+        at: time of the interval's least upper end.
         unit: unit of the robustness.
     """
 
@@ -104,12 +104,13 @@ class FinalStanding(NamedTuple):
 class StandingEncoder:
     """Encodes the standing of results, sample by sample.
 
-    Between blocks it stores the last numbers of each result. Messages do not depend on the cut into blocks.
+    Between blocks the encoder stores the last numbers of each result. Messages do not depend on the cut into
+    blocks.
 
     Attributes:
         outcomes: outcome of each result; empty before `end`.
         order: indices of the results, the worst first, with earlier violations first; empty before `end`.
-        zero_ns: zero of the seconds; None before it is known.
+        zero_ns: zero of the seconds; None before the first sample.
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class StandingEncoder:
         Args:
             times_ns: (T,), times of all samples.
             blocks: block of each tree; an instance for an object may have fewer samples.
-            over: deciding atom of each tree up to the last of these samples; "" without a verdict.
+            over: deciding atom of each tree after the last of these samples; "" without a verdict.
         """
         shown_ns = times_ns[samples_to_write(times_ns, self._written_ns)]
         if len(shown_ns):
@@ -204,7 +205,7 @@ class StandingEncoder:
     def _numbers(self, tree_index: int, block: SeriesBlock, sample_counts: Integers) -> Floats:
         """Return (N, 4, S), the numbers of a result after some counts of samples (S,) in a block.
 
-        After 0 samples they are the numbers of the last sample before the block.
+        A count of 0 gives the numbers of the last sample before the block.
         """
         if not len(block.times_ns):
             return np.repeat(self._last_series[tree_index], len(sample_counts), axis=2)
@@ -213,7 +214,7 @@ class StandingEncoder:
         return numbers
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
-        """Add the next samples, and write no messages for them."""
+        """Add the next samples without writing messages."""
         for tree_index, block in enumerate(blocks):
             if not len(block.times_ns):
                 continue
@@ -298,7 +299,8 @@ class StandingEncoder:
         """Encode messages.
 
         Args:
-            instants_ns: (2, R, S), time since which each result is violated, and time of its least upper end.
+            instants_ns: (2, R, S), start of each result's violation, and time of each result's least upper
+                end.
         """
         since_ns = instants_ns[0]
         codes_by_tree = [standing_codes(node_series, final=final) for node_series in series]

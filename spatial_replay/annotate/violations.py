@@ -1,6 +1,6 @@
 """The robustness of objects and regions in each sample, and the position of the first violation.
 
-Robustness gives the colours of the scene, and the position gives its arrow.
+Robustness gives the colours of the scene, and the position gives the arrow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
-"""Limit of bindings with numbers of their own. Beyond it, all members get the worst member's number."""
+"""Limit of bindings with numbers of their own. Above it, all members get the worst member's number."""
 
 _NO_NUMBERS: Final[Mapping[str, Floats]] = MappingProxyType({})
 
@@ -44,7 +44,7 @@ class Shade:
         is_known: whether the part was known in all samples.
         least_bound: least number of each bound object so far.
         leaf: index of the quantifier among the program's leaves; -1 for another part.
-        bodies: the quantifier's body for each of its bindings.
+        bodies: the quantifier's body for each binding.
         worst: (T,), index of the deciding body in each sample of the block; -1 where the part holds.
     """
 
@@ -159,7 +159,7 @@ def _separable(leaf: Formula, sign: float) -> Quantified | None:
 def _numbers_of(
     leaf: Quantified, sign: float, scene: TraceScene
 ) -> tuple[Sequence[tuple[str, ...]], tuple[Formula, ...], Floats]:
-    """Return the bindings of a quantifier, its body for each binding, and their numbers (B, T).
+    """Return the bindings of a quantifier, the body for each binding, and the bodies' numbers (B, T).
 
     All three are empty for more than `_MOST_BINDINGS` bindings.
     """
@@ -192,9 +192,9 @@ class EvaluatedResult(NamedTuple):
         requirements: requirements of the formula.
         block: numbers of nodes and leaves.
         leaf_pairs: pairs that an arrow can point at; None for a result without arrows.
-        since_ns: (R,), start of the certain violation of each requirement's conjunct (see `violated_since`);
+        since_ns: (R,), start of each conjunct's certain violation, by requirement (see `violated_since`);
             None for equal times.
-        settled: the formula's violation that is certain before the end, or None.
+        settled: the formula's violation, if it is certain before the end of the log; else None.
         is_final: whether the block is the last sample with intervals over the finished log.
         shades: parts of the requirements that colour objects; None if whole requirements colour objects.
     """
@@ -234,8 +234,8 @@ class Violations(NamedTuple):
         is_shown: (S,), whether the arrow has two ends.
         points: (S, 2, 2), ends of the arrow on the first and on the second object or region of the pair.
         top: (S,), upper end of the pair's higher member; NaN if neither member has a height.
-        robustness: (S,), at most 0, of the requirement or of the settling atom. It is in the unit of the log:
-            a division by `scale` is undone.
+        robustness: (S,), robustness of the requirement or of the settling atom, at most 0, in the unit of the
+            log: a division by `scale` is undone.
         holds: (S,), whether the atom holds but must not.
         moment_ns: (S,) int64, time of the earlier sample that has the number; -1 for a number of this sample.
         atom: (S,) int64, index in `atoms` of the atom that decides a quantifier; else -1.
@@ -256,14 +256,14 @@ class Violations(NamedTuple):
 
 
 class BoundAtom(NamedTuple):
-    """An atom of a quantifier with its deciding objects: its text, and the pair that it relates."""
+    """An atom of a quantifier with its deciding objects: the atom's text and pair of terms."""
 
     text: str
     pair: Pair
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
-    """Return (R,), the start of the certain violation of each requirement's conjunct, or `LATEST_NS`.
+    """Return (R,), the start of each conjunct's certain violation, by requirement, or `LATEST_NS`.
 
     Args:
         block: the next samples.
@@ -327,8 +327,8 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 
     Among the violations in a sample, the violation that was certain first has the arrow.
 
-    The arrow is at the deciding atom of the requirement, between the two points that attain the signed
-    distance of its terms, or along the protrusion of an enclosure. In the sample that settled the formula's
+    The arrow is at the requirement's deciding atom. It joins the two points that attain the terms' signed
+    distance, or shows the protrusion of an enclosure. In the sample that settled the formula's
     violation, the arrow is at the settling atom. A requirement with a deadline or in response to a condition
     keeps the arrow, its ends and its number after that sample. Conditions of implications have no arrow,
     because the missing response is the fault.
@@ -428,7 +428,7 @@ def _robustness(
 
 
 def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Integers, Integers, Floats]:
-    """Return (S,) indices of results, (S,) indices of requirements and (S,) robustness of first violations.
+    """Return the results, the requirements (indices) and the robustness of first violations, (S,) each.
 
     A requirement with robustness -inf is skipped: no object can fulfil it, so the arrow would have no ends.
     """

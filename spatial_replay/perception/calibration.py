@@ -1,4 +1,4 @@
-"""Printable sheets of tags in true size, and calibration of a camera from frames of known tags.
+"""Printable sheets of tags in true size, and calibration of cameras from frames with these tags.
 
 Only this module imports fpdf2.
 """
@@ -34,7 +34,7 @@ _LOOSE: Final = 0.02
 """Largest relative standard deviation of the focal length; above it, the views are too similar."""
 
 _WRONG: Final = 8.0
-"""Largest root mean square error of corners, pixels. A larger error means another sheet than the stated one.
+"""Largest root mean square error of corners, pixels. A larger error means that the sheet is another one.
 
 The error of a bent sheet is far smaller.
 """

@@ -66,7 +66,7 @@ _DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
 
 
 class ImageTopic:
-    """Frames of one log topic with images or AprilTag detections. It can be iterated once.
+    """Frames of one log topic with images or AprilTag detections, for one iteration.
 
     Attributes:
         name: name of the log.
@@ -143,7 +143,7 @@ class ImageTopic:
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
         """Yield the latest frame at or before each of some increasing times.
 
-        Several times with the same frame yield it once. Only the necessary frames are decoded. Damaged frames
+        A frame for several times is yielded once. Only the necessary frames are decoded. Damaged frames
         are left out.
 
         Raises:
@@ -321,7 +321,7 @@ def open_frames(
     Args:
         topic: topic of a log. None chooses the only image topic or, without image topics, the only topic with
             detections.
-        rate: frames per second of a video, which replace its own stamps.
+        rate: frames per second of a video, which replace the video's own stamps.
 
     Raises:
         MissingFileError: there is no such file.
@@ -342,7 +342,7 @@ def open_frames(
 
 
 class CameraFrames:
-    """Frames of a camera until it is unplugged. It can be iterated once; times count from the first frame.
+    """Frames of a camera until it is unplugged, for one iteration. Times count from the first frame.
 
     Attributes:
         name: name, such as "camera 0".

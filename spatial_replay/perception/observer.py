@@ -49,7 +49,7 @@ class ObjectPose(NamedTuple):
         place: (3,), x, y, and height above the resting height of the tags file.
         yaw: orientation, radians.
         spread: (4, 4), covariance of x, y, z, yaw from the errors of corners.
-        shared: (2, 2), covariance of x, y from the error of the plane, which nearby objects share.
+        shared: (2, 2), covariance of x, y from the plane's error, which nearby objects have in common.
         parallax: largest error of the place from the unresolved height of the tag.
         doubt: reason to distrust the pose, or None.
         misfit: distance of the corners from the fitted tag, pixels per degree of freedom.
@@ -249,11 +249,11 @@ def _level_start(plane: CameraPlane, corners: Floats, tag: MountedTag) -> Floats
 
 
 def fuse(poses: Sequence[ObjectPose]) -> ObjectPose:
-    """Fuse the poses from several tags on an object, each weighted by its covariance."""
+    """Fuse the poses from several tags on an object, weighted by their covariances."""
     if len(poses) == 1:
         return poses[0]
     first_yaw = poses[0].yaw
-    # yaws are shifted to within half a turn of the first yaw, so that their mean lies between them
+    # yaws are unwrapped to within half a turn of the first yaw, so that their mean is valid
     pose_states = np.array(
         [[*pose.place, first_yaw + math.remainder(pose.yaw - first_yaw, 2 * math.pi)] for pose in poses]
     )
@@ -642,7 +642,7 @@ class TagObserver:
     """Converts the frames of resting cameras to samples, in one run.
 
     An object is unknown if its tags are hidden from all cameras, or if its pose has a doubt. A hidden object
-    is held at its last place for a while, with an uncertainty that grows at its highest speed.
+    is held at its last place for a while, with an uncertainty that grows at the object's highest speed.
 
     Attributes:
         tags: the tags file.

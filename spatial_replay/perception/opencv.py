@@ -1,6 +1,6 @@
 """Frames, detection of tags, camera poses and geometry; only this module imports OpenCV.
 
-Pixel coordinates are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down.
+Pixel coordinates are as in OpenCV: the centre of the first pixel of an image is (0, 0), y points down.
 Other AprilTag detectors count from that pixel's outer corner, so their coordinates are half a pixel larger.
 `corners_from_apriltag` converts their corners.
 """
@@ -56,9 +56,9 @@ class Frame:
     """One image of a camera.
 
     Attributes:
-        time_ns: its stamp, on the clock of the samples.
+        time_ns: stamp of the image, on the clock of the samples.
         image: (height, width) grey, or (height, width, 3) blue, green, red.
-        data: H.264 in Annex B form from a video, or the message from a topic; b"" if it cannot be copied.
+        data: H.264 in Annex B form from a video, or the message from a topic; b"" if neither can be copied.
         detections: tags that a robot detected, without their image; None to detect tags in `image`.
 
     Raises:
@@ -171,7 +171,7 @@ def rotations(vectors: Floats) -> Floats:
 # --------------------------------------------------------------------------- corners to a fraction of a pixel
 
 _ALONG: Final = 24
-"""Number of places along an edge at which its brightness step is located."""
+"""Number of places along an edge at which the brightness step is located."""
 
 _MARGIN: Final = 0.1
 """Fraction of an edge that is skipped at each end, next to the other edges."""

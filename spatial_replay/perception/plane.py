@@ -134,7 +134,7 @@ class HomographyPlane:
         map from the plane to the image is A B. B maps the plane to the sphere around the camera. At the
         distance d, its singular values are (1, cos t) / d. A maps the sphere to the image. At the angle p to
         the optical axis, its singular values are f / cos p and f / cos² p. So cos t is at least cos p times
-        the ratio of the singular values of A B, and d is at least f divided by the greater one.
+        the ratio of the singular values of A B, and d is at least f divided by the greater singular value.
 
         Returns:
             Largest errors of places, and largest relative errors of lengths, (N,) each.
@@ -352,7 +352,8 @@ def _off_alone(
     """Find the tag whose removal gives the best fit of the other tags; None without any fit.
 
     Returns:
-        index of the tag, its error in the fit of the other tags, and the largest error of these, pixels.
+        index of the tag, its error in the fit of the other tags, and the largest error of the other tags,
+        pixels.
     """
     candidates: list[tuple[float, int, float]] = []
     for tag_index in range(len(known_corners) // 4):

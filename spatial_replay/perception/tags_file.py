@@ -37,8 +37,8 @@ class MountedTag:
 
     Attributes:
         id: number of the tag.
-        size: edge of its black square, in footprint units.
-        x, y: place of its centre.
+        size: edge of the black square, in footprint units.
+        x, y: place of the tag's centre.
         yaw: angle from the frame's x axis to the tag's right, counter-clockwise, radians.
         z: height of the tag above the reference tags while its object rests.
     """
@@ -77,7 +77,8 @@ class TaggedObject:
         footprint: footprint in the object's frame.
         height: (bottom, top) above the plane, or None.
         is_lifted: whether the object may leave the plane; its tags then have poses in space.
-        fastest: highest speed, footprint units per second; the uncertainty of a held object grows at it.
+        fastest: highest speed, footprint units per second; the uncertainty of a held object grows at this
+            speed.
     """
 
     name: str
@@ -99,8 +100,8 @@ class TagsFile:
         is_image: whether the plane is the image itself, in pixels.
         references: tags with known places.
         camera: model of the camera; None if it is not calibrated.
-        pose: (6,), rotation vector and translation from the plane's frame to the camera's; None if it comes
-            from reference tags.
+        pose: (6,), rotation vector and translation from the plane's frame to the camera's; None if
+            reference tags determine the pose.
         cameras: camera and pose of each of several cameras, by name or number; replaces `camera` and `pose`.
         corner_error: standard deviation of a corner, pixels; None to measure it.
         reference_error: error of a reference tag's place, in footprint units.

@@ -52,7 +52,7 @@ class Decoded(NamedTuple):
     Attributes:
         of: object that was passed with its packet.
         frame: frame of PyAV.
-        is_true: whether no frame that it depends on is missing or damaged.
+        is_true: whether no frame on which this frame depends is missing or damaged.
     """
 
     of: Any
@@ -66,7 +66,7 @@ class Shown(NamedTuple):
     Attributes:
         of: object that was passed with its message.
         image: image of the frame; black if the frame is not true.
-        is_true: whether no frame that it depends on is missing or damaged.
+        is_true: whether no frame on which this frame depends is missing or damaged.
     """
 
     of: Any
@@ -80,7 +80,7 @@ class _PendingPacket:
 
     Attributes:
         of: object that was passed with the packet.
-        losses_before, losses_after: numbers of losses before and after its decoding.
+        losses_before, losses_after: numbers of losses before and after the packet's decoding.
     """
 
     of: Any
@@ -277,7 +277,7 @@ def has_key(data: bytes) -> bool:
 
 
 def picture(decoded: Decoded) -> Image:
-    """Return the image of a frame; black if it is not true, because it may show tags at wrong places.
+    """Return the image of a frame. A frame that is not true is black, as it may show tags at wrong places.
 
     Raises:
         LogError: the frame is too large.
@@ -331,7 +331,7 @@ _MOST_BOXES: Final = 1000
 
 
 class VideoFile:
-    """Frames of a video file. It can be iterated once; stamps count from the first frame.
+    """Frames of a video file, for one iteration. Stamps count from the first frame.
 
     Attributes:
         name: name of the file.
@@ -408,9 +408,11 @@ class VideoFile:
 
     @property
     def remark(self) -> str | None:
-        """Remark that the given rate replaces stamps of the file that look right, or None.
+        """Remark that the given rate replaces the file's stamps, or None.
 
-        It is final after all frames are read, because stamps that go back are not right.
+        There is no remark without a rate, without stamps, and for stamps that go back.
+
+        The remark is final after all frames are read.
         """
         if self._rate is None or not self._has_stamps or self._goes_back:
             return None
@@ -484,7 +486,7 @@ class VideoFile:
         )
 
     def _decode(self) -> Iterator[Decoded]:
-        """Yield frames in display order, each with its bytes if it can be copied."""
+        """Yield frames in display order, with their bytes if the frames can be copied."""
         av = load_av()
         # an .avi has no display times, so frames in display order get the decoding times in order (`slots`)
         is_avi = self._container.format.name == "avi"

@@ -53,7 +53,7 @@ Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 
 
 class _Below(NamedTuple):
-    """Threshold of a robustness. A possible condition compares its lower end, a certain one its upper end."""
+    """Threshold of a robustness. A condition compares the upper end; a possible condition the lower end."""
 
     threshold: float
     is_possible: bool
@@ -91,7 +91,7 @@ class Trigger:
 
     @property
     def texts(self) -> list[str]:
-        """The conditions; each of them fires the trigger."""
+        """The conditions; each condition fires the trigger."""
         return [condition.strip() for condition in ([self.when] if isinstance(self.when, str) else self.when)]
 
 
@@ -164,7 +164,7 @@ def _parse_condition(text: str) -> tuple[str, str | _Below]:
 
 
 def _verdict(updates: Sequence[Update], name: str) -> str:
-    """Return the verdict of a spec; "" before it has one."""
+    """Return the verdict of a spec; "" before the first evaluation."""
     for update in updates:
         if name in update.places and update.specs[update.places[name][0]].numbers is not None:
             return str(update.node(name).verdict)
@@ -175,7 +175,7 @@ _SLICE_BYTES: Final = 8 * 2**20
 """Approximate amount that is written to a clip between two reads of the queue, bytes."""
 
 _LATE_S: Final = 2.0
-"""Time for which a clip waits for late samples, s; a source may delay samples for a second at its end."""
+"""Time for which a clip waits for late samples, s; a source may delay its last samples for a second."""
 
 _LATE_NS: Final = 10**9
 """Maximum delay of messages behind samples, ns."""
@@ -200,7 +200,7 @@ class TriggeredClip:
     Attributes:
         path: path of the log.
         reason: first condition that fired during the clip.
-        time_ns: time at which it fired.
+        time_ns: time at which the trigger fired.
         held_s: time before the trigger that the clip covers, s.
         dropped: number of samples in the clip's time that were dropped because the queue was full.
     """
@@ -405,7 +405,7 @@ class ClipLog(RecorderLog):
                 self._finish(is_interrupted=False)
 
     def miss(self, time_ns: int, kind: Missed) -> None:
-        """Record the time of a dropped sample or message; a clip counts those within its time."""
+        """Record the time of a dropped sample or message. A clip counts the drops within its time."""
         self._missed[kind].append(time_ns)
 
     def report(self, event: RunEvent) -> None:
@@ -511,7 +511,7 @@ class ClipLog(RecorderLog):
             clip.put(entry)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or extend the open clip if no entry between them is missing."""
+        """Open a clip around a time, or extend the open clip if the ring has all entries between."""
         if self._open is not None:
             until_ns = self._open.until_ns
             if self._evicted_ns > until_ns or (at_ns > until_ns and self._is_past(until_ns)):
@@ -546,7 +546,7 @@ class ClipLog(RecorderLog):
         return sorted(entries_within, key=lambda entry: entry.time_ns)
 
     def _evict(self) -> None:
-        """Evict entries that are too old, and then the oldest entries until the ring fits its limit."""
+        """Evict entries that are too old, and then the oldest entries above the memory limit."""
         # a late sample may fire, so the age of entries counts from the newest sample
         reached_ns, arrived_s = self._latest_arrivals.get(Sample, (self._newest_ns, 0.0))
         if time.monotonic() - arrived_s > _LATE_S:

@@ -154,7 +154,7 @@ class Recording:
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """The automaton of each result, or the reason why it has none."""
+        """The automaton of each result, or the reason why there is no automaton."""
         return self._evaluation.automata
 
     @property
@@ -180,7 +180,7 @@ class Recording:
 
         Args:
             beside: messages of other topics that are not derived from samples, sorted by time within each
-                topic. A replay copies them.
+                topic. A replay copies these messages.
 
         Raises:
             TraceError: samples that are not after the earlier samples.
@@ -208,7 +208,7 @@ class Recording:
         self._sink.write_messages(merge(self._evaluation.annotator.occurrence(*event)))
 
     def _count_messages(self, trace: Trace, beside: Messages | None) -> Messages:
-        """Return the messages to write: samples and other messages. Count and hash them."""
+        """Count and hash the next samples and other messages; return them as messages to write."""
         certified_messages = sample_messages(trace, self._sample_count)
         messages = certified_messages
         if beside is not None and len(beside):
@@ -272,7 +272,7 @@ class Recording:
         self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan, self._doubts))
 
     def break_off(self, end: RunEnd) -> None:
-        """Write the end of a log whose last samples could not be written; it has no certificate."""
+        """Write the end of a log whose last samples could not be written. The log has no certificate."""
         self._sink.add_metadata(ENDING, self._ending(end._replace(interrupted=True)) | {"failed": "true"})
 
     def _ending(self, end: RunEnd) -> dict[str, str]:
@@ -535,7 +535,7 @@ _WORDS: Final = {
 
 
 class VerdictChange(NamedTuple):
-    """A change of a spec's verdict or, while it is pending, of the sign of its robustness.
+    """A change of a spec's verdict or, while the spec is pending, of its robustness' sign.
 
     A changed verdict counts at once. A changed sign counts after three samples, as in the events of a log.
 

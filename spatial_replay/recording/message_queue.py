@@ -106,7 +106,7 @@ class MessageQueue:
         self.raise_failure()
 
     def raise_failure(self) -> None:
-        """Raise the failure that prevents writing, if there is one."""
+        """Raise the failure that prevents writing, if any."""
         if self.failure is not None:
             raise self.failure
 
@@ -173,8 +173,8 @@ class MessageChannel:
         """Queue the next message; return at once unless the queue is full.
 
         Args:
-            time_ns: log time of the message, on the clock of the samples. It may not be before the channel's
-                previous message.
+            time_ns: log time of the message, on the clock of the samples. The time may not be before the
+                channel's previous message.
             data: a dict for json, a message for protobuf, or bytes, which are written unchanged.
 
         Raises:

@@ -54,7 +54,7 @@ class SampleWriter:
 
     Attributes:
         dropped: number of samples that were dropped because the queue was full, or given to `miss`.
-        doubts: assumptions that the source contradicts; they are written at the end of the log.
+        doubts: assumptions that the source contradicts, which are written at the end of the log.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class SampleWriter:
                 self._try(partial(self._log.report, event))
 
     def _record(self, samples: Sequence[Sample], messages: Messages) -> None:
-        """Encode and write samples and messages; after a failure, drop them."""
+        """Encode and write samples and messages. After a failure, they are dropped."""
         if self._messages.failure is not None or not (samples or len(messages) or self._log.is_busy):
             return
         try:
@@ -272,7 +272,7 @@ class SampleWriter:
             self._bell.put(None)
 
     def _waiting_samples(self) -> tuple[list[Sample], bool]:
-        """Return gathered samples, and whether the log ends after them."""
+        """Return gathered samples, and whether the log ends after these samples."""
         if self._queue.qsize() < self._wake_count and not self._log.is_busy:
             with suppress(queue.Empty):
                 self._bell.get(timeout=self._log.gather_s)

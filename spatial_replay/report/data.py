@@ -233,7 +233,7 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
 
 
 def _choose(is_chosen: NDArray[np.bool_], samples: Integers, limit: int) -> None:
-    """Mark samples as chosen, up to `limit` in all. Of too many samples, mark evenly spread samples."""
+    """Mark samples as chosen, up to `limit` in all. Too many samples are thinned evenly."""
     new_samples = samples[~is_chosen[samples]]
     free_count = max(0, limit - int(np.count_nonzero(is_chosen)))
     if len(new_samples) > free_count:

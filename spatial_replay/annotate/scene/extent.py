@@ -1,4 +1,4 @@
-"""The extent of a scene: the bounds of its footprints so far, and the size that scales its texts."""
+"""The extent of a scene: the bounds of all footprints so far, and the size that scales texts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.trace.trace import Trace
 
 VIEW: Final = 1.5
-"""Height of the view, as a multiple of the scene's longer side. A panel may be narrower than it is high."""
+"""Height of the view, as a multiple of the scene's longer side. A panel may be narrower than high."""
 
 _STEP: Final = 1.5
 """Ratio of consecutive sizes for texts. Steps keep names in place while a scene grows."""
@@ -38,7 +38,7 @@ class SceneBounds(NamedTuple):
         return box if before is None else before.with_points(np.reshape(box, (2, 2)))
 
     def with_points(self, points: Floats) -> SceneBounds:
-        """Return the box around this box and some points (P, 2)."""
+        """Return this box enlarged to contain some points (P, 2)."""
         corners = np.vstack([points, [self[:2], self[2:]]])
         return SceneBounds(*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
 
@@ -57,8 +57,8 @@ class SceneExtent(NamedTuple):
 
     Attributes:
         bounds: box of the footprints; None before any footprint.
-        size: longer side of the box around footprints and regions, in steps: its first length times a power
-            of `_STEP`.
+        size: longer side of the box around footprints and regions, in steps: the first such length times
+            a power of `_STEP`.
     """
 
     bounds: SceneBounds | None = None
@@ -120,7 +120,7 @@ class SceneExtent(NamedTuple):
 
 
 def map_area(plan: Mapping[str, str]) -> SceneBounds | None:
-    """Return the area of a planner's map from the metadata of its plan; None without a map."""
+    """Return the area of a planner's map, from the plan's metadata; None without a map."""
     try:
         xmin, ymin, cell, columns, rows = map(float, json.loads(plan["settings"])["grid"])
     except (KeyError, TypeError, ValueError):

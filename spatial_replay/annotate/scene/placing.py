@@ -26,7 +26,7 @@ _NOWHERE: Final = 4
 """Rank of a position on a blocked box. Rank 2 is outside the view, 1 is on another object, 0 is free."""
 
 _FEW: Final = 0.7
-"""Fraction of scenes without a free position. Below it, these scenes are copied, to skip all other scenes."""
+"""Fraction of scenes without a free position. Below this fraction, only these scenes are copied."""
 
 Box = tuple[Floats, Floats]
 """Low and high corners (..., 2, K) of boxes in K scenes; NaN for no box."""
@@ -147,7 +147,7 @@ def half_sizes(letters: Floats, line: Floats) -> Floats:
 def _place(half_size: Floats, nearest: Box, arrow: Box, around: Surroundings, candidate_count: int) -> Floats:
     """Return the centres (2, K) of one text in each of K scenes, at the first position of the best rank.
 
-    A text covers other objects only if all positions in the view do. It leaves the view only if all
+    A text covers other objects only if all positions in the view do. A text leaves the view only if all
     positions in the view cover a blocked box.
 
     Args:

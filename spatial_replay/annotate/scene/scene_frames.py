@@ -50,8 +50,8 @@ def labelled_objects(
 ) -> NDArray[np.bool_]:
     """Return (S, objects), whether each object has a label.
 
-    In a crowded sample, at most `_MOST_LABELS` objects have labels: first the objects that violate a
-    specification, from the worst on, and then the objects that a specification names.
+    In a crowded sample, at most `_MOST_LABELS` objects have labels. Objects that violate a specification
+    come first, from the worst on. Objects that a specification names follow.
 
     Args:
         named: objects that specifications name.
@@ -151,7 +151,7 @@ _LONGEST_CAUSE: Final = 60
 
 
 _LEAST: Final = 0.4
-"""Share of the full colour at the slightest robustness, so that its sign is visible."""
+"""Share of the full colour at the slightest robustness, so that the sign is visible."""
 
 _FROM_GREY: Final = np.subtract((NEGATIVE, POSITIVE), NEUTRAL)
 _FROM_GREY.flags.writeable = False
@@ -279,7 +279,7 @@ class Arrows(NamedTuple):
     texts: ArrowTexts
 
     def at(self, index: int) -> DrawnViolation | None:
-        """Return the arrow in a message; None without one."""
+        """Return the arrow in a message, or None."""
         violations = self.violations
         if not violations.is_shown[index]:
             return None
@@ -318,7 +318,7 @@ class SceneFrame(NamedTuple):
     place: int = 0
 
     def violation(self, result: int) -> DrawnViolation | None:
-        """Return the arrow of a result in this message; None without one."""
+        """Return the arrow of a result in this message, or None."""
         return self.arrows[result].at(self.place)
 
     @property
@@ -388,11 +388,11 @@ class SceneContent(NamedTuple):
     """Columns of S messages.
 
     Attributes:
-        names: objects in these messages, in the message before, or with a last outline.
+        names: objects in these messages, in the previous message, or with a last outline.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
-        styles: (S, names), -1 where an object is absent. Bit 0: it has a label. Bit 1: it violated a result.
-            Higher bits: its level.
+        styles: (S, names), -1 where an object is absent. Bit 0: has a label. Bit 1: has violated a result.
+            Higher bits: level.
         missing: (S, names), index in `last` of a missing object's outline; else -1.
         last: last outlines of missing objects.
         observations: (S, names), rows of `rings`, `footprints` and `middles`.

@@ -90,7 +90,7 @@ def dashes_of(rings: Sequence[Floats]) -> Floats:
 
 
 class Form(NamedTuple):
-    """The primitives of a footprint: the lengths of its rings, and whether it has a height."""
+    """The primitives of a footprint: lengths of rings, and whether the footprint has a height."""
 
     rings: tuple[int, ...]
     has_height: bool
@@ -206,7 +206,7 @@ UTF-8 has no bytes 0xfe and 0xff: https://www.rfc-editor.org/rfc/rfc3629#section
 
 
 def encode_frame(time_ns: int) -> bytes:
-    """Return the message that makes the scene's frame known to viewers, by a child frame at its origin."""
+    """Return the message that introduces the scene's frame to viewers, by a child frame at the origin."""
     message = FrameTransform(parent_frame_id=FRAME, child_frame_id=FRAMES[1])
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
     message.rotation.w = 1.0
@@ -280,7 +280,7 @@ def point_at(entity: SceneEntity, label: str, lift: float, names: Sequence[str] 
     """Add an arrow, names and the label to an entity, with slots for positions and the arrow's length.
 
     Args:
-        lift: height of flat objects above the plane; it also scales the arrow's width.
+        lift: height of flat objects above the plane, which also scales the arrow's width.
     """
     arrow = entity.arrows.add(
         shaft_length=SLOT, shaft_diameter=5.0 * lift, head_length=SLOT, head_diameter=12.0 * lift
@@ -382,7 +382,7 @@ class DrawnObject(NamedTuple):
     """The drawing of an object.
 
     Attributes:
-        level: height, 0 to `LEVELS`. Smaller objects are higher, so that larger ones do not hide them.
+        level: height, 0 to `LEVELS`. Smaller objects are higher, so that larger objects do not hide them.
         label: name, with a mark if the object violated a result; "" for no label.
     """
 
@@ -393,7 +393,7 @@ class DrawnObject(NamedTuple):
 
 
 class SceneLayout(NamedTuple):
-    """The structure of a message, which determines the offsets of its numbers.
+    """The structure of a message, which determines the offsets of all numbers.
 
     Attributes:
         deleted: objects of the previous message that are gone.
@@ -468,7 +468,7 @@ class EncodedRegions(NamedTuple):
 
 
 def encode_regions(regions: Sequence[Region], *, named: bool = True) -> EncodedRegions:
-    """Encode regions, with or without names. Larger regions are lower and do not hide smaller ones."""
+    """Encode regions, with or without names. Larger regions are lower, and do not hide smaller regions."""
     sizes = [region.size for region in regions]
     message, number_indices = SceneUpdate(), list[int]()
     for region_index, (region, size) in enumerate(zip(regions, sizes, strict=True)):

@@ -156,8 +156,8 @@ class SceneState:
         shown: objects in the last message.
         last: last footprint (batch, row) of each object that specifications name.
         is_pointing: whether the last message has an arrow at a violation.
-        scale: robustness at which colours are full, None before any object is shown. It is the median size
-            (longer side of the bounding box) of the objects in the first message with objects.
+        scale: robustness at which colours are full, None before any object is shown. The scale is the
+            median size (longer side of the bounding box) of the objects in the first message with objects.
         extent: extent of the samples so far, which scales texts.
         templates: templates of the layouts so far; a cache that changes no message.
     """
@@ -173,10 +173,10 @@ class SceneState:
 
 
 def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> SceneState:
-    """Return the state before a run's first message, with its scale (see `SceneState`).
+    """Return the state before a run's first message, with the scale (see `SceneState`).
 
     Args:
-        trace: samples of the run from the first one on.
+        trace: samples of the run, from the first sample on.
         zero_ns: zero of times in texts.
     """
     rows = trace.rows[samples_to_write(trace.times_ns, None)]
@@ -184,7 +184,7 @@ def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> S
 
 
 class SceneMessages(NamedTuple):
-    """Encoded messages with their times (S,) int64, the state after them, and their content if any."""
+    """Encoded messages with their times (S,) int64, the state after them, and their content or None."""
 
     times_ns: Integers
     payloads: Sequence[bytes]
@@ -198,7 +198,7 @@ class SceneEncoder:
     Every message has all regions and all observed objects, so that a viewer can jump to any message. Objects
     that are gone are deleted. If a specification names a missing object, its last outline stays. An object or
     region has the colour of its worst requirement: blue holds, vermillion fails, grey is unknown (see
-    `palette` and `requirements`). An arrow with its robustness points at the violation that was certain first
+    `palette` and `requirements`). An arrow with a robustness points at the violation that was certain first
     (see `violations`).
 
     Attributes:
@@ -415,7 +415,7 @@ def _shades_of(
 
 
 def samples_to_write(times_ns: Integers, written_ns: int | None) -> Integers:
-    """Return the indices of the samples with a message, each at least `PERIOD_NS` after the previous one.
+    """Return the indices of the samples with a message, each at least `PERIOD_NS` after the previous message.
 
     Args:
         written_ns: time of the last message; None before the first message.
