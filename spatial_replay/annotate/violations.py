@@ -123,10 +123,10 @@ class ShadeTracker:
         part = shade.requirement
         numbers_now = part.sign * block.series[part.node, 1]
         known_numbers = numbers_now[~np.isnan(numbers_now)]
-        least = min(shade.least, float(known_numbers.min(initial=math.inf)))
+        least_number = min(shade.least, float(known_numbers.min(initial=math.inf)))
         is_known = shade.is_known and len(known_numbers) == len(numbers_now)
         failing_samples = np.flatnonzero(numbers_now < 0.0)
-        bound: dict[str, Floats] = {}
+        numbers_by_object: dict[str, Floats] = {}
         bodies, worst_bodies = tuple[Formula, ...](), np.full(len(numbers_now), -1, np.int64)
         if leaf is not None and len(failing_samples):
             failing_trace = trace.take(np.searchsorted(trace.times_ns, block.times_ns[failing_samples]))
@@ -139,14 +139,16 @@ class ShadeTracker:
                 worst_bodies[failing_samples] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
             for object_names, binding_numbers in zip(bindings, failing_numbers, strict=True):
                 for name in object_names:
-                    object_numbers = bound.setdefault(name, np.full(len(numbers_now), np.nan))
+                    object_numbers = numbers_by_object.setdefault(name, np.full(len(numbers_now), np.nan))
                     object_numbers[failing_samples] = np.fmin(
                         object_numbers[failing_samples], binding_numbers
                     )
         least_bound = dict(shade.least_bound)
-        for name, object_numbers in bound.items():
+        for name, object_numbers in numbers_by_object.items():
             least_bound[name] = float(np.fmin.reduce(object_numbers, initial=least_bound.get(name, math.inf)))
-        return Shade(part, bound, least, is_known, least_bound, shade.leaf, bodies, worst_bodies)
+        return Shade(
+            part, numbers_by_object, least_number, is_known, least_bound, shade.leaf, bodies, worst_bodies
+        )
 
 
 def _separable(leaf: Formula, sign: float) -> Quantified | None:

@@ -53,20 +53,20 @@ def message_channel(
         UsageError: a topic of this package, an unknown encoding, or a schema that does not fit.
     """
     check_topic(topic)
-    message = schema if isinstance(schema, type) and issubclass(schema, Message) else None
+    message_class = schema if isinstance(schema, type) and issubclass(schema, Message) else None
     if encoding is None:
-        encoding = "protobuf" if message else "json"
+        encoding = "protobuf" if message_class else "json"
     if encoding not in ENCODINGS:
         raise UsageError(
             f"{topic}: the encoding is {shortened(encoding)}; known encodings are {', '.join(ENCODINGS)}"
         )
-    if message is not None:
+    if message_class is not None:
         if encoding != "protobuf":
             raise UsageError(
-                f"{topic}: the schema is the protobuf class {message.__name__}, but the encoding is"
+                f"{topic}: the schema is the protobuf class {message_class.__name__}, but the encoding is"
                 f" {encoding}; give encoding='protobuf'"
             )
-        return protobuf_channel(topic, message)
+        return protobuf_channel(topic, message_class)
     if schema is None:
         if encoding not in _SELF_DESCRIBING:
             raise UsageError(f"{topic}: {encoding} messages cannot be decoded without a schema; give one")
