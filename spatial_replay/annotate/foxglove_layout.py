@@ -202,7 +202,7 @@ def state_strips(trees: Sequence[ReportedTree], *, by_stamp: bool = False) -> Pa
     spec_strips = [
         (title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)
     ]
-    # Foxglove takes its colours from these settings, Lichtblick from the numbers
+    # Foxglove reads colours from these settings, Lichtblick derives colours from the numbers
     state_settings = [
         {"value": str(standing), "label": words, "color": colour}
         for standing, (words, colour) in _STANDING_COLOURS.items()

@@ -78,7 +78,7 @@ class ReportedTree(NamedTuple):
         """Return the text of each node as the file writes it, with the object instead of the parameter.
 
         Nodes in the body of a `def`, and nodes of a quantifier for each of its objects, have no text of their
-        own in the file. They get canonical texts.
+        own in the file. Such nodes get canonical texts.
 
         Args:
             source: text of the file.

@@ -255,7 +255,7 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
     moves: list[dict[int, tuple[int, ...]]] = []
     for state, entry in enumerate(automaton.entries):
         targets = table(entry)
-        # propositions that the run needs to stay in the state must only stay true
+        # propositions that keep the run in its state do not have to change
         constant_propositions = (requires(entry) or frozenset()) if state in targets else frozenset()
         moves.append(
             {
@@ -310,7 +310,7 @@ def _way(
         and target in owed_propositions
         and len(propositions) + owed_counts[target] == owed_counts[state]
     ]
-    # a path with one proposition per sample shows the order of the formula; a single step hides it
+    # a path with one proposition per sample shows the order of the formula; a single step hides this order
     target = min(nearest, key=lambda target: (len(targets[target]) or len(targets), target))
     return (*targets[target], *owed_propositions[target])
 

@@ -511,7 +511,7 @@ def _locate(
     positions = positions[(violations.leaf[positions] >= 0) & ~is_past]
     if not len(positions):
         return
-    # a trace of only these samples, which are often few, is faster to measure
+    # only these samples are measured, because they are often few
     leaf_indices, scene = (
         violations.leaf[positions],
         TraceScene(trace.take(samples[positions]), result.leaf_pairs.regions),

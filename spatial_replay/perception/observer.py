@@ -106,7 +106,7 @@ def poses_on_plane(
         axis=-1,
     )
     positions = centres - centre_shifts
-    # unwrapped, so that a step across 180 degrees is no large derivative
+    # yaws are unwrapped, so that a step across 180 degrees is no large derivative
     states = np.concatenate([positions, np.unwrap(yaws, axis=1)[..., None], edge_lengths[..., None]], axis=-1)
     state_derivatives = (states[:, 1:9] - states[:, 9:]) / (2 * _STEP)
     variance = plane.corner_error**2
@@ -134,7 +134,7 @@ def poses_on_plane(
             relative_misfit = (
                 float(np.linalg.norm(corner_places[index, 0] - squares[index], axis=1).max()) / sizes[index]
             )
-            # a tag above the plane of an uncalibrated camera appears larger, below it smaller
+            # an uncalibrated camera shows a tag above the plane larger, and a tag below the plane smaller
             unexplained_error = abs(size_error) - (length_errors[index] if size_error * tag.z > 0 else 0.0)
             if (
                 unexplained_error > _SIZE_TOLERANCE + size_noise

@@ -219,7 +219,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: t
     fitted_corners, derivative = _appearing(known_corners, solution, tags.camera)
     corner_errors_px = np.linalg.norm(fitted_corners - seen_corners, axis=1)
     unknown_count = derivative.shape[-1]
-    # per degree of freedom, so that few tags do not look exact
+    # error per degree of freedom, so that a fit of few tags does not look exact
     rms = float(
         np.sqrt(np.square(corner_errors_px).sum() / max(2 * len(corner_errors_px) - unknown_count, 1))
     )

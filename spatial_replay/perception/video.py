@@ -104,7 +104,7 @@ class Decoder:
         self._losses = 0
         # losses before the last key frame no longer count
         self._mended_losses = 0
-        # packets after a loss whose frames are pending
+        # packets after a loss that wait for their frames
         self._pending: list[_PendingPacket] = []
 
     def decode(self, packet: Any, of: Any = None) -> list[Decoded]:
@@ -181,7 +181,7 @@ class Decoder:
     def _judge(self, frame: Any, pending: _PendingPacket) -> Decoded:
         if frame.is_corrupt:
             self._mended_losses = -1
-        # with intra refresh (strip by strip), FFmpeg marks the first frame as key, but it is predicted
+        # with intra refresh (strip by strip), FFmpeg marks the first frame as key, although it is predicted
         elif (
             frame.key_frame
             and frame.pict_type not in _predicted_kinds()
@@ -488,7 +488,7 @@ class VideoFile:
     def _decode(self) -> Iterator[Decoded]:
         """Yield frames in display order, with their bytes if the frames can be copied."""
         av = load_av()
-        # an .avi has no display times, so frames in display order get the decoding times in order (`slots`)
+        # an .avi has no display times: its frames in display order get the sorted decoding times (`slots`)
         is_avi = self._container.format.name == "avi"
         is_reordered = is_avi and self._stream.codec_context.has_b_frames
         slots: deque[int] = deque()

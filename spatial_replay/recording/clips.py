@@ -136,7 +136,7 @@ def condition_of(text: str, files: Sequence[Specification], monitors: Sequence[M
     if isinstance(target, _Below):
         monitor = next(monitor for monitor in monitors if name in monitor.names)
         reason = f"{name} {'possibly ' if target.is_possible else ''}below {target.threshold:g}"
-        # the lower end shows that the value may be below, the upper end that it certainly is
+        # a robustness is possibly below if its lower end is below, certainly if its upper end is below
         bound = 0 if target.is_possible else 1
         return lambda updates, _: reason if monitor.interval(name)[bound] < target.threshold else None
     return lambda updates, _: f"{name} {target}" if _verdict(updates, name) == target else None

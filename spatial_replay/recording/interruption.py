@@ -1,4 +1,4 @@
-"""Signals during a recording: the log is closed, or a step is finished, before the program ends."""
+"""Handling of signals during a recording: a program closes its log, or finishes a step, before it ends."""
 
 from __future__ import annotations
 

@@ -399,7 +399,7 @@ class FileLog(RecorderLog):
             self.flush()
             warm_up(self._recording.files, self._recording.automata)
         except BaseException:
-            # also after an interruption during the compilation
+            # the stream is closed also after an interruption of the compilation
             with suppress(OutputError):
                 self._stream.close()
             raise
@@ -514,7 +514,7 @@ def _record_trial(files: Sequence[Specification], automata: Sequence[SpecAutomat
     recording.add(Trace.from_samples([Sample(10**10, {})]))
     recording.end()
     writer.close()
-    # the code of arrows at violations, because these samples may have no violation
+    # compile the code of arrows at violations, because these samples may have no violation
     footprints = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
     contacts(footprints, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
 

@@ -70,7 +70,7 @@ class SampleWriter:
             most_lost_s: maximum time of samples that a kill may lose, s.
         """
         self._log, self.name = log, name
-        # reentrant, so an interruption never leaves it locked, unlike a Queue with a limit
+        # a SimpleQueue is reentrant: an interruption never leaves it locked, unlike a Queue with a limit
         # (https://docs.python.org/3/library/queue.html#queue.SimpleQueue.put)
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -241,7 +241,7 @@ class SampleWriter:
         try:
             trace = Trace.from_samples(samples)
         except Exception as error:
-            # only the samples before the faulty one are written
+            # only the samples before the faulty sample are written
             encodable_samples = encodable(samples)
             self._try(
                 lambda: self._log.add(encodable_samples, Trace.from_samples(encodable_samples), messages)

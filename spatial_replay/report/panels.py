@@ -482,7 +482,7 @@ class ReportedScene:
             self.add_frame(time_ns, partial(frames.frame, index))
 
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
-        """Add the next frame, which is computed only if it is kept.
+        """Add the next frame. `frame_of` computes the frame, and is called only for frames that are kept.
 
         The last frame, of the finished log, has the time of the frame before it, and replaces that frame.
         """

@@ -390,7 +390,7 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
 
 
 _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
-"""Index of a result on the page, and index of each of its shown nodes by id, by the result's title."""
+"""By title of a result: the result's index on the page, and the indices of the shown nodes by id."""
 
 
 def _places(report: RunReport) -> _Places:

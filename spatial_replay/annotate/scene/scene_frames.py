@@ -163,7 +163,7 @@ _OPACITY: Final = 0.6
 
 _MAP_PLACES: Final = tuple(np.linspace(-1.0, 1.0, len(MAP)).tolist())
 _MAP_COLOURS: Final = tuple(zip(*(bytes.fromhex(colour[1:]) for colour in MAP), strict=True))
-"""Positions of a map's colours from -1, the worst, to 1, the best, and their red, green and blue."""
+"""Positions of a map's colours, -1 (worst) to 1 (best), and the red, green and blue of these colours."""
 
 
 def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:

@@ -578,7 +578,7 @@ def _deciding_boxes(
             name_boxes[:, side][..., arrow_indices] = blocked_boxes[:, side][..., arrow_indices]
     blocked_boxes[0, _ARROW_BOX] = np.minimum(arrow_ends[0], arrow_ends[1])
     blocked_boxes[1, _ARROW_BOX] = np.maximum(arrow_ends[0], arrow_ends[1])
-    # the name of an object without a box is at the end of the arrow
+    # an object without a box has its name at the end of the arrow
     low, high = np.where(np.isnan(name_boxes), arrow_ends, name_boxes)
     return _DecidingBoxes(low, high, name_lengths, (blocked_boxes[0], blocked_boxes[1]))
 
