@@ -332,8 +332,8 @@ def learn(
         reading: options of reading, as for `read_trace`.
 
     Raises:
-        UsageError: a run is too short, runs are equal or in different units, or there are fewer than two good
-            runs, or the good runs have no common property.
+        UsageError: a run is too short, runs are equal or in different units, or the good runs are fewer than
+            two or without a common property.
         LogError: a log cannot be read.
     """
     refuse_unknown(reading, Reading.__annotations__)

@@ -60,16 +60,16 @@ class Compiler:
             )
         self.interprets = True
         self.spent_s = 0.0
-        # tasks of a child process that compiles, and the trial runs that then load the code
+        # tasks that a child process compiles, and trial runs that load the compiled code
         self.trials: list[tuple[str, Callable[[], object]]] = []
         self.loader: threading.Thread | None = None
         self._loading = set[int]()
         self.listeners: list[Callable[[], None]] = []
         self._is_announced = False
-        # not from `sys.modules`, which contains modules that another thread is still importing, too
+        # not read from `sys.modules`: another thread may still be importing the module
         self._compiler: Any = None
         self.lock = threading.RLock()
-        # held as long as files are open that a forked process must not inherit
+        # held during the use of files that a forked process must not inherit
         self.fork_lock = threading.Lock()
         self.turns = set[int]()
 
@@ -189,7 +189,7 @@ class Compiler:
             self.await_code()
 
     def say(self, text: str) -> None:
-        """Write a line to standard error, unless there are listeners, which show the compilation."""
+        """Write a line to standard error. With listeners, nothing is written: they show the compilation."""
         if not self.listeners:
             sys.stderr.write(f"spatial-replay: {text}\n")
 
@@ -213,7 +213,7 @@ _FIRST_S: Final = 1.5
 """Limit instead of `_PATIENCE_S` for a new kernel, seconds. Most kernels take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
-"""Further limits per kernel, seconds: before it is compiled (`_COLD_S`), before it is loaded (`_WARM_S`)."""
+"""Further limits per kernel, seconds: without cached machine code (`_COLD_S`), or with it (`_WARM_S`)."""
 _GUESS_S: Final = 2e-6
 """Guessed time of a new kernel, seconds per array element."""
 _LONG: Final = 3.0
@@ -272,8 +272,8 @@ def compile_ahead() -> None:
 def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None:
     """Prepare kernels for a control loop, so that no call waits for the compiler.
 
-    A trial run loads cached machine code. If there is none, a child process compiles it, and kernels are
-    interpreted until a thread has loaded it.
+    A trial run loads cached machine code. Without cached code, a child process compiles the kernels. They are
+    interpreted until a thread has loaded the code.
 
     Args:
         task: name of the `spatial-replay warmup` task that compiles all kernels of the trial.
@@ -332,7 +332,7 @@ def _note_of(task: str, folder: Path) -> Path:
 
 @cache
 def _target() -> str:
-    """Return a digest of the target of machine code: Python, numba and processor."""
+    """Return a digest of Python, numba and the processor, the target of machine code."""
     # imported before a control loop runs, because the import would delay the loop
     import numba
 
@@ -529,7 +529,7 @@ class _Kernel(Generic[_Arguments, _Result]):
 def _link(
     function: Callable[_Arguments, _Result], form: Callable[[Any], Any]
 ) -> Callable[_Arguments, _Result]:
-    """Return a copy of a function that calls its kernels in the form that `form` returns."""
+    """Return a copy of a function that calls `form(kernel)` instead of each kernel."""
     original = cast(FunctionType, function)
     globals_by_name = {
         name: original.__globals__[name] for name in _names(original) if name in original.__globals__
@@ -650,7 +650,7 @@ def cache_folder() -> Path | None:
 def remove_damaged_files(folder: Path) -> None:
     """Remove machine code that does not match its digest.
 
-    Code newer than its digest stays as long as other processes use the folder, because it may be unfinished.
+    Code newer than its digest may be unfinished. It stays while other processes use the folder.
     """
     descriptor = _opened_lock(folder)
     try:

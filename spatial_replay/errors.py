@@ -3,13 +3,13 @@
     SpatialReplayError
     ├── UsageError              an invalid call or combination of options
     │   ├── MissingFileError    a file does not exist or cannot be opened
-    │   └── NoAutomatonError    a formula without an automaton, or with too large a one
+    │   └── NoAutomatonError    a formula without an automaton, or with too large an automaton
     ├── SpecificationError      an invalid specification, with all its errors
     ├── GeometryError           invalid footprint coordinates
     ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
     │   ├── RemoteError         an address that does not answer, or whose file changes
-    │   └── UnfitLogError       a log without what a suite requires
+    │   └── UnfitLogError       a log that lacks a requirement of a suite
     ├── OutputError             an output could not be written
     └── ClusterError            a cluster of computers is lost
 
@@ -131,7 +131,7 @@ class RemoteError(LogError):
 
 
 class UnfitLogError(LogError):
-    """A log that lacks what a suite requires: topics, rates, objects."""
+    """A log that lacks a requirement of a suite: topics, rates, objects."""
 
 
 class OutputError(SpatialReplayError):

@@ -134,8 +134,8 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
 class VectorJudge(_VectorWrapper):
     """A vector environment whose episodes are judged. `Judge` returns it for a vector environment.
 
-    Values of `info["judge"]` are arrays with masks (`_verdict`, …). If the last step of an episode also
-    resets it, its last sample is in `info["final_info"]["judge"]`.
+    Values of `info["judge"]` are arrays with masks (`_verdict`, …). A step that ends and resets an episode
+    has the episode's last sample in `info["final_info"]["judge"]`.
     """
 
     def __init__(

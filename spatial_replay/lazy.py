@@ -84,6 +84,6 @@ def data_frame(value: object) -> Any:
 
 
 def drawn_as_svg(value: Displayed) -> str | None:
-    """Return a value as SVG; None if no drawing program is installed."""
+    """Return an automaton as SVG; None if it is large, or if Graphviz is missing or fails."""
     drawing: str | None = import_module("spatial_replay.notebook.evaluation_view").automaton_svg(value)
     return drawing

@@ -144,10 +144,7 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def interval_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
-    """Return a robustness with its unit, and with a wider interval if it has one.
-
-    The text of an interval is such as "between -inf and -0.2 m".
-    """
+    """Return a robustness with its unit. An interval of uncertainty is added: "between -inf and -0.2 m"."""
     robustness_text = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
     if math.isnan(lower) or lower == upper == robustness:
         return robustness_text
@@ -320,6 +317,6 @@ def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
 
 
 def _likeness(name: str, known: str) -> tuple[float, float]:
-    """Return the likeness of two names and of their sorted letters, which also finds swapped letters."""
+    """Return the likeness of two names and of their sorted letters. Sorting finds swapped letters."""
     ratio = difflib.SequenceMatcher(None, known, name).ratio()
     return ratio, difflib.SequenceMatcher(None, sorted(known), sorted(name)).ratio()

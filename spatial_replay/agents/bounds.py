@@ -103,7 +103,7 @@ class Bounds:
         return f"{path}{episode_suffix}"
 
     def _path(self, text: str, argument: str) -> Path | None:
-        """Return the path of an existing file or folder without links; None for a missing one.
+        """Return the path of a file or folder, with links resolved; None if it is missing.
 
         Raises:
             UsageError: the path is outside the roots.

@@ -20,7 +20,7 @@ from spatial_replay.report.panels import unpack_array, with_signs
 from spatial_replay.text import number_text, with_unit
 
 MOST_CURVES: Final = 60
-"""Maximum number of curves in a drawing, which shows the worst."""
+"""Maximum number of curves in a drawing. The worst curves are drawn."""
 _MOST_POINTS: Final = 120
 _WIDTH: Final = 480.0
 _HEIGHT: Final = 120.0

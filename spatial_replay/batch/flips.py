@@ -109,7 +109,7 @@ class RunDiff:
                 yield f"  … and {len(changes) - _LISTED[kind]:,} more"
 
     def table(self) -> Iterator[str]:
-        """Yield the lines of a table with the number of changes of each spec."""
+        """Yield the lines of a table with each spec's numbers of changes."""
         yield f"{plural(self.logs, 'log')}, {plural(self.results, 'result')}"
         counts: dict[tuple[str, str, str], Counter[str]] = {spec: Counter() for spec in self.specs}
         edited_specs = set()

@@ -172,7 +172,7 @@ def _version_at(address: str) -> str:
 
 
 def _version_of(file: RemoteFile) -> tuple[int, str]:
-    """Return the size of a remote file, and its strong ETag or, without one, a digest of its bytes."""
+    """Return the size of a remote file, and its strong ETag; without an ETag, the digest of its bytes."""
     version = file.current_version()
     if version.is_exact:
         return version.size, str(version.tag)

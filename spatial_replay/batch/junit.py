@@ -41,7 +41,7 @@ def write_junit(
 ) -> None:
     """Write the table of a run as a JUnit report.
 
-    A report above the limit has shorter texts. If these are too large, the report has only the number of
+    A report above the limit has shorter texts. A report that is still too large has only the number of
     passing test cases in each test suite.
 
     Args:

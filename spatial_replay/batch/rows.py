@@ -103,7 +103,7 @@ class ResultRow:
         vacuous: sentences on the parts that decided nothing.
         left: sentences on group members that left the log within reach of a threshold and came back.
         doubts: names of the verdict's assumptions that the log contradicts.
-        doubtful: a sentence on each of these assumptions.
+        doubtful: sentences on the assumptions in `doubts`.
         dropped: sentence on messages that the recorder dropped, or None.
         samples: number of evaluated samples.
         zero_ns: zero of the times in sentences about the log.
@@ -184,7 +184,7 @@ def rows_from_task(task: Task, explained: Collection[ResultName] | None = ()) ->
 def rows_from_tasks(tasks: tuple[Task, ...]) -> list[TaskRows]:
     """Return the rows of several logs. Short logs are evaluated together."""
     rows: list[TaskRows] = []
-    # tasks of a case are neighbours, which `groupby` needs
+    # `groupby` needs neighbours, and the tasks of a case are neighbours
     for _, like_tasks in groupby(tasks, lambda task: (task.specs, task.conditions)):
         rows += _rows_of_like_tasks(list(like_tasks))
     return rows

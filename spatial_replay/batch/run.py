@@ -159,7 +159,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
 
 
 _DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
-"""Folder names; a data set that is a folder contains at least one of them."""
+"""Folder names. The folder of a data set contains at least one of them."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 
@@ -513,7 +513,7 @@ def run_batch(
         identities_by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
-        # written before the evaluation: a batch after a killed one does not hash the logs again
+        # written before the evaluation: after a killed batch, the next batch does not hash the logs again
         folder.write_identities(identities_by_state)
         storable_keys = {
             request.key for request in requests if request.key is not None and not request.file.has_plugins

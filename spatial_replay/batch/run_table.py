@@ -468,10 +468,10 @@ class Tolerance:
         return cls(float(percent or 0.0) / 100.0, float(amount or floor or 0.0), unit or floor_unit or "")
 
     def check(self, units: Iterable[str | None]) -> None:
-        """Check that the unit of an amount is a unit of the results.
+        """Check that some result has the unit of the amount.
 
         Raises:
-            UsageError: the amount lacks the results' unit, or no result has the amount's unit.
+            UsageError: the amount has no unit although results have one, or its unit is no result's unit.
         """
         units_of_results = sorted({unit for unit in units if unit and unit != "1"})
         if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):

@@ -218,7 +218,7 @@ def _encode_table(table: pa.Table) -> bytes:
     from pyarrow import parquet
 
     stream = io.BytesIO()
-    # one combined chunk is written in a quarter of the time of many small ones
+    # writing one combined chunk takes a quarter of the time of many small chunks
     parquet.write_table(table.combine_chunks(), stream, compression="zstd")
     data = stream.getvalue()
     footer_start = _footer(data)

@@ -221,7 +221,7 @@ class Case:
         requirements: ids of the case's requirements, for specs without an id.
         at_least_logs: least number of logs; fewer logs are a fault.
         places: file and line of each key, for errors; empty for a command line.
-        is_whole: whether specs, constants and objects of parameters have no faulty value, which is left out.
+        is_whole: whether specs, constants and objects of parameters are complete. Faulty values are left out.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The command line: one file per command; each parses, calls one function, and prints the result.
+"""The command line. The file of a command parses options, calls one function, and prints the result.
 
 Commands import the numerical libraries inside their functions, so that `--help` answers at once.
 """

@@ -148,7 +148,7 @@ class LazyCommands(click.Group):
 )
 @click.version_option(__version__, "-V", "--version", prog_name=PROGRAM, message="%(prog)s %(version)s")
 def application() -> None:
-    """Check whether a recorded run did what it should: where, when, and by how much.
+    """Check whether a recorded run satisfies its specification: where, when, and by how much.
 
     \b
     Example:
@@ -196,7 +196,7 @@ def _end_waiting_threads(exit_code: int) -> None:
 
 
 _AGAIN_S = 0.05
-"""Delay of the next interruption after an ignored one, seconds."""
+"""Delay before an ignored interruption is repeated, seconds."""
 
 
 class _Interruption(KeyboardInterrupt):
@@ -212,7 +212,7 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
-    """Interrupt again a moment after an ignored interruption, such as one in a callback of numba."""
+    """Repeat an ignored interruption after a moment. A callback of numba, for example, ignores it."""
     if isinstance(ignored.exc_value, _Interruption):
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     else:
@@ -220,7 +220,11 @@ def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the program with these arguments (by default those of the process) and return its exit code."""
+    """Run the program, and return its exit code.
+
+    Args:
+        arguments: command line without the program's name; None for the arguments of the process.
+    """
     try:
         exit_code = application.main(
             args=None if arguments is None else list(arguments),
@@ -366,7 +370,7 @@ def new_form(option: str, command: click.Command) -> str | None:
 
 
 def report_error(error: BaseException) -> None:
-    """Write an error to standard error; with its traceback if SPATIAL_REPLAY_DEBUG is set."""
+    """Write an error to standard error. SPATIAL_REPLAY_DEBUG adds the traceback."""
     if os.environ.get(DEBUG_VARIABLE):
         show(*"".join(traceback.format_exception(error)).splitlines(), err=True)
     if isinstance(error, click.exceptions.NoArgsIsHelpError):

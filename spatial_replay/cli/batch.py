@@ -259,10 +259,10 @@ def batch(
     fail_on: frozenset[str],
     allow: frozenset[str],
 ) -> int:
-    """Evaluate many logs (a suite file, or logs with specifications) and show what fails.
+    """Evaluate many logs (a suite file, or logs with specifications), and show the failures.
 
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are stored in a
-    folder, and another run evaluates only missing ones. A log that cannot be read has a row with its error.
+    folder, and a later run evaluates only missing results. An unreadable log has a row with its error.
 
     One exit code covers all logs, with the meanings of replay. The code is 0 if everything is as expected, 1
     if anything fails, 3 if logs are damaged or unfit, 4 if results are unknown, doubtful or tested by
@@ -365,7 +365,8 @@ def _suite(logs: tuple[str, ...], arguments: ConditionArguments, semantics: Sema
     """Return the suite of a suite file, or of logs with options.
 
     Raises:
-        UsageError: both are given, there is no specification, or the suite is invalid.
+        UsageError: a suite file has logs or options next to it, there is no specification, or the suite is
+            invalid.
     """
     from spatial_replay.batch.suite import Conditions, load_suite
 

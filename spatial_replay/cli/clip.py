@@ -221,7 +221,7 @@ def verify(
     signature: Path | None,
     reading: Reading,
 ) -> int:
-    """Recompute a log's certificate and compare it with the recorded one.
+    """Recompute a log's certificate, and compare it with the recorded certificate.
 
     The log is evaluated with its own specifications and options. With --decisions, every planner decision is
     recomputed from the recorded samples, with all its maps, and compared bit for bit. With --source, the
@@ -258,7 +258,7 @@ def verify(
     annotated = open_source(log)
     original = None
     if source is not None:
-        # options of the command line have precedence over the recorded ones
+        # options of the command line have precedence over recorded options
         options = ReadOptions(**reading).non_defaults()
         original = open_source(source, **{**reading, **recorded_reading(annotated, source.name), **options})
     with progress("samples") as advance:

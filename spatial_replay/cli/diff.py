@@ -193,7 +193,7 @@ def _causes(
 
     Args:
         paths: paths of logs, by name.
-        specifications: the old specification and the new one.
+        specifications: the old and the new specification.
     """
     from spatial_replay.compare.specifications import diff_over_source
 

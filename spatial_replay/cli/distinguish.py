@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 def distinguish(first: LogFile, second: LogFile, hz: float | None, as_json: bool) -> int:
-    """Find the shortest run that one of two specifications accepts and the other one rejects.
+    """Find the shortest run that one of two specifications accepts and the other rejects.
 
     Both directions are searched. A specification accepts a run if the run satisfies all its results. Exits
     with 0 if both accept the same runs, with 1 if they differ, and with 4 if the search is undecided.

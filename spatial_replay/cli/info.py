@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _EXTENSION = "spatial-replay.foxe"
 """File name of the extension for Foxglove and Lichtblick."""
 _EPOCH_LIKELY_NS = 10**18
-"""Least time that counts from 1970; it is in 2001. Smaller times count from the start of the run."""
+"""Least time since 1970, ns: a moment in 2001. Smaller times count from the start of the run."""
 
 
 _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
@@ -94,8 +94,8 @@ def info(
 ) -> int:
     """Show the contents of a log: samples, objects, signals, topics, attachments.
 
-    An external log is shown with its topics and their possible mapping; with a mapping, the objects are
-    shown. A data set is shown with its tasks, labels and features. push_v3#2 is the address of one episode.
+    For an external log, it shows the topics and a possible mapping. With a mapping, it shows the mapped
+    objects. For a data set, it shows tasks, labels and features. push_v3#2 is the address of one episode.
 
     The command reads the whole log. The exit code is 0, or 3 for a damaged log. Damage is reported on
     standard error.
@@ -264,7 +264,7 @@ def _print_decisions(log: LogFile, number: str, as_json: bool) -> int:
 
 
 def _print_fitness(log: LogFile, reading: Reading) -> int:
-    """Print the section `requires` of a suite for logs like this one."""
+    """Print the section `requires` of a suite, with the rates, gaps and objects of this log."""
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import Regularity, fitness_of
 

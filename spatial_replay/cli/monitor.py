@@ -390,7 +390,7 @@ class _Run:
 
     @contextmanager
     def _signals(self, loop: asyncio.AbstractEventLoop) -> Iterator[None]:
-        """End the run at the first Ctrl-C; the second one interrupts the program."""
+        """End the run at the first Ctrl-C. The second Ctrl-C interrupts the program."""
         handled_signals: list[signal.Signals] = []
 
         def stop(signal_number: signal.Signals) -> None:

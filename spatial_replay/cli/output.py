@@ -60,7 +60,7 @@ def _ending_numbers(ending: Ending) -> str:
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:
-    """Print one line for each result, and another one for a sliding window."""
+    """Print one line for each result, and a further line for a sliding window."""
     span_text = time_text(replayed.end_ns, replayed.start_ns)
     notes = ", damaged: verdicts are over what could be read" if replayed.faults else ""
     verdicts = [result.verdict for result in replayed.results]
@@ -183,7 +183,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
-    """Return the number of violations over the sliding window and the time of the first one, as text."""
+    """Return the number of violations over the sliding window, and the first violation's time, as text."""
     if result.leaves is None:
         return ""
     robustness, times_ns = result.window_signal(window_ns)[0], result.times_ns

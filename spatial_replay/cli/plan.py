@@ -129,7 +129,7 @@ def _redo(
 
 
 def _why(log: LogFile, decision_number: int | None, object_name: str | None, place: str | None) -> int:
-    """Print why a decision did not bring an object to a place."""
+    """Print the reasons why a decision did not bring an object to a place."""
     # imported here so that --help stays fast
     from spatial_replay.planning.read import why_not_there
 

@@ -328,7 +328,7 @@ def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def show_film(videos: Sequence[Path]) -> None:
-    """Print how to read the videos of a run, if there are any."""
+    """Print the command that reads the videos of a run, if there are any."""
     if videos:
         from spatial_replay.runs.virtual_camera import tags_of_film
 

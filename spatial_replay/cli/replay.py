@@ -102,7 +102,7 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
     except (SpecificationError, MissingFileError) as error:
         if not all(path.parent.is_dir() and not path.is_dir() for path in files.paths):
             raise
-        # an unreadable log raises here, because no saved specification would help
+        # raises the error of an unreadable log, because a saved specification would not help
         open_inputs(replace(request, specs=(), constants={}), can_do_without=True)
         _wait_for_files(files, error)
     return files

@@ -126,7 +126,7 @@ def tune(
     constants: Mapping[str, float | str],
     reading: Reading,
 ) -> ExitCode:
-    """Find the constants with which good runs satisfy a specification and bad runs violate it.
+    """Find constants for which good runs satisfy a specification, and bad runs violate it.
 
     With good and bad runs, the values have the widest margin between good and bad. With good runs only, the
     values are the tightest. Constants to tune have a range in the text, such as const near = 70 in [40, 100],
@@ -248,7 +248,7 @@ def learn(
     as_json: bool,
     reading: Reading,
 ) -> ExitCode:
-    """Find a short specification that all GOOD runs satisfy and that bad ones violate.
+    """Find a short specification that all GOOD runs satisfy, and bad runs violate.
 
     Its lines are invariants, ends of runs, goals and orders of events, for objects by name or for a class.
     With bad runs, some bad run violates each line, and the most distinctive line comes first. Without bad

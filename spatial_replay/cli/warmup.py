@@ -140,7 +140,7 @@ TASKS: Mapping[str, Callable[[], None]] = MappingProxyType(
         "bag": _read_bag,
     }
 )
-"""Tasks by name, the longest first, so that no core waits for the last one."""
+"""Tasks by name, the longest first: a long last task would leave cores idle."""
 
 
 @click.command()
