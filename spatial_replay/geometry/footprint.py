@@ -580,13 +580,13 @@ def packed_centre(tracked: TrackedObject) -> tuple[bytes, bytes]:
 
 @elementwise
 @kernel
-def _fill_packed_centre(numbers: Floats, centre: Floats) -> None:
+def _fill_packed_centre(number_pairs: Floats, centre: Floats) -> None:
     """Fill `centre` (2,) from packed parts, with the same steps as `_fill_centres`."""
     total_area = sum_x = sum_y = mean_x = mean_y = 0.0
     header, part_count = 0, 0
-    while header < len(numbers):
-        end = header + 1 + int(numbers[header, 0])
-        area, x, y = weight_and_centre(numbers, header + 1, end, numbers[header, 1])
+    while header < len(number_pairs):
+        end = header + 1 + int(number_pairs[header, 0])
+        area, x, y = weight_and_centre(number_pairs, header + 1, end, number_pairs[header, 1])
         total_area, sum_x, sum_y = total_area + area, sum_x + area * x, sum_y + area * y
         mean_x, mean_y = mean_x + x, mean_y + y
         header, part_count = end, part_count + 1

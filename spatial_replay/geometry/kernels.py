@@ -261,7 +261,7 @@ def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) ->
 @reference_free
 def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
     """Return the signed distance of rows a and b; rows that both have heights are upright prisms."""
-    start = rows.vertex_start
+    vertex_start = rows.vertex_start
     least_distance = np.inf
     for part in range(rows.part_start[a], rows.part_start[a + 1]):
         for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
@@ -272,10 +272,10 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
             distance = _convex_distance(
                 rows.vertices,
                 rows.edges,
-                start[part],
-                start[part + 1],
-                start[other_part],
-                start[other_part + 1],
+                vertex_start[part],
+                vertex_start[part + 1],
+                vertex_start[other_part],
+                vertex_start[other_part + 1],
             )
             least_distance = min(least_distance, distance - radii)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
@@ -288,7 +288,7 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
 
 @reference_free
 def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) -> float:
-    start, radius = rows.vertex_start, rows.radius
+    vertex_start, radius = rows.vertex_start, rows.radius
     least_protrusion = np.inf
     for other_part in range(rows.part_start[b], rows.part_start[b + 1]):
         # the protrusion from a part is at least the distance from it, so far parts cannot give the least
@@ -297,7 +297,12 @@ def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) 
         if least_protrusion < np.inf and _is_farther(rows, part, other_part, reach):
             continue
         planar = _convex_protrusion(
-            rows.vertices, rows.edges, start[part], start[part + 1], start[other_part], start[other_part + 1]
+            rows.vertices,
+            rows.edges,
+            vertex_start[part],
+            vertex_start[part + 1],
+            vertex_start[other_part],
+            vertex_start[other_part + 1],
         )
         least_protrusion = min(least_protrusion, planar + (radius[part] - radius[other_part]) + enlargement)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
@@ -418,8 +423,8 @@ def measure_rows(
         block_end = min(block + BLOCK, end)
         for request in range(len(quantity)):
             if quantity[request] <= PROTRUSION:
-                for side in range(2):
-                    operand = first[request] if side == 0 else second[request]
+                for operand_side in range(2):
+                    operand = first[request] if operand_side == 0 else second[request]
                     operand_start = member_start[operand]
                     for member in range(
                         operand_start + block * width[operand], operand_start + block_end * width[operand]
@@ -428,15 +433,15 @@ def measure_rows(
         for sample in range(block, block_end):
             for request in range(values.shape[0]):
                 a, b = first[request], second[request]
-                start = member_start[a] + sample * width[a]
-                a_members = (start, start + width[a])
+                first_element = member_start[a] + sample * width[a]
+                a_members = (first_element, first_element + width[a])
                 if quantity[request] >= MIN_X:
                     values[request, sample] = _union_extreme(
                         rows, members, a_members, quantity[request], enlargement[a]
                     )
                     continue
-                start = member_start[b] + sample * width[b]
-                b_members = (start, start + width[b])
+                first_element = member_start[b] + sample * width[b]
+                b_members = (first_element, first_element + width[b])
                 if quantity[request] == SIGNED_DISTANCE:
                     enlargements = enlargement[a] + enlargement[b]
                     values[request, sample] = _union_distance(
@@ -527,13 +532,13 @@ def _of_parts(
 @piece
 def _line(vertices: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int) -> _Line:
     """Return the line of the signed distance of two convex polygons, segments or points."""
-    from_a = _push(vertices, a_start, a_stop, b_start, b_stop)
-    from_b = _push(vertices, b_start, b_stop, a_start, a_stop)
-    if from_b[4] > from_a[4]:
-        x, y, dx, dy, distance = from_b
-        from_a = (x + dx * distance, y + dy * distance, -dx, -dy, distance)
-    if -np.inf < from_a[4] <= 0.0:
-        return from_a
+    push_from_a = _push(vertices, a_start, a_stop, b_start, b_stop)
+    push_from_b = _push(vertices, b_start, b_stop, a_start, a_stop)
+    if push_from_b[4] > push_from_a[4]:
+        x, y, dx, dy, distance = push_from_b
+        push_from_a = (x + dx * distance, y + dy * distance, -dx, -dy, distance)
+    if -np.inf < push_from_a[4] <= 0.0:
+        return push_from_a
     near_a = _nearest(vertices, a_start, a_stop, b_start, b_stop)
     near_b = _nearest(vertices, b_start, b_stop, a_start, a_stop)
     if near_b[4] < near_a[4]:

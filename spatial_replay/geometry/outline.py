@@ -131,12 +131,12 @@ _MOST_TESTED_CORNERS = 16
 
 @elementwise
 @kernel
-def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
+def _normalise_all(starts: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
     """Normalise every outline in place and close the gaps; return the number of vertices left."""
     used_count = 0
     scratch = np.empty_like(vertices)
     for outline in range(len(counts)):
-        first, stop = start[outline], start[outline + 1]
+        first, stop = starts[outline], starts[outline + 1]
         counts[outline] = stop - first
         fault[outline] = SOUND
         tolerance = _tolerance(vertices, first, stop)

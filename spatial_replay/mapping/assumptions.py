@@ -366,7 +366,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _compass(evidence: TopicEvidence, log: Log) -> str | None:
-    """Return a clause on the zero of an angle next to fixes, unless motions confirm the angle."""
+    """Return a clause on an angle next to satellite fixes, unless motions confirm its zero."""
     yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
     courses = evidence.motions.courses
     goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW

@@ -136,9 +136,9 @@ class Namer:
             return [self._codes[self._name(*argument)] for argument in arguments]
         codes = []
         for argument in arguments:
-            value = get(*argument)
+            field_value = get(*argument)
             # the list of a UUID is not hashable
-            value_key = value if isinstance(value, str | int | float) else bytes(value)
+            value_key = field_value if isinstance(field_value, str | int | float) else bytes(field_value)
             code = code_by_value.get(value_key)
             if code is None:
                 code = code_by_value[value_key] = self._codes[self._name(*argument)]
@@ -214,10 +214,10 @@ def class_codes(
     code_by_value: dict[Any, int] = {}
     object_codes = []
     for element in objects:
-        value = _first_value(binding.class_gets, element)
-        code = code_by_value.get(value)
+        class_value = _first_value(binding.class_gets, element)
+        code = code_by_value.get(class_value)
         if code is None:
-            code = code_by_value[value] = codes[_class_name(layout, value, binding.class_names)]
+            code = code_by_value[class_value] = codes[_class_name(layout, class_value, binding.class_names)]
         object_codes.append(code)
     return object_codes
 
@@ -235,37 +235,39 @@ def _first_value(getters: Sequence[Get], element: object) -> Any:
     return None
 
 
-def _class_name(layout: MessageLayout, value: object, names: Table[object, str]) -> str | None:
-    if value is None or value == "":
+def _class_name(layout: MessageLayout, class_value: object, name_by_value: Table[object, str]) -> str | None:
+    if class_value is None or class_value == "":
         return None
     # JSON can contain lone surrogates as escapes, which UTF-8 cannot encode
-    value_text = str(value).encode("utf-8", "replace").decode()
-    class_text = names.get(value, value_text)
+    value_text = str(class_value).encode("utf-8", "replace").decode()
+    class_text = name_by_value.get(class_value, value_text)
     for table_key in (value_text, class_text):
         if table_key in layout.class_table:
             return layout.class_table[table_key]
     return layout.class_other if layout.class_has_other else class_text
 
 
-def _text(value: object, path: FieldPath) -> str:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, Zero):
+def _text(field_value: object, path: FieldPath) -> str:
+    if isinstance(field_value, str):
+        return field_value
+    if isinstance(field_value, Zero):
         return "0"
-    if isinstance(value, float) and value.is_integer():
-        return str(int(value))
-    if isinstance(value, int | float) or (hasattr(value, "item") and not hasattr(value, "__len__")):
-        return str(value)
-    if field_names(value) in (("value",), ("uuid",)):
+    if isinstance(field_value, float) and field_value.is_integer():
+        return str(int(field_value))
+    if isinstance(field_value, int | float) or (
+        hasattr(field_value, "item") and not hasattr(field_value, "__len__")
+    ):
+        return str(field_value)
+    if field_names(field_value) in (("value",), ("uuid",)):
         # a message with one field, such as osi3.Identifier and unique_identifier_msgs/UUID
-        return _text(get_field(value, field_names(value)[0]), path)
-    if _is_uuid(value):
-        digits = bytes(value).hex()  # type: ignore[call-overload]
+        return _text(get_field(field_value, field_names(field_value)[0]), path)
+    if _is_uuid(field_value):
+        digits = bytes(field_value).hex()  # type: ignore[call-overload]
         # a UUID of zeros was not set
         return str(digits) if digits.strip("0") else ""
-    if is_list(value) and len(value) <= _MOST_IN_NAME:
-        return "_".join(_text(part, path) for part in value)
-    raise FieldError(f"{path.text}: expected a text or a number, got {type_name(value)}")
+    if is_list(field_value) and len(field_value) <= _MOST_IN_NAME:
+        return "_".join(_text(part, path) for part in field_value)
+    raise FieldError(f"{path.text}: expected a text or a number, got {type_name(field_value)}")
 
 
 def _is_uuid(value: object) -> bool:
@@ -435,8 +437,8 @@ def ns_from_json(value: Any) -> int:
     """
     if isinstance(value, dict):
         seconds, nanoseconds = (
-            next((value[name] for name in names if name in value), 0)
-            for names in zip(*_TIME_FIELDS, strict=True)
+            next((value[name] for name in field_pair if name in value), 0)
+            for field_pair in zip(*_TIME_FIELDS, strict=True)
         )
         time_ns = int(seconds) * _SECOND_NS + int(nanoseconds)
     else:
@@ -467,9 +469,9 @@ class _Columns:
     def add(self, path: FieldPath) -> int:
         if path.from_message:
             raise FieldError(f"{path.text}: $. is for frame, stamp and signals; give a field of the object")
-        value = walk(path, self.example)
-        if not (is_number(value) or _is_numeral(value)):
-            raise FieldError(f"{path.text}: expected a number, got {type_name(value)}")
+        example_value = walk(path, self.example)
+        if not (is_number(example_value) or _is_numeral(example_value)):
+            raise FieldError(f"{path.text}: expected a number, got {type_name(example_value)}")
         path_texts = [column.text for column in self.paths]
         if path.text in path_texts:
             return path_texts.index(path.text)
@@ -628,11 +630,11 @@ def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
     def columns_of(paths: str | tuple[str, ...]) -> tuple[int, ...]:
         if isinstance(paths, tuple):
             return columns.add_all(paths)
-        value = walk(FieldPath.of(paths), columns.example)
+        quaternion_value = walk(FieldPath.of(paths), columns.example)
         quaternion = columns.point(FieldPath.of(paths), "xyzw")
         if len(quaternion) != 4:
             raise FieldError(f"{paths}: it is not a quaternion; give the path of one with x, y, z, w")
-        if not is_list(value):
+        if not is_list(quaternion_value):
             if layout.order:
                 raise OrderError(f"{paths}: its fields are named x, y, z and w; leave `order` out")
             return quaternion
@@ -641,7 +643,7 @@ def _orientation(layout: MessageLayout, columns: _Columns) -> tuple[int, ...]:
                 f"{paths}: the four numbers have no names; `order: wxyz` says that w comes first,"
                 " `order: xyzw` that it comes last"
             )
-        return tuple(quaternion[layout.order.index(name)] for name in "xyzw")
+        return tuple(quaternion[layout.order.index(axis)] for axis in "xyzw")
 
     return _first(layout.orientation, columns_of) or ()
 
@@ -675,12 +677,12 @@ def _polygon(layout: MessageLayout, columns: _Columns) -> tuple[Get | None, bool
     path = FieldPath.of(outline_path)
     if (ring_path := path_of_rings(path, example)) is not None:
         return (getter(ring_path, example) if ring_path.steps else lambda element: element), True
-    value = walk(path, example)
-    if "points" in field_names(value):
+    outline = walk(path, example)
+    if "points" in field_names(outline):
         # geometry_msgs/Polygon
-        path, value = below(path, "points"), get_field(value, "points")
-    if not is_list(value):
-        raise FieldError(f"{path.text}: expected a list of corners, got {type_name(value)}")
+        path, outline = below(path, "points"), get_field(outline, "points")
+    if not is_list(outline):
+        raise FieldError(f"{path.text}: expected a list of corners, got {type_name(outline)}")
     return getter(path, example), False
 
 
@@ -691,9 +693,11 @@ def _uncertainty(layout: MessageLayout, columns: _Columns) -> tuple[float | int 
     if not uncertainty.is_covariance:
         return columns.measure(uncertainty.measure), None
     path = FieldPath.of(str(uncertainty.measure) or layout.covariance or "covariance")
-    value = walk(path, columns.example)
-    if not is_list(value) or len(value) not in (4, 9, 36):
-        raise FieldError(f"{path.text}: expected a covariance of 4, 9 or 36 numbers, got {type_name(value)}")
+    covariance = walk(path, columns.example)
+    if not is_list(covariance) or len(covariance) not in (4, 9, 36):
+        raise FieldError(
+            f"{path.text}: expected a covariance of 4, 9 or 36 numbers, got {type_name(covariance)}"
+        )
     return None, getter(path, columns.example)
 
 
@@ -705,9 +709,9 @@ def _frame(
         root = message if path.from_message else example
         if (len(paths) > 1 or not needs_frame) and not leads_somewhere(path, root):
             continue
-        value = walk(path, root)
-        if not isinstance(value, str):
-            raise FieldError(f"{path.text}: expected the name of a frame, got {type_name(value)}")
+        frame_name = walk(path, root)
+        if not isinstance(frame_name, str):
+            raise FieldError(f"{path.text}: expected the name of a frame, got {type_name(frame_name)}")
         return getter(path, root), path.from_message
     return None
 
@@ -739,23 +743,23 @@ def bind_time(
 
 
 def _time_getter(stamp: Stamp, path: FieldPath, root: object) -> TimeGetter:
-    value = walk(path, root)
+    stamp_value = walk(path, root)
     if stamp.nanoseconds:
         paths = [path, FieldPath.of(stamp.nanoseconds)]
         if not all(is_number(walk(part_path, root)) for part_path in paths):
             raise FieldError(f"{path.text}: seconds and nanoseconds have to be numbers")
         return TimeGetter(path, tuple_getter(paths, root), True, 1)
-    existing_names = field_names(value)
-    any_or_all = any if isinstance(value, Sparse) else all
+    existing_names = field_names(stamp_value)
+    any_or_all = any if isinstance(stamp_value, Sparse) else all
     for part_names in _TIME_FIELDS:
         if any_or_all(name in existing_names for name in part_names):
-            pair = tuple_getter([below(path, name) for name in part_names], root)
-            return TimeGetter(path, pair, True, 1)
-    if is_list(value) and len(value) == 2 and all(type(part) is int for part in value):
+            pair_getter = tuple_getter([below(path, name) for name in part_names], root)
+            return TimeGetter(path, pair_getter, True, 1)
+    if is_list(stamp_value) and len(stamp_value) == 2 and all(type(part) is int for part in stamp_value):
         return TimeGetter(path, getter(path, root), True, 1)
-    if isinstance(value, str):
-        ns_from_text(value, stamp.unit_ns)
-    elif not is_number(value):
+    if isinstance(stamp_value, str):
+        ns_from_text(stamp_value, stamp.unit_ns)
+    elif not is_number(stamp_value):
         remedy = "give the path of a stamp, a number or a text; `clock: log` takes the time of recording"
-        raise FieldError(f"{path.text}: {type_name(value)} is not a time; {remedy}")
+        raise FieldError(f"{path.text}: {type_name(stamp_value)} is not a time; {remedy}")
     return TimeGetter(path, getter(path, root), False, stamp.unit_ns)

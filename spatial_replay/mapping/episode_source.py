@@ -222,7 +222,7 @@ class EpisodeSource(Source):
         frame_count: int,
         report: Report,
     ) -> tuple[list[str], ObservationRows]:
-        """Return the names of objects, and the objects' observations in all frames, object by object.
+        """Return the names of objects, and observations in all frames, ordered by object.
 
         Objects are checked together, because a check of few rows costs as much as a check of many rows.
         Frames without a valid footprint are faults.

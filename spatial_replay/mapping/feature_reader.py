@@ -194,7 +194,7 @@ def _bind_signal(signal: SignalMapping, entry: TopicMapping, places: _Places) ->
     return BoundSignal(signal.name, places.single(f"signals.{signal.name}", signal.field), entry.invalid)
 
 
-def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> BoundObject:
+def _bind_object(entry: TopicMapping, places: _Places, default_order: str | None) -> BoundObject:
     """Bind an entry with a position.
 
     Raises:
@@ -212,13 +212,15 @@ def _bind_object(entry: TopicMapping, places: _Places, order: str | None) -> Bou
     quaternion: tuple[NumberPlace, ...] = ()
     if entry.orientation is not None:
         quaternion = places.several("orientation", entry.orientation, (4,))
-        order = entry.order or order or ("xyzw" if isinstance(entry.orientation, tuple) else None)
-        if order is None:
+        default_order = (
+            entry.order or default_order or ("xyzw" if isinstance(entry.orientation, tuple) else None)
+        )
+        if default_order is None:
             raise UsageError(
                 f"{places.key}.orientation: the four numbers have no names; `order: wxyz` says that w comes"
                 " first, `order: xyzw` that it comes last"
             )
-        quaternion = tuple(quaternion[order.index(name)] for name in "xyzw")
+        quaternion = tuple(quaternion[default_order.index(name)] for name in "xyzw")
     shape = entry.shape
     if shape is not None and shape.outline:
         raise UsageError(f"{places.key}.shape: a feature has no list of corners; give [[x, y], …]")
@@ -386,21 +388,23 @@ class _Places:
     def _example(self, count: int) -> str:
         return "[0]" if count == 1 else f'"[0:{count}]"'
 
-    def _places(self, key: str, text: str) -> Iterator[NumberPlace]:
+    def _places(self, key: str, place_text: str) -> Iterator[NumberPlace]:
         feature = self.feature
-        if text in feature.places:
-            yield NumberPlace(feature.name, feature.places.index(text), text)
+        if place_text in feature.places:
+            yield NumberPlace(feature.name, feature.places.index(place_text), place_text)
             return
-        whole_feature = self.data_set.feature(text)
+        whole_feature = self.data_set.feature(place_text)
         if whole_feature is not None:
             yield from (_place(whole_feature, index) for index in range(whole_feature.width))
             return
-        slice_match = _SLICE.fullmatch(text)
+        slice_match = _SLICE.fullmatch(place_text)
         source = (
             feature if slice_match is None or not slice_match[1] else self.data_set.feature(slice_match[1])
         )
         if slice_match is None or source is None:
-            raise UsageError(f"{self.key}.{key}: {feature.name} has no place {text!r}; {self._hint(text)}")
+            raise UsageError(
+                f"{self.key}.{key}: {feature.name} has no place {place_text!r}; {self._hint(place_text)}"
+            )
         if slice_match[2] is None:
             begin, end = (
                 None if bound_text is None else int(bound_text) for bound_text in slice_match.groups()[2:]
@@ -411,14 +415,14 @@ class _Places:
         if not -source.width <= index < source.width:
             raise UsageError(
                 f"{self.key}.{key}: {source.name} has {plural(source.width, 'number')}, so there is no"
-                f" {text}; write [0] to [{source.width - 1}]"
+                f" {place_text}; write [0] to [{source.width - 1}]"
             )
         yield _place(source, index % source.width)
 
-    def _hint(self, text: str) -> str:
+    def _hint(self, place_text: str) -> str:
         places, width = self.feature.places, self.feature.width
         known_names = [*places, *(feature.name for feature in self.data_set.features)]
-        if hint := nearest_hint(text, known_names):
+        if hint := nearest_hint(place_text, known_names):
             return hint
         if places:
             return f"its places are {listing(list(places))}"

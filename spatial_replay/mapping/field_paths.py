@@ -152,15 +152,19 @@ def from_protobuf_json(value: object, objects: str) -> object:
 _POINT = MappingProxyType({"x": 0.0, "y": 0.0, "z": 0.0})
 
 
-def _message_from_json(value: object) -> object:
-    if isinstance(value, list):
+def _message_from_json(json_value: object) -> object:
+    if isinstance(json_value, list):
         # a list of numbers is not copied, because it may be long
-        return list(map(_message_from_json, value)) if value and isinstance(value[0], dict | list) else value
-    if not isinstance(value, dict):
-        return value
-    if value.keys() <= {"x", "y", "z", "w"}:
-        return {**_POINT, **value}
-    fields = {key: _message_from_json(field_value) for key, field_value in value.items()}
+        return (
+            list(map(_message_from_json, json_value))
+            if json_value and isinstance(json_value[0], dict | list)
+            else json_value
+        )
+    if not isinstance(json_value, dict):
+        return json_value
+    if json_value.keys() <= {"x", "y", "z", "w"}:
+        return {**_POINT, **json_value}
+    fields = {key: _message_from_json(field_value) for key, field_value in json_value.items()}
     if "position" in fields:
         # a missing orientation becomes a quaternion of zeros, as in protobuf's binary encoding
         fields.setdefault("orientation", {**_POINT, "w": 0.0})
@@ -272,12 +276,12 @@ class Best:
 _SCORES = ("score", "probability", "confidence")
 
 
-def _score(value: object) -> float:
+def _score(result: object) -> float:
     """Return the score of a result, or of its hypothesis; -inf without a score."""
-    score_fields = field_names(value)
+    score_fields = field_names(result)
     if "hypothesis" in score_fields:
-        return _score(get_field(value, "hypothesis"))
-    scores: Iterator[Any] = (get_field(value, name) for name in _SCORES if name in score_fields)
+        return _score(get_field(result, "hypothesis"))
+    scores: Iterator[Any] = (get_field(result, name) for name in _SCORES if name in score_fields)
     best_score = next((float(score) for score in scores if score is not None and is_number(score)), nan)
     return -inf if isnan(best_score) else best_score
 
@@ -633,8 +637,8 @@ class NameTemplate:
             example = "tag{id}, {ns}_{id}"
             raise UsageError(f"{text[:80]!r} is not a name; write text with fields in braces: {example}")
         parts = tuple(
-            literal if fields is None else tuple(map(FieldPath.of, fields.split("|")))
-            for fields, literal in (match.groups() for match in _PART.finditer(text))
+            literal if field_list is None else tuple(map(FieldPath.of, field_list.split("|")))
+            for field_list, literal in (part_match.groups() for part_match in _PART.finditer(text))
         )
         return cls(text, parts)
 

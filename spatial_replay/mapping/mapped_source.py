@@ -300,7 +300,7 @@ class _TreeLog:
 
     def ticks(self, messages: MessageColumns) -> Messages:
         """Return one tick per message of a tree's log."""
-        rows = []
+        tick_rows = []
         log_messages = select(messages, np.flatnonzero(np.isin(messages.channel, list(self._channels))))
         for message in replace(log_messages, channels=self._channels).messages():
             try:
@@ -316,9 +316,9 @@ class _TreeLog:
             }
             self._nodes[message.topic] = self._trees[message.topic].add(log)
             payload = self._tick().payload(time_by_clock[self._clock])
-            rows.append(Row(0, self._tick_count, message.log_time_ns, message.publish_time_ns, payload))
+            tick_rows.append(Row(0, self._tick_count, message.log_time_ns, message.publish_time_ns, payload))
             self._tick_count += 1
-        return Messages.from_rows({0: TREE_CHANNEL}, rows)
+        return Messages.from_rows({0: TREE_CHANNEL}, tick_rows)
 
     def _tick(self) -> TreeTick:
         """Return the newest nodes. If there are several trees, each tree gets a root named like its topic."""

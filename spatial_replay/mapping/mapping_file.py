@@ -324,18 +324,16 @@ def parse_mapping(text: str, name: str = "mapping", folder: Path | None = None) 
 
 
 def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
-    value: Any = document.value
-    shapes = value.get("shapes") or {}
-    sampling = value.get("sample", {})
+    root: Any = document.value
+    shapes = root.get("shapes") or {}
+    sampling = root.get("sample", {})
     # the hash is computed from a canonical form, so that it does not depend on layout and comments
-    canonical_text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
-    fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
-    topics = tuple(
-        _topic_mapping(topic, entry or {}, shapes) for topic, _, entry in _entries(value, "topics")
-    )
+    canonical_text = json.dumps(root, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
+    fixed_frame, origin = root.get("fixed_frame"), root.get("origin")
+    topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, _, entry in _entries(root, "topics"))
     features = tuple(
         _topic_mapping(feature, _without_indices(entry), shapes)
-        for feature, _, entry in _entries(value, "features")
+        for feature, _, entry in _entries(root, "features")
     )
     unit_by_signal = {
         signal.name: signal.unit for entry in (*topics, *features) for signal in entry.signals if signal.unit
@@ -345,40 +343,40 @@ def _mapping(document: Document, name: str, folder: Path) -> LogMapping:
         sha256=hashlib.sha256(canonical_text.encode("utf-8", "surrogatepass")).hexdigest(),
         topics=topics,
         fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
-        clock=value.get("clock", "log"),
+        clock=root.get("clock", "log"),
         sampling=Sampling(
             sampling.get("topic"), duration_ns(sampling["every"]) if "every" in sampling else None
         ),
-        max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
-        max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
-        trims_ends=value.get("ends", "trim") == "trim",
-        accept=tuple(value.get("accept", ())),
+        max_age_ns=age_ns(root["max_age"]) if "max_age" in root else None,
+        max_gap_ns=duration_ns(root["max_gap"]) if "max_gap" in root else None,
+        trims_ends=root.get("ends", "trim") == "trim",
+        accept=tuple(root.get("accept", ())),
         origin=(float(origin[0]), float(origin[1])) if origin else None,
         axes=Axes(
-            value.get("axes", {}).get("y", "up"),
-            float(value.get("scale", 1.0)),
-            value.get("unit", ""),
+            root.get("axes", {}).get("y", "up"),
+            float(root.get("scale", 1.0)),
+            root.get("unit", ""),
             unit_by_signal,
         ),
         features=features,
         episodes=EpisodeReading(
-            fps=float(value["fps"]) if "fps" in value else None,
-            label=value.get("label"),
-            model=folder / value["model"] if "model" in value else None,
-            order=value.get("order"),
-            assets=folder / value["assets"] if "assets" in value else None,
+            fps=float(root["fps"]) if "fps" in root else None,
+            label=root.get("label"),
+            model=folder / root["model"] if "model" in root else None,
+            order=root.get("order"),
+            assets=folder / root["assets"] if "assets" in root else None,
         ),
         shapes=MappingProxyType({name: shape for name in shapes if (shape := _shape(name, shapes))}),
     )
 
 
-def _entries(value: Table[str, Any], key: str) -> Iterator[tuple[str, Place, Any]]:
+def _entries(root: Table[str, Any], section: str) -> Iterator[tuple[str, Place, Any]]:
     """Yield (topic or feature, place, entry) for each entry; one topic may have several entries."""
-    for name, entry in value.get(key, {}).items():
+    for name, entry in root.get(section, {}).items():
         if isinstance(entry, list):
-            yield from ((name, (key, name, index), part) for index, part in enumerate(entry))
+            yield from ((name, (section, name, index), list_entry) for index, list_entry in enumerate(entry))
         else:
-            yield name, (key, name), entry
+            yield name, (section, name), entry
 
 
 def _without_indices(entry: Any) -> Any:
@@ -403,34 +401,34 @@ _OF_EPISODES = ("features", "label", "fps", "model", "assets", "order")
 """Keys that apply to data sets of episodes only."""
 
 
-def _contradictions_of_kinds(value: Table[str, Any]) -> Iterator[tuple[Place, str]]:
+def _contradictions_of_kinds(root: Table[str, Any]) -> Iterator[tuple[Place, str]]:
     """Yield faults of a file that mixes keys of logs and data sets, or lacks both."""
-    episode_keys = [key for key in _OF_EPISODES if key in value]
-    if not episode_keys and "topics" not in value:
+    episode_keys = [key for key in _OF_EPISODES if key in root]
+    if not episode_keys and "topics" not in root:
         yield (), "the key 'topics' is missing, or 'features' for a data set of episodes"
     for key in _OF_TOPICS if episode_keys else ():
-        if key in value:
+        if key in root:
             yield (key,), f"it is for logs of messages, and {episode_keys[0]!r} for data sets of episodes"
-    if "features" in value and not value["features"]:
+    if "features" in root and not root["features"]:
         yield ("features",), NO_FEATURE
 
 
 def _contradictions(document: Document) -> list[tuple[Place, str]]:
     """Return faults that a schema cannot express: unknown shapes, conflicting keys, durations of 0."""
-    value: Any = document.value
-    if isinstance(value, dict) and "topics" in value and not value["topics"]:
+    root: Any = document.value
+    if isinstance(root, dict) and "topics" in root and not root["topics"]:
         return [(("topics",), NO_TOPIC)]
-    if not isinstance(value, dict):
+    if not isinstance(root, dict):
         return []
-    faults = list(_contradictions_of_kinds(value))
-    if not all(isinstance(value.get(key, {}), dict) for key in ("topics", "features")):
+    faults = list(_contradictions_of_kinds(root))
+    if not all(isinstance(root.get(key, {}), dict) for key in ("topics", "features")):
         return faults
-    shapes_by_name = value.get("shapes")
+    shapes_by_name = root.get("shapes")
     shapes = list(shapes_by_name) if isinstance(shapes_by_name, dict) else []
-    if value.get("fixed_frame", "") is None:
+    if root.get("fixed_frame", "") is None:
         faults.append((("fixed_frame",), NO_FRAME))
-    feature_entries = list(_entries(value, "features"))
-    entries = [*_entries(value, "topics"), *feature_entries]
+    feature_entries = list(_entries(root, "features"))
+    entries = [*_entries(root, "topics"), *feature_entries]
     for _, place, entry in feature_entries:
         if isinstance(entry, dict) and "position" not in entry and not entry.keys() <= _SIGNAL_KEYS:
             faults.append((place, "the key 'position' is missing"))
@@ -451,9 +449,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             for inner_place, fault in _contradictions_of_turns(entry, is_feature)
         ]
     tables_with_durations: list[tuple[Place, Any, str]] = [
-        ((), value, "max_age"),
-        ((), value, "max_gap"),
-        (("sample",), value.get("sample"), "every"),
+        ((), root, "max_age"),
+        ((), root, "max_gap"),
+        (("sample",), root.get("sample"), "every"),
     ]
     tables_with_durations += [(place, entry, "max_age") for _, place, entry in entries]
     for place, table, key in tables_with_durations:
@@ -514,7 +512,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         frame=frame.removeprefix("/") if isinstance(frame, str) else None,
         frame_field=frame["field"] if isinstance(frame, dict) else None,
         stamp=_stamp(entry.get("stamp")),
-        signals=tuple(_signal(name, value) for name, value in entry.get("signals", {}).items()),
+        signals=tuple(_signal(name, signal_entry) for name, signal_entry in entry.get("signals", {}).items()),
         only=tuple(entry.get("only", ())),
         without=tuple(entry.get("except", ())),
         max_age_ns=age_ns(entry["max_age"]) if "max_age" in entry else None,
@@ -527,86 +525,86 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
     )
 
 
-def _angle(value: Any) -> Angle | None:
-    if not isinstance(value, dict):
-        return None if value is None else Angle(value)
+def _angle(angle_entry: Any) -> Angle | None:
+    if not isinstance(angle_entry, dict):
+        return None if angle_entry is None else Angle(angle_entry)
     # MAVLink sends hundredths of a degree
-    scale = {"rad": 1.0, "deg": pi / 180, "cdeg": pi / 18_000}[value.get("unit", "rad")]
+    scale = {"rad": 1.0, "deg": pi / 180, "cdeg": pi / 18_000}[angle_entry.get("unit", "rad")]
     return Angle(
-        value["field"],
-        -scale if value.get("clockwise") else scale,
-        pi / 2 if value.get("zero") == "north" else 0.0,
-        is_plain="zero" not in value and "clockwise" not in value,
+        angle_entry["field"],
+        -scale if angle_entry.get("clockwise") else scale,
+        pi / 2 if angle_entry.get("zero") == "north" else 0.0,
+        is_plain="zero" not in angle_entry and "clockwise" not in angle_entry,
     )
 
 
-def _class(value: Any) -> str | ClassMapping | None:
-    if not isinstance(value, dict):
-        return None if value is None else str(value)
+def _class(class_entry: Any) -> str | ClassMapping | None:
+    if not isinstance(class_entry, dict):
+        return None if class_entry is None else str(class_entry)
     return ClassMapping(
-        value["field"],
-        MappingProxyType(dict(value.get("names", {}))),
-        value.get("else"),
-        "else" in value,
-        value.get("changes", "remark"),
+        class_entry["field"],
+        MappingProxyType(dict(class_entry.get("names", {}))),
+        class_entry.get("else"),
+        "else" in class_entry,
+        class_entry.get("changes", "remark"),
     )
 
 
-def _shape(value: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
-    if value is None:
+def _shape(shape_entry: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
+    if shape_entry is None:
         return None
-    if isinstance(value, str):
-        value = shapes[value]
-    x, y = value.get("offset", (0.0, 0.0))
-    offset, height = (float(x), float(y)), _height(value.get("height"))
-    if "box" in value:
+    if isinstance(shape_entry, str):
+        shape_entry = shapes[shape_entry]
+    x, y = shape_entry.get("offset", (0.0, 0.0))
+    offset, height = (float(x), float(y)), _height(shape_entry.get("height"))
+    if "box" in shape_entry:
         return ShapeMapping(
-            "box", tuple(_measure(size) for size in value["box"]), offset=offset, height=height
+            "box", tuple(_measure(size) for size in shape_entry["box"]), offset=offset, height=height
         )
-    if "disc" in value:
-        return ShapeMapping("disc", (_measure(value["disc"]),), offset=offset, height=height)
-    if isinstance(value["polygon"], str):
-        return ShapeMapping("polygon", outline=value["polygon"], offset=offset, height=height)
-    corners = tuple((float(x), float(y)) for x, y in value["polygon"])
+    if "disc" in shape_entry:
+        return ShapeMapping("disc", (_measure(shape_entry["disc"]),), offset=offset, height=height)
+    if isinstance(shape_entry["polygon"], str):
+        return ShapeMapping("polygon", outline=shape_entry["polygon"], offset=offset, height=height)
+    corners = tuple((float(x), float(y)) for x, y in shape_entry["polygon"])
     return ShapeMapping("polygon", points=corners, offset=offset, height=height)
 
 
-def _height(value: Any) -> tuple[Measure, Measure] | None:
-    return (_measure(value[0]), _measure(value[1])) if value else None
+def _height(height_entry: Any) -> tuple[Measure, Measure] | None:
+    return (_measure(height_entry[0]), _measure(height_entry[1])) if height_entry else None
 
 
-def _uncertainty(value: Any) -> Uncertainty | None:
-    if value is None:
+def _uncertainty(uncertainty_entry: Any) -> Uncertainty | None:
+    if uncertainty_entry is None:
         return None
-    if isinstance(value, dict):
-        return Uncertainty(value["covariance"], True, float(value.get("sigmas", 2.0)))
-    if value == "covariance":
+    if isinstance(uncertainty_entry, dict):
+        return Uncertainty(uncertainty_entry["covariance"], True, float(uncertainty_entry.get("sigmas", 2.0)))
+    if uncertainty_entry == "covariance":
         return Uncertainty("", True)
-    return Uncertainty(_measure(value))
+    return Uncertainty(_measure(uncertainty_entry))
 
 
-def _measure(value: Any) -> Measure:
-    return value if isinstance(value, str) else float(value)
+def _measure(measure_entry: Any) -> Measure:
+    return measure_entry if isinstance(measure_entry, str) else float(measure_entry)
 
 
-def _stamp(value: Any) -> Stamp | None:
-    if isinstance(value, dict):
-        return Stamp(value["field"], UNITS_NS[value.get("unit", "ns")])
-    if isinstance(value, list):
-        return Stamp(value[0], nanoseconds=value[1])
-    return None if value is None else Stamp(value)
+def _stamp(stamp_entry: Any) -> Stamp | None:
+    if isinstance(stamp_entry, dict):
+        return Stamp(stamp_entry["field"], UNITS_NS[stamp_entry.get("unit", "ns")])
+    if isinstance(stamp_entry, list):
+        return Stamp(stamp_entry[0], nanoseconds=stamp_entry[1])
+    return None if stamp_entry is None else Stamp(stamp_entry)
 
 
-def _signal(name: str, value: Any) -> SignalMapping:
+def _signal(name: str, signal_entry: Any) -> SignalMapping:
     """Return the mapping of a signal.
 
     Raises:
         UsageError: two numbers have the same name.
     """
-    if not isinstance(value, dict):
-        return SignalMapping(name, value)
+    if not isinstance(signal_entry, dict):
+        return SignalMapping(name, signal_entry)
     number_by_text: dict[str, float] = {}
-    for raw_key, label in value.get("names", {}).items():
+    for raw_key, label in signal_entry.get("names", {}).items():
         signal_text, number = (label, float(raw_key)) if isinstance(label, str) else (raw_key, float(label))
         if number_by_text.setdefault(signal_text, number) != number:
             raise UsageError(
@@ -614,5 +612,7 @@ def _signal(name: str, value: Any) -> SignalMapping:
                 " give each its own name"
             )
     return SignalMapping(
-        name, value["field"], value.get("unit", json.dumps(number_by_text) if number_by_text else "")
+        name,
+        signal_entry["field"],
+        signal_entry.get("unit", json.dumps(number_by_text) if number_by_text else ""),
     )

@@ -170,11 +170,13 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     """
     if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
         return None
-    best = _best(messages)
-    if best is not None and best.objects is not None and not best.names:
+    best_guess = _best(messages)
+    if best_guess is not None and best_guess.objects is not None and not best_guess.names:
         # a list of positions without ids is a plan if the topic or type has such a name, as nav_msgs/Path has
-        words = (_words(re.split(r"[/.]", name)[-1]) for name in (topic, kind))
-        best = replace(best, is_plan=best.is_plan or any(map(_PLANS.intersection, words)))
+        words_by_name = (_words(re.split(r"[/.]", name)[-1]) for name in (topic, kind))
+        best_guess = replace(
+            best_guess, is_plan=best_guess.is_plan or any(map(_PLANS.intersection, words_by_name))
+        )
     if any(isinstance(message, dict) for message in messages):
         with suppress(FieldError):
             sparse_guess = _best([sparse(message) for message in messages])
@@ -184,7 +186,7 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
                 and _lacks_coordinates(sparse_guess, messages)
             ):
                 return replace(sparse_guess, has_zeros_left_out=True)
-    return best
+    return best_guess
 
 
 def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
@@ -210,14 +212,16 @@ def _best(messages: Sequence[object]) -> Guess | None:
     if not guesses:
         return None
     # near the origin an outline may be in either frame; a message with `is_own` decides
-    best = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
-    if best.objects is None:
-        return best
+    best_guess = _with_evidence(max(guesses, key=lambda guess: (guess.score, guess.is_own)), messages)
+    if best_guess.objects is None:
+        return best_guess
     guess_by_path = {
         candidate.objects: candidate for guess in guesses for candidate in (guess, *guess.others)
     }
-    further_guesses = (guess for path, guess in guess_by_path.items() if path not in (None, best.objects))
-    return replace(best, others=tuple(_with_evidence(guess, messages) for guess in further_guesses))
+    further_guesses = (
+        guess for path, guess in guess_by_path.items() if path not in (None, best_guess.objects)
+    )
+    return replace(best_guess, others=tuple(_with_evidence(guess, messages) for guess in further_guesses))
 
 
 def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
@@ -306,9 +310,9 @@ def _guess(message: object) -> Guess | None:
     if list_guesses and (
         whole_message is None or (whole_message.polygon is None and not list_guesses[0][0].is_plan)
     ):
-        best, path = list_guesses[0]
+        best_guess, path = list_guesses[0]
         other_guesses = tuple(replace(guess, objects=path) for guess, path in list_guesses[1:])
-        return replace(best, objects=path, others=other_guesses)
+        return replace(best_guess, objects=path, others=other_guesses)
     return whole_message
 
 
@@ -422,9 +426,9 @@ def _table_of_objects(value: object) -> list[object]:
     return objects if is_table and not any(map(_is_no_place, object_keys)) else []
 
 
-def _object_in(value: object) -> Guess | None:
+def _object_in(message: object) -> Guess | None:
     """Find the fields of one object in a message, or in an element of a list; None without a position."""
-    field_values = dict(_iter_fields(value))
+    field_values = dict(_iter_fields(message))
     position, orientation = _pose_in(field_values)
     polygon, corners = _outline_in(field_values)
     bounds = _bounds_in(field_values)
@@ -441,7 +445,7 @@ def _object_in(value: object) -> Guess | None:
         return None
     is_posed = polygon is None or is_in_object_frame
     if bounds is not None:
-        corners = [_box_at(bounds, value)]
+        corners = [_box_at(bounds, message)]
     elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
         corners = [_point(field_values[position]) or ()]
     return Guess(
@@ -455,9 +459,9 @@ def _object_in(value: object) -> Guess | None:
         size=_size_in(field_values) if polygon is None else (),
         names=_names_in(field_values),
         class_name=_first(
-            field_values, _CLASSES, lambda value: isinstance(value, str) and value not in _GEOMETRIES
+            field_values, _CLASSES, lambda message: isinstance(message, str) and message not in _GEOMETRIES
         ),
-        plane=_first(field_values, _PLANES, lambda value: isinstance(value, str) and value != ""),
+        plane=_first(field_values, _PLANES, lambda message: isinstance(message, str) and message != ""),
         is_in_pixels=not is_in_object_frame and _are_pixels(corners),
     )
 
@@ -465,11 +469,11 @@ def _object_in(value: object) -> Guess | None:
 def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
     """Return the path of an outline and its corners; (None, []) without an outline."""
     for path in _paths_by_name(fields, _OUTLINES):
-        value = fields[path]
-        if not is_list(value) and "points" in field_names(value):
-            path, value = f"{path}.points", get_field(value, "points")
-        if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
-            return path, [point for corner in value if (point := _point(corner)) is not None]
+        field_value = fields[path]
+        if not is_list(field_value) and "points" in field_names(field_value):
+            path, field_value = f"{path}.points", get_field(field_value, "points")
+        if is_list(field_value) and len(field_value) >= 3 and _has(field_value[0], "xy"):
+            return path, [point for corner in field_value if (point := _point(corner)) is not None]
     for path in _paths_by_name(fields, ("geometry",)):
         # a geometry of GeoJSON
         geometry_fields = field_names(fields[path])
@@ -509,10 +513,10 @@ def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]
     Raises:
         FieldError: a path does not resolve.
     """
-    numbers = [
+    bound_numbers = [
         walk(FieldPath.of(path), element) for path in (bounds if isinstance(bounds, tuple) else [bounds])
     ]
-    return tuple(_numbers(numbers if len(numbers) == 4 else numbers[0], 4))
+    return tuple(_numbers(bound_numbers if len(bound_numbers) == 4 else bound_numbers[0], 4))
 
 
 def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
@@ -535,12 +539,12 @@ def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
     """Return the paths of a position and an orientation, preferably in the same pose."""
-    orientations = [
+    orientation_paths = [
         path
         for path in _paths_by_name(fields, _TURNS)
         if _has(fields[path], "xyzw") or _numbers(fields[path], 4)
     ]
-    positions = [
+    position_paths = [
         path
         # first names such as `position`, then names such as `agvPosition`
         for path in (*_paths_by_name(fields, _POSITIONS), *_paths_by_last_word(fields, _POSITIONS))
@@ -548,17 +552,17 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
         if _point(fields[path]) is not None
         and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
     ]
-    for position_path in positions:
-        for orientation in orientations:
-            if position_path.rpartition(".")[0] == orientation.rpartition(".")[0]:
-                return position_path, orientation
-    position: str | tuple[str, ...] | None = positions[0] if positions else None
+    for position_path in position_paths:
+        for orientation_path in orientation_paths:
+            if position_path.rpartition(".")[0] == orientation_path.rpartition(".")[0]:
+                return position_path, orientation_path
+    position: str | tuple[str, ...] | None = position_paths[0] if position_paths else None
     if position is None and all(_is_number(fields.get(name)) for name in "xy"):
         # x and y next to w belong to a quaternion
         position = None if _is_number(fields.get("w")) else ("x", "y")
     if position is None:
         position = geodetic_order(tuple(path for path, value in fields.items() if _is_number(value)))
-    return position, orientations[0] if orientations else None
+    return position, orientation_paths[0] if orientation_paths else None
 
 
 def _point(value: object) -> tuple[float, ...] | None:
@@ -577,13 +581,16 @@ def _numbers(value: object, count: int) -> list[float]:
     return numbers if len(numbers) == count else []
 
 
-def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
+def _is_around(corners: Sequence[tuple[float, ...]], point: tuple[float, ...]) -> bool:
     """Return whether a point is in the box around an outline, enlarged by the outline's size."""
-    low, high = (
+    lower_corner, upper_corner = (
         tuple(extremum(corner[axis] for corner in corners) for axis in (0, 1)) for extremum in (min, max)
     )
-    half_perimeter = sum(high) - sum(low)
-    return all(low[axis] - half_perimeter <= place[axis] <= high[axis] + half_perimeter for axis in (0, 1))
+    half_perimeter = sum(upper_corner) - sum(lower_corner)
+    return all(
+        lower_corner[axis] - half_perimeter <= point[axis] <= upper_corner[axis] + half_perimeter
+        for axis in (0, 1)
+    )
 
 
 _PIXELS = 50
@@ -626,13 +633,17 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
     for path in dict.fromkeys(
         [*_paths_by_name(fields, _NAMES), *sorted(other_paths, key=lambda path: path.count("."))]
     ):
-        value = fields[path]
-        if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
+        field_value = fields[path]
+        if isinstance(field_value, str | int) and not isinstance(field_value, bool) and field_value != "":
             name_paths.append(path)
-        elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
+        elif isinstance(field_value, bytes) or (
+            is_list(field_value) and len(field_value) in (1, _UUID_BYTES)
+        ):
             # a list with one id, or with the bytes of a UUID
             name_paths.append(path)
-        elif inner_name := next((name for name in ("value", "uuid") if name in field_names(value)), None):
+        elif inner_name := next(
+            (name for name in ("value", "uuid") if name in field_names(field_value)), None
+        ):
             name_paths.append(f"{path}.{inner_name}")
     return tuple(dict.fromkeys(name_paths))
 
@@ -676,12 +687,12 @@ def _is_time(name: str) -> bool:
 
 
 def _iter_fields(
-    value: object, path: str = "", depth: int = 0, *, is_skipped: Callable[[str], bool] = _is_no_place
+    message_part: object, path: str = "", depth: int = 0, *, is_skipped: Callable[[str], bool] = _is_no_place
 ) -> Iterator[tuple[str, object]]:
     """Iterate over the (path, value) of fields in a message and its parts, without elements of lists."""
-    for name in field_names(value) if depth < _DEEPEST else ():
+    for name in field_names(message_part) if depth < _DEEPEST else ():
         if not is_skipped(name) and _FIELD.fullmatch(name):
-            inner_value = get_field(value, name)
+            inner_value = get_field(message_part, name)
             full_path = f"{path}.{name}" if path else name
             yield full_path, inner_value
             yield from _iter_fields(inner_value, full_path, depth + 1, is_skipped=is_skipped)
@@ -697,10 +708,10 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _has(value: object, names: str) -> bool:
+def _has(message: object, names: str) -> bool:
     """Return whether a message has numbers in all fields with the given one-letter names."""
-    fields = field_names(value)
-    if isinstance(value, Sparse):
+    fields = field_names(message)
+    if isinstance(message, Sparse):
         allowed_names = "xyz" if names == "xy" else names
-        return all(name in allowed_names and _is_number(value[name]) for name in fields)
-    return all(name in fields and _is_number(get_field(value, name)) for name in names)
+        return all(name in allowed_names and _is_number(message[name]) for name in fields)
+    return all(name in fields and _is_number(get_field(message, name)) for name in names)

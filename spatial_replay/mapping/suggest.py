@@ -274,10 +274,10 @@ def _entry_lines(suggestion: TopicSuggestion) -> Iterator[str]:
         yield f"  {topic}: {suggestion.entry or suggestion.signals}"
 
 
-def _first_that_fit(texts: Sequence[tuple[str, str]], byte_limit: int) -> list[tuple[str, str]]:
+def _first_that_fit(named_texts: Sequence[tuple[str, str]], byte_limit: int) -> list[tuple[str, str]]:
     """Return the first (name, text) pairs whose texts fit into `byte_limit` bytes."""
     texts_that_fit: list[tuple[str, str]] = []
-    for name, text in texts:
+    for name, text in named_texts:
         byte_limit -= len(text.encode()) + 1
         if byte_limit < 0:
             break
@@ -379,11 +379,11 @@ def _first_fix(layout: MessageLayout, examples: Sequence[object]) -> tuple[float
 def _first_corner(message: object) -> tuple[float, float] | None:
     """Return latitude and longitude of the first position in a GeoJSON message; None without a position."""
     try:
-        text = str(walk(FieldPath.of("geojson"), message))
+        geojson_text = str(walk(FieldPath.of("geojson"), message))
     except FieldError:
         return None
     # longitude comes before latitude (RFC 7946, section 3.1.1)
-    coordinates_match = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', text)
+    coordinates_match = re.search(r'"coordinates":[\s[]*(-?[\d.]+)\s*,\s*(-?[\d.]+)', geojson_text)
     return None if coordinates_match is None else (float(coordinates_match[2]), float(coordinates_match[1]))
 
 
@@ -585,7 +585,7 @@ _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
 
 
 def _fields(name: str, guess: Guess) -> dict[str, str]:
-    values: list[tuple[str, str | tuple[str, ...] | None]] = [
+    key_values: list[tuple[str, str | tuple[str, ...] | None]] = [
         ("objects", guess.objects),
         ("name", name),
         ("class", guess.class_name),
@@ -596,7 +596,7 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("polygon", None if guess.is_own else guess.polygon),
         ("bounds", guess.bounds),
     ]
-    fields = {key: _value(key, value) for key, value in values if value is not None}
+    fields = {key: _value(key, value) for key, value in key_values if value is not None}
     if guess.bounds_have_size:
         fields["bounds"] = f"{{field: {fields['bounds']}, form: xywh}}"
     if guess.has_compass:
@@ -627,8 +627,8 @@ def _shape(guess: Guess) -> str:
         return f"{{polygon: {yaml_text(guess.polygon)}}}"
     if not guess.size:
         return f"{{disc: {_RADIUS}}}"
-    sizes = ", ".join(map(yaml_text, guess.size))
-    return f"{{disc: {sizes}}}" if len(guess.size) == 1 else f"{{box: [{sizes}]}}"
+    size_text = ", ".join(map(yaml_text, guess.size))
+    return f"{{disc: {size_text}}}" if len(guess.size) == 1 else f"{{box: [{size_text}]}}"
 
 
 def _name(topic: Topic, guess: Guess) -> str:
@@ -657,10 +657,10 @@ def _remarks(guess: Guess) -> tuple[str, ...]:
         size_remarks = (_FORM_OF_BOUNDS[guess.bounds_have_size].format(guess.bounds),)
     index_remarks = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
     if guess.other_outline is not None:
-        shape = f"shape: {{polygon: {guess.other_outline}}}"
+        shape_text = f"shape: {{polygon: {guess.other_outline}}}"
         object_remarks = (
             *object_remarks,
-            f"objects whose size is 0 have corners; `{shape}` reads these, and not the boxes",
+            f"objects whose size is 0 have corners; `{shape_text}` reads these, and not the boxes",
         )
     if guess.plane is not None:
         floors_remark = f"{guess.plane} names floors or maps; objects on all of them are in one plane here"

@@ -133,8 +133,10 @@ def suggest_feature_mapping(data_set: DataSet) -> str:
     if reason := why_poseless(data_set):
         raise UsageError(reason)
     features = mappable_features(data_set)
-    columns, bodies = _numbers(data_set, features)
-    suggestions, body_by_feature = _without_bodies(suggest_objects(features, columns), columns, bodies)
+    numbers_by_feature, bodies = _numbers(data_set, features)
+    suggestions, body_by_feature = _without_bodies(
+        suggest_objects(features, numbers_by_feature), numbers_by_feature, bodies
+    )
     if data_set.names_bodies and not suggestions and (data_set.fps or data_set.has_times):
         raise UsageError(f"{data_set.name} needs no mapping: it names its objects")
     name = printable(data_set.name)
@@ -164,11 +166,11 @@ def suggest_objects(features: Sequence[Feature], columns: Mapping[str, Floats]) 
     """
     suggestions: dict[str, Suggestion] = {}
     for feature in features:
-        values = columns.get(feature.name)
+        frame_numbers = columns.get(feature.name)
         if feature.places:
-            objects = _objects_by_places(feature, values)
+            objects = _objects_by_places(feature, frame_numbers)
         elif re.split(r"[./]", feature.name)[-1] == "qpos":
-            objects = _free_joints(feature, values)
+            objects = _free_joints(feature, frame_numbers)
         else:
             objects = _whole_feature(feature, features, columns)
         for suggestion in objects:
@@ -197,13 +199,13 @@ def _numbers(data_set: DataSet, features: Sequence[Feature]) -> tuple[dict[str, 
 
 
 def _without_bodies(
-    suggestions: Sequence[Suggestion], columns: Mapping[str, Floats], bodies: Sequence[Body]
+    suggestions: Sequence[Suggestion], numbers_by_feature: Mapping[str, Floats], bodies: Sequence[Body]
 ) -> tuple[list[Suggestion], dict[str, str]]:
     """Return the suggestions that are not bodies of the data set, and the names of bodies by feature."""
     body_by_feature: dict[str, str] = {}
     for suggestion in suggestions:
         for body in bodies:
-            positions = columns[suggestion.feature][: len(body.positions), :3]
+            positions = numbers_by_feature[suggestion.feature][: len(body.positions), :3]
             if suggestion.position == ("[0:3]",) and np.allclose(positions, body.positions, atol=1e-5):
                 body_by_feature[suggestion.feature] = body.name
     return [
@@ -214,7 +216,7 @@ def _without_bodies(
 # ------------------------------------------------------------------------------------- objects by their names
 
 
-def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
+def _objects_by_places(feature: Feature, frame_numbers: Floats | None) -> Iterator[Suggestion]:
     """Yield objects whose coordinates have names, such as `puck_x`."""
     point_places: dict[str, dict[str, str]] = {}
     quaternion_places: dict[str, dict[str, str]] = {}
@@ -252,16 +254,18 @@ def _objects_by_places(feature: Feature, values: Floats | None) -> Iterator[Sugg
             yield suggestion
             continue
         indices = [feature.places.index(place) for place in places]
-        yield _with_orientation(suggestion, places, None if values is None else values[:, indices], order)
+        yield _with_orientation(
+            suggestion, places, None if frame_numbers is None else frame_numbers[:, indices], order
+        )
 
 
 def _whole_feature(
-    feature: Feature, features: Sequence[Feature], columns: Mapping[str, Floats]
+    feature: Feature, features: Sequence[Feature], numbers_by_feature: Mapping[str, Floats]
 ) -> Iterator[Suggestion]:
     """Yield the object of a feature that is named like a position or a pose, such as `obj_pos`."""
     parent_word, last_word = (["", *re.split(r"[./]", feature.name)])[-2:]
     point_match, pose_match = _POINT.fullmatch(last_word), _POSE.fullmatch(last_word)
-    values = columns.get(feature.name)
+    frame_numbers = numbers_by_feature.get(feature.name)
     if feature.width in (2, 3) and point_match is not None and not _NO_POINT.search(last_word):
         name = (
             last_word
@@ -271,24 +275,28 @@ def _whole_feature(
         suggestion = Suggestion(feature.name, name, (f"[0:{feature.width}]",))
         quaternion_feature = f"{feature.name[: len(feature.name) - len(point_match['what'])]}quat"
         if any((sibling.name, sibling.width) == (quaternion_feature, 4) for sibling in features):
-            suggestion = _with_orientation(suggestion, (quaternion_feature,), columns.get(quaternion_feature))
+            suggestion = _with_orientation(
+                suggestion, (quaternion_feature,), numbers_by_feature.get(quaternion_feature)
+            )
         yield suggestion
     elif feature.width == 7 and pose_match is not None:
         name = pose_match["stem"] if pose_match["stem"] not in ("", "root") else parent_word or last_word
         suggestion = Suggestion(feature.name, name, ("[0:3]",))
-        yield _with_orientation(suggestion, ("[3:7]",), None if values is None else values[:, 3:7])
+        yield _with_orientation(
+            suggestion, ("[3:7]",), None if frame_numbers is None else frame_numbers[:, 3:7]
+        )
 
 
-def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion]:
+def _free_joints(feature: Feature, frame_numbers: Floats | None) -> Iterator[Suggestion]:
     """Yield the bodies with a free joint in a state of MuJoCo.
 
     A free joint has seven numbers: a position and a unit quaternion (w x y z).
     """
-    if values is None or not len(values):
+    if frame_numbers is None or not len(frame_numbers):
         return
-    width = values.shape[1]
+    width = frame_numbers.shape[1]
     length_errors = [
-        float(np.abs(np.linalg.norm(values[:, start + 3 : start + 7], axis=1) - 1).max())
+        float(np.abs(np.linalg.norm(frame_numbers[:, start + 3 : start + 7], axis=1) - 1).max())
         for start in range(width - 6)
     ]
     joint_starts: list[int] = []
@@ -305,7 +313,7 @@ def _free_joints(feature: Feature, values: Floats | None) -> Iterator[Suggestion
             (f"[{start}:{start + 3}]",),
             (f"[{start + 3}:{start + 7}]",),
             "wxyz",
-            remark=f"its orientation has length 1 in all {len(values):,} frames looked at",
+            remark=f"its orientation has length 1 in all {len(frame_numbers):,} frames looked at",
         )
 
 
@@ -361,19 +369,19 @@ def _feature_lines(suggestions: Sequence[Suggestion]) -> Iterator[str]:
 
 
 def _entry_lines(suggestion: Suggestion) -> Iterator[str]:
-    fields = [f"name: {yaml_text(suggestion.name)}", f"position: {_places(suggestion.position)}"]
+    entry_fields = [f"name: {yaml_text(suggestion.name)}", f"position: {_places(suggestion.position)}"]
     if suggestion.orientation:
-        fields += [f"orientation: {_places(suggestion.orientation)}", f"order: {suggestion.order}"]
+        entry_fields += [f"orientation: {_places(suggestion.orientation)}", f"order: {suggestion.order}"]
     if suggestion.is_in_space:
-        fields.append("height: [0, 0]")
+        entry_fields.append("height: [0, 0]")
     if suggestion.signals:
-        names = ", ".join(
+        signal_text = ", ".join(
             f"{yaml_text(_signal_name(place))}: {yaml_text(place)}" for place in suggestion.signals
         )
-        fields.append(f"signals: {{{names}}}")
+        entry_fields.append(f"signals: {{{signal_text}}}")
     if suggestion.remark:
         yield f"    # {printable(suggestion.name)}: {printable(suggestion.remark, 300)}"
-    yield f"    - {{{', '.join(fields)}}}"
+    yield f"    - {{{', '.join(entry_fields)}}}"
 
 
 def _places(places: tuple[str, ...]) -> str:

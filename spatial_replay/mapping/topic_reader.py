@@ -253,16 +253,16 @@ class Extractor:
 
     def _with_one_class(self, detections: Detections) -> Detections:
         """Return detections whose objects keep their first class, or have the class in their name."""
-        names, classes = detections.name.tolist(), detections.class_code.tolist()
+        name_codes, classes = detections.name.tolist(), detections.class_code.tolist()
         if self.layout.class_changes == "first":
             first_classes = self._first_classes
             classes = [
-                first_classes.setdefault(name, code) for name, code in zip(names, classes, strict=True)
+                first_classes.setdefault(name, code) for name, code in zip(name_codes, classes, strict=True)
             ]
             return replace(detections, class_code=np.array(classes, np.int64))
         # the new name depends only on the class, so it is equal in a window and in the whole log
-        names = [self._name_of_class(name, code) for name, code in zip(names, classes, strict=True)]
-        return replace(detections, name=np.array(names, np.int64))
+        name_codes = [self._name_of_class(name, code) for name, code in zip(name_codes, classes, strict=True)]
+        return replace(detections, name=np.array(name_codes, np.int64))
 
     def _name_of_class(self, name: int, code: int) -> int:
         class_name = self._classes.by_code[code]
@@ -696,13 +696,17 @@ class TopicReader:
             )
 
     def _read_each(
-        self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], is_good: Booleans
+        self,
+        read: Callable[[Any], Any],
+        arguments: Sequence[Any],
+        log_times_ns: Sequence[int],
+        is_good: Booleans,
     ) -> list[Any]:
-        """Apply `read` to the good items; report the failures and clear their flags."""
-        results: list[Any] = [None] * len(items)
+        """Apply `read` to the good arguments; report the failures and clear their flags."""
+        results: list[Any] = [None] * len(arguments)
         for index in np.flatnonzero(is_good).tolist():
             try:
-                results[index] = read(items[index])
+                results[index] = read(arguments[index])
             except (*MISFITS, LogError) as error:
                 is_good[index] = False
                 reason = str(error)
@@ -921,8 +925,8 @@ class PendingMessages:
         get times right after the messages before the step.
         """
         no_integers = np.empty(0, np.int64)
-        columns = zip((no_integers, no_integers, no_integers, no_integers), *self._columns, strict=True)
-        times_ns, sequence_numbers, log_times_ns, record_numbers = map(np.concatenate, columns)
+        column_parts = zip((no_integers, no_integers, no_integers, no_integers), *self._columns, strict=True)
+        times_ns, sequence_numbers, log_times_ns, record_numbers = map(np.concatenate, column_parts)
         contents = self._contents
         if not (record_numbers[1:] > record_numbers[:-1]).all() or not (times_ns[1:] >= times_ns[:-1]).all():
             times_ns = self._without_steps(times_ns, sequence_numbers, record_numbers, upto_ns)

@@ -807,8 +807,11 @@ class Tracker:
                 self.remarks.count_stale(topic, name, times_ns, is_stale[:, object_index], in_gap)
             self._place_following(topic, times_ns, state)
             states.append(state)
-        names, *columns = zip(*states, strict=True)
-        return States(np.concatenate(names), *(np.concatenate(column, axis=1) for column in columns))
+        name_arrays, *state_columns = zip(*states, strict=True)
+        return States(
+            np.concatenate(name_arrays),
+            *(np.concatenate(state_column, axis=1) for state_column in state_columns),
+        )
 
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int

@@ -368,11 +368,13 @@ class FrameTree:
             longest_ns: longest time between two transforms that are interpolated.
             holds: whether a transform holds for `longest_ns` if no transform follows in that time.
         """
-        count = len(times_ns)
-        if target == source or not count:
-            return Transforms.identity(count)
-        question = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
-        transforms = Transforms.unknown(count)
+        time_count = len(times_ns)
+        if target == source or not time_count:
+            return Transforms.identity(time_count)
+        question = _Question(
+            np.arange(time_count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds
+        )
+        transforms = Transforms.unknown(time_count)
         for run_question in self._by_run(question):
             for part_question in self._by_parents(run_question):
                 transforms.put(part_question.places, self._in_one_tree(target, source, part_question))
@@ -516,8 +518,8 @@ class FrameTree:
 
     def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
         """Note a frame's first contradiction of each kind: static and moving, two parents, changed static."""
-        key = child, is_mixed, old.parent == new.parent
-        if key in self._contradictions:
+        contradiction = child, is_mixed, old.parent == new.parent
+        if contradiction in self._contradictions:
             return
         subject, rule = f"frame {child!r} has two parents,", "newest counts"
         parent_places = " and ".join(f"{entry.parent!r} at {_place(entry)}" for entry in (old, new))
@@ -527,7 +529,7 @@ class FrameTree:
             subject = f"the static transform of {child!r} in {new.parent!r} changes"
             parent_places = f"from {_place(old)} to {_place(new)}"
         second_since = Instant(new.clock_ns, 0)
-        self._contradictions[key] = Sentence(
+        self._contradictions[contradiction] = Sentence(
             f"{subject} {parent_places}, the second from ", second_since, f" on: the {rule}"
         )
 

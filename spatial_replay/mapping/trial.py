@@ -88,9 +88,9 @@ _FASTEST = 20
 """Greatest ratio of stamp time to recording time. The reciprocal is the least ratio."""
 
 
-def _reader(topic: Topic, entry: str, head: str, reasons: list[str]) -> TopicReader:
+def _reader(topic: Topic, entry_text: str, mapping_head: str, reasons: list[str]) -> TopicReader:
     """Return a reader of decoded messages that adds a reason to `reasons` for each unreadable message."""
-    mapping = parse_mapping(f"{head}topics:\n  {yaml_text(topic.name)}: {entry}")
+    mapping = parse_mapping(f"{mapping_head}topics:\n  {yaml_text(topic.name)}: {entry_text}")
     (planned,) = ReadingPlan.of(mapping, [topic]).planned
     return TopicReader(
         planned,
@@ -128,8 +128,10 @@ def choose_entry(
         # a change may reveal another contradiction, such as a number that stands for a missing value
         changed_fields, remaining_doubts = min(trials, key=lambda trial: len(trial[1]))
         if len(remaining_doubts) <= len(doubts):
-            keys = [f"{key}: {value}" for key, value in changed_fields.items() if fields.get(key) != value]
-            reasons.append(f"{', '.join(keys)}, since otherwise {_clause(doubt)}")
+            changed_keys = [
+                f"{key}: {value}" for key, value in changed_fields.items() if fields.get(key) != value
+            ]
+            reasons.append(f"{', '.join(changed_keys)}, since otherwise {_clause(doubt)}")
             fields, doubts = changed_fields, remaining_doubts
     return fields, [*reasons, *(_clause(doubt, with_remedy=True) for doubt in doubts)]
 
@@ -138,8 +140,8 @@ def _doubts(
     topic: Topic, fields: Fields, messages: Sequence[object], times_ns: Sequence[int], origin: str
 ) -> tuple[Doubt, ...]:
     """Return the contradictions of an entry, in the order of the table of assumptions."""
-    text = f"{origin}max_age: forever\ntopics:\n  {yaml_text(topic.name)}: {flow_text(fields)}"
-    plan = ReadingPlan.of(replace(parse_mapping(text), accept=()), [topic])
+    mapping_text = f"{origin}max_age: forever\ntopics:\n  {yaml_text(topic.name)}: {flow_text(fields)}"
+    plan = ReadingPlan.of(replace(parse_mapping(mapping_text), accept=()), [topic])
     assembler = Assembler(plan, lambda topic: lambda payload: messages[int(payload)], name="")
     try:
         assembler.add(

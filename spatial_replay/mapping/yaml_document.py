@@ -292,10 +292,10 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
                     yield from _faults_in_words(violation)
                 return
     if keyword == "additionalProperties" and isinstance(error.instance, dict):
-        keys = list(error.schema.get("properties", {}))
+        known_keys = list(error.schema.get("properties", {}))
         for key in error.instance:
-            if key not in keys:
-                hint = nearest_hint(key, keys) or f"known are {', '.join(keys)}"
+            if key not in known_keys:
+                hint = nearest_hint(key, known_keys) or f"known are {', '.join(known_keys)}"
                 yield (*place, key), f"unknown key; {hint}"
     elif keyword == "required":
         missing_keys = [key for key in error.validator_value if key not in error.instance]

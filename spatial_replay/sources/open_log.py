@@ -305,7 +305,7 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
 
     folder = os.fspath(metadata).removesuffix(BAG_METADATA)
     try:
-        names = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
+        file_names = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
     except MissingFileError as error:
         raise MissingFileError(
             f"{error}; give the address of a bag's folder for a ROS 2 bag, and of one file for any other log,"
@@ -315,8 +315,8 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
         raise LogError(f"{metadata} cannot be used: {error}; copy the bag to this machine") from None
     # paths in web addresses are percent-encoded, keys in buckets are not
     if is_web(metadata):
-        names = tuple(map(quote, names))
-    return [metadata, *(RemoteFile(folder + name) for name in names)]
+        file_names = tuple(map(quote, file_names))
+    return [metadata, *(RemoteFile(folder + name) for name in file_names)]
 
 
 def downloaded_bag(metadata: RemoteFile) -> Path:
@@ -389,26 +389,30 @@ class Format(NamedTuple):
 
 
 def _track_source(
-    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, usual_axes: Axes = OUR_AXES
+    path: LogFile,
+    format_name: str,
+    options: ReadOptions,
+    iter_traces: IterTraces,
+    usual_axes: Axes = OUR_AXES,
 ) -> Source:
     """Return the source of a track file; option `y_down` overrides the usual axes of its format."""
     axes = usual_axes if options.y_down is None else replace(usual_axes, y="down" if options.y_down else "up")
-    return TrackSource(path, kind, options, iter_traces=iter_traces, axes=axes)
+    return TrackSource(path, format_name, options, iter_traces=iter_traces, axes=axes)
 
 
-def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
+def _open_annotations(path: LogFile, format_name: str, options: ReadOptions) -> Source:
     rate = FRAMES_A_SECOND if options.rate is None else options.rate
     reader = partial(iter_annotations, rate=rate, lost=options.lost)
-    return _track_source(path, kind, options, reader, Axes("down"))
+    return _track_source(path, format_name, options, reader, Axes("down"))
 
 
-def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
+def _open_scenario(path: LogFile, format_name: str, options: ReadOptions) -> Source:
     from spatial_replay.logs.formats.commonroad import iter_scenario
 
-    return _track_source(path, kind, options, iter_scenario, Axes(unit="m"))
+    return _track_source(path, format_name, options, iter_scenario, Axes(unit="m"))
 
 
-def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
+def _open_messages(path: LogFile, format_name: str, options: ReadOptions) -> Source:
     if options.mapping is None:
         if isinstance(path, Path) and path.is_dir() and not (path / BAG_METADATA).exists():
             first_name = min(entry.name for entry in path.iterdir() if _BAG_FILE.search(entry.name))
@@ -418,27 +422,27 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
                 "a ROS 2 bag needs a mapping file, too: --mapping FILE or mapping=FILE"
             )
         raise UsageError(
-            f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
-            " does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "
+            f"{path.name} is a {format_name}, which does not say what its objects are; give a mapping file"
+            " that does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "
             f"{shlex.quote(str(path))} --suggest-mapping"
         )
     # the import is here, because readers of external logs are slow to import
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping
 
-    return MappedSource(path, kind, options, mapping=load_mapping(options.mapping))
+    return MappedSource(path, format_name, options, mapping=load_mapping(options.mapping))
 
 
-def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
+def _open_mcap(path: LogFile, format_name: str, options: ReadOptions) -> Source:
     """Open an MCAP log: our own log, which names its objects, or an external log with a mapping."""
     from spatial_replay.logs.mcap.read import McapSource
 
-    source = McapSource(path, kind, options)
+    source = McapSource(path, format_name, options)
     if not options.non_defaults().keys() - {"max_gap"}:
         return source
     if source.has_samples:
-        options.refuse_except(frozenset({"max_gap"}), kind, path.name)
-    return _open_messages(path, kind, options)
+        options.refuse_except(frozenset({"max_gap"}), format_name, path.name)
+    return _open_messages(path, format_name, options)
 
 
 _MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
