@@ -671,10 +671,14 @@ def with_poses(
     # complex numbers add x and y in one operation, which runs over all positions
     complex_positions = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
     complex_vertices = new_vertices.view(np.complex128)[..., 0]
-    x, y = (corners - centre).T
+    corner_x, corner_y = (corners - centre).T
     for turn_index, turn in enumerate(turns.tolist()):
         cosine, sine = (math.cos(turn), math.sin(turn)) if turn else (1.0, 0.0)
-        turned_corners = zip((x * cosine - y * sine).tolist(), (x * sine + y * cosine).tolist(), strict=True)
+        turned_corners = zip(
+            (corner_x * cosine - corner_y * sine).tolist(),
+            (corner_x * sine + corner_y * cosine).tolist(),
+            strict=True,
+        )
         for corner_index, corner_xy in enumerate(turned_corners):
             np.add(complex_positions, complex(*corner_xy), out=complex_vertices[turn_index, :, corner_index])
     return FootprintBatch.without_checks(

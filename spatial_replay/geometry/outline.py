@@ -322,7 +322,7 @@ def convex_pieces(vertices: Floats, holes: Sequence[Floats] = ()) -> list[Floats
     if not polygon.is_valid:
         raise GeometryError(_describe_crossing(polygon))
     corners = [(x, y) for x, y in vertices.tolist()]
-    corner_numbers = {corner: i for i, corner in enumerate(corners)}
+    corner_numbers = {corner: number for number, corner in enumerate(corners)}
     closed_triangles = get_coordinates(constrained_delaunay_triangles(polygon)).reshape(-1, 4, 2)
     triangles = [
         tuple([corner_numbers[x, y] for x, y in triangle]) for triangle in closed_triangles[:, :3].tolist()
@@ -351,22 +351,34 @@ def _turn(corners: Sequence[_Corner], a: int, b: int, c: int) -> float:
 def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring]:
     """Join counter-clockwise triangles across shared edges while the result is convex."""
     rings = dict(enumerate(triangles))
-    ring_of_edge = {edge: name for name, ring in rings.items() for edge in _edges(ring)}
-    shared_edges = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
-    for i, j in sorted(shared_edges, key=lambda edge: (-_squared_length(corners, *edge), edge)):
-        left_ring, right_ring = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
-        # the left ring runs from j to i, the right ring from i to j
-        from_j, from_i = _rotate(left_ring, j), _rotate(right_ring, i)
-        merged_ring = from_j + from_i[1:-1]
-        turn_at_i = _turn(corners, from_j[-2], i, from_i[1])
-        turn_at_j = _turn(corners, from_i[-2], j, from_j[1])
+    ring_of_edge = {edge: ring_number for ring_number, ring in rings.items() for edge in _edges(ring)}
+    shared_edges = [
+        (first_corner, second_corner)
+        for first_corner, second_corner in ring_of_edge
+        if first_corner < second_corner and (second_corner, first_corner) in ring_of_edge
+    ]
+    for first_corner, second_corner in sorted(
+        shared_edges, key=lambda edge: (-_squared_length(corners, *edge), edge)
+    ):
+        left_ring, right_ring = (
+            rings[ring_of_edge[first_corner, second_corner]],
+            rings[ring_of_edge[second_corner, first_corner]],
+        )
+        # the left ring runs from the second corner to the first, the right ring back
+        from_second, from_first = _rotate(left_ring, second_corner), _rotate(right_ring, first_corner)
+        merged_ring = from_second + from_first[1:-1]
+        turn_at_first = _turn(corners, from_second[-2], first_corner, from_first[1])
+        turn_at_second = _turn(corners, from_first[-2], second_corner, from_second[1])
         # straight corners are allowed, because normalising a piece drops them
-        if turn_at_i < 0 or turn_at_j < 0:
+        if turn_at_first < 0 or turn_at_second < 0:
             continue
-        merged_name, removed_name = ring_of_edge[i, j], ring_of_edge[j, i]
-        rings[merged_name] = merged_ring
-        del rings[removed_name]
-        ring_of_edge.update((edge, merged_name) for edge in _edges(merged_ring))
+        merged_number, removed_number = (
+            ring_of_edge[first_corner, second_corner],
+            ring_of_edge[second_corner, first_corner],
+        )
+        rings[merged_number] = merged_ring
+        del rings[removed_number]
+        ring_of_edge.update((edge, merged_number) for edge in _edges(merged_ring))
     return list(rings.values())
 
 

@@ -974,22 +974,26 @@ class LiveAssembler(_Assembling):
         return times_ns, is_used
 
     def _note_arrivals(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
-        name = reader.name
-        newest_ns = np.maximum.accumulate(np.append(self._latest_ns_by_topic[name], times_ns))
-        self._latest_ns_by_topic[name] = int(newest_ns[-1])
-        back_ns = newest_ns[:-1] - times_ns
+        topic_name = reader.name
+        newest_ns = np.maximum.accumulate(np.append(self._latest_ns_by_topic[topic_name], times_ns))
+        self._latest_ns_by_topic[topic_name] = int(newest_ns[-1])
+        step_back_ns = newest_ns[:-1] - times_ns
         # a message that steps back farther is too late anyway
-        back_ns = back_ns[(back_ns >= 0) & (newest_ns[:-1] >= 0) & (back_ns < self._max_delay_s * 1e9)]
+        step_back_ns = step_back_ns[
+            (step_back_ns >= 0) & (newest_ns[:-1] >= 0) & (step_back_ns < self._max_delay_s * 1e9)
+        ]
         # one nanosecond more, because samples are final only before the earliest time that may still arrive
-        self._step_back_ns[name] = max(self._step_back_ns[name], int(back_ns.max(initial=-1)) + 1)
-        if name in self._transform_topics:
+        self._step_back_ns[topic_name] = max(
+            self._step_back_ns[topic_name], int(step_back_ns.max(initial=-1)) + 1
+        )
+        if topic_name in self._transform_topics:
             self._are_transforms_new = True
         if not self._transform_topics or len(self._held) >= _MOST_HELD:
             return
         until_s = self._now_s + self._max_delay_s
-        if self._follows_frames and name == self._plan.sampled_topic:
+        if self._follows_frames and topic_name == self._plan.sampled_topic:
             self._held += [
-                _Held(name, "", int(time_ns), int(time_ns), False, until_s) for time_ns in times_ns
+                _Held(topic_name, "", int(time_ns), int(time_ns), False, until_s) for time_ns in times_ns
             ]
         if reader.extractor is None or reader.planned.is_static:
             return
@@ -1005,7 +1009,7 @@ class LiveAssembler(_Assembling):
             for frame, stamp_ns in dict.fromkeys(zip(chunk.frames or (), stamps, strict=False)):
                 if frame != self._plan.mapping.fixed_frame:
                     at_ns, by_stamp = (stamp_ns, True) if stamp_ns else (time_ns, False)
-                    self._held.append(_Held(name, frame, time_ns, at_ns, by_stamp, until_s))
+                    self._held.append(_Held(topic_name, frame, time_ns, at_ns, by_stamp, until_s))
                     self._are_transforms_new = True
 
     def _upto_ns(self, now_s: float) -> int:

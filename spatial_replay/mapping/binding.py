@@ -201,8 +201,8 @@ class Namer:
             if word:
                 self._has_ids = self._has_ids or alternatives[-1].text == INDEX
                 return word
-        fields = "|".join(path.text for path in alternatives)
-        raise ContentError(f"{{{fields}}} is empty; choose another name")
+        field_list = "|".join(path.text for path in alternatives)
+        raise ContentError(f"{{{field_list}}} is empty; choose another name")
 
 
 def class_codes(

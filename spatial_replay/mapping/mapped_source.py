@@ -174,8 +174,8 @@ class MappedSource(FileSource):
         mapped_names = {*(entry.topic for entry in self.mapping.topics), self.mapping.sampling.topic}
         reasons = [topic.unreadable for topic in topics if topic.name in mapped_names and topic.unreadable]
         if reasons:
-            texts = [f"{self.name}: {reason}" for reason in reasons]
-            raise LogError("\n".join([*texts, *reader.take_faults()]))
+            fault_texts = [f"{self.name}: {reason}" for reason in reasons]
+            raise LogError("\n".join([*fault_texts, *reader.take_faults()]))
         try:
             mapping = replace(self.mapping, max_gap_ns=self.max_gap_ns)
             return ReadingPlan.of(mapping, topics, late_ns(self.reading.max_lateness))

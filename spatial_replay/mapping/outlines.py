@@ -168,10 +168,12 @@ def outlines_from_rings(holders: Sequence[Any]) -> tuple[Integers, Integers, Flo
     outlines: list[Floats] = []
     outline_counts, empty_count = [], 0
     for holder in holders:
-        pieces = [piece for rings in _polygons_in(holder) for piece in _pieces(rings)]
-        empty_count += not pieces
-        outlines += pieces or [np.full((1, 3), np.nan)]
-        outline_counts.append(max(1, len(pieces)))
+        polygon_outlines = [
+            polygon_outline for rings in _polygons_in(holder) for polygon_outline in _pieces(rings)
+        ]
+        empty_count += not polygon_outlines
+        outlines += polygon_outlines or [np.full((1, 3), np.nan)]
+        outline_counts.append(max(1, len(polygon_outlines)))
     corner_counts = np.array([len(outline) for outline in outlines], np.int64)
     corners = np.concatenate(outlines) if outlines else np.empty((0, 3))
     return np.array(outline_counts, np.int64), corner_counts, corners, empty_count
@@ -199,17 +201,17 @@ def _depth(value: Any) -> int:
 
 def _pieces(rings: Sequence[Any]) -> list[Floats]:
     """Return the outlines (n, 3) of a polygon; [] if its outer ring has too few corners."""
-    outer, *holes = (_ring(ring) for ring in rings) if len(rings) else (np.empty((0, 3)),)
-    if len(outer) < _LEAST_CORNERS:
+    outer_ring, *holes = (_ring(ring) for ring in rings) if len(rings) else (np.empty((0, 3)),)
+    if len(outer_ring) < _LEAST_CORNERS:
         return []
     holes = [hole for hole in holes if len(hole) >= _LEAST_CORNERS]
     if not holes:
-        return [outer]
+        return [outer_ring]
     try:
-        pieces = convex_pieces(outer[:, :2], [hole[:, :2] for hole in holes])
+        pieces = convex_pieces(outer_ring[:, :2], [hole[:, :2] for hole in holes])
     except GeometryError as error:
         raise ContentError(str(error)) from None
-    return [np.column_stack([piece, np.full(len(piece), outer[0, 2])]) for piece in pieces]
+    return [np.column_stack([piece, np.full(len(piece), outer_ring[0, 2])]) for piece in pieces]
 
 
 def _ring(corners: Any) -> Floats:
