@@ -201,14 +201,12 @@ class Falsification(Printed):
             if value is None or (value == parameter.rest and not parameter.is_drawn):
                 continue
             # the values of a group share one text
-            text_before = texts_by_group.get(parameter.group)
+            group_text = texts_by_group.get(parameter.group)
             if parameter.group == parameter.name:
                 texts_by_group[parameter.group] = parameter.text_of(value)
             else:
                 texts_by_group[parameter.group] = (
-                    f"{parameter.group} {value:.12g}"
-                    if text_before is None
-                    else f"{text_before},{value:.12g}"
+                    f"{parameter.group} {value:.12g}" if group_text is None else f"{group_text},{value:.12g}"
                 )
         return ", ".join(texts_by_group.values()) or "nothing varied"
 
@@ -217,27 +215,29 @@ class Falsification(Printed):
         yield f"run 1, with nothing varied: {_verdict_text(self.first)}"
         for parameter in self.parameters:
             if parameter.unit == "s" and self.first.seconds < parameter.high < math.inf:
-                span = f"{parameter.low:g}s:{parameter.high:g}s"
+                range_text = f"{parameter.low:g}s:{parameter.high:g}s"
                 yield (
-                    f"{parameter.name}@{span} goes on after the end of that run, at"
+                    f"{parameter.name}@{range_text} goes on after the end of that run, at"
                     f" {self.first.seconds:g} s: from there on nothing happens"
                 )
         if self.first.is_violated:
             yield "  the search ended with it: what fails without any variation needs no search"
-        unknown = sum(run.verdict == "unknown" for run in self.runs)
-        doubt = f", {unknown:,} unknown" if unknown else ""
-        runs = plural(len(self.runs), "run")
+        unknown_count = sum(run.verdict == "unknown" for run in self.runs)
+        unknown_text = f", {unknown_count:,} unknown" if unknown_count else ""
+        runs_text = plural(len(self.runs), "run")
         if self.failures:
-            yield f"{runs} of {self.name}: {len(self.failures):,} violated{doubt}; the worst first:"
+            yield (
+                f"{runs_text} of {self.name}: {len(self.failures):,} violated{unknown_text}; the worst first:"
+            )
             for failure in self.failures[:_MOST_FAILURES]:
                 yield from self._lines_of(failure)
             if len(self.failures) > _MOST_FAILURES:
                 yield f"  … and {len(self.failures) - _MOST_FAILURES:,} more in failures.json"
         else:
-            lowest = self.lowest
-            yield f"{runs} of {self.name}: none violated{doubt}"
-            case = self.text_of(lowest.case)
-            yield f"  the lowest: run {lowest.number}, {_verdict_text(lowest)}, with {case}"
+            lowest_run = self.lowest
+            yield f"{runs_text} of {self.name}: none violated{unknown_text}"
+            case_text = self.text_of(lowest_run.case)
+            yield f"  the lowest: run {lowest_run.number}, {_verdict_text(lowest_run)}, with {case_text}"
             if len({run.robustness for run in self.runs}) == 1 < len(self.runs):
                 yield "  it is the same in every run: what is varied does not change it"
             elif not self.is_exhausted:
@@ -251,19 +251,19 @@ class Falsification(Printed):
             yield f"  {plural(self.impossible, 'case')} left out, in which objects would lie in each other"
         if self.simulations:
             yield f"{plural(self.simulations, 'more run')} made the failures smaller"
-        worst = min(self.failures, key=lambda failure: failure.smaller.robustness, default=None)
-        if worst is not None and worst.command is not None:
-            less = " with less" if worst.is_smaller else ""
-            yield f"the worst again, run {worst.run.number}{less}: {worst.command}"
+        worst_failure = min(self.failures, key=lambda failure: failure.smaller.robustness, default=None)
+        if worst_failure is not None and worst_failure.command is not None:
+            less_text = " with less" if worst_failure.is_smaller else ""
+            yield f"the worst again, run {worst_failure.run.number}{less_text}: {worst_failure.command}"
 
     def _lines_of(self, failure: Failure) -> Iterator[str]:
         run = failure.run
         yield f"  {failure.log}  {run.spec} {with_unit(run.robustness, run.unit)}  {self.text_of(run.case)}"
         if failure.is_smaller:
             smaller = failure.smaller
-            number = with_unit(smaller.robustness, smaller.unit)
-            case = self.text_of(smaller.case)
-            yield f"    with less: {failure.smaller_log}  {smaller.spec} {number}  {case}"
+            robustness_text = with_unit(smaller.robustness, smaller.unit)
+            case_text = self.text_of(smaller.case)
+            yield f"    with less: {failure.smaller_log}  {smaller.spec} {robustness_text}  {case_text}"
         yield f"    clip: {failure.clip}"
 
     @property
@@ -301,16 +301,16 @@ class Falsification(Printed):
             for run in self.runs[1:]
             if (value := run.case[parameter.name]) is not None
         ]
-        tenths: list[list[float]] = [[] for _ in range(TENTHS)]
+        robustness_by_tenth: list[list[float]] = [[] for _ in range(TENTHS)]
         for value, robustness in values:
-            tenths[parameter.tenth_of(value)].append(robustness)
+            robustness_by_tenth[parameter.tenth_of(value)].append(robustness)
         return Coverage(
             parameter.name,
             parameter.low,
             parameter.high,
             parameter.unit,
-            tuple(map(len, tenths)),
-            tuple(min(robustnesses, default=None) for robustnesses in tenths),
+            tuple(map(len, robustness_by_tenth)),
+            tuple(min(robustnesses, default=None) for robustnesses in robustness_by_tenth),
         )
 
 
@@ -322,16 +322,16 @@ def _verdict_text(run: SearchedRun) -> str:
     return f"{run.verdict}, {run.spec} {with_unit(run.robustness, run.unit)}"
 
 
-def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
-    names = max(len(coverage.parameter) for coverage in covered)
-    spans = [
+def _table(coverages: tuple[Coverage, ...]) -> Iterator[str]:
+    name_width = max(len(coverage.parameter) for coverage in coverages)
+    range_texts = [
         f"{coverage.low:g} to {coverage.high:g}{f' {coverage.unit}' if coverage.unit else ''}"
-        for coverage in covered
+        for coverage in coverages
     ]
-    width = max(map(len, spans))
-    for coverage, span in zip(covered, spans, strict=True):
-        counts = " ".join(f"{count:3}" for count in coverage.runs)
-        yield f"  {coverage.parameter:<{names}}  {span:<{width}}  {counts}"
+    range_width = max(map(len, range_texts))
+    for coverage, range_text in zip(coverages, range_texts, strict=True):
+        counts_text = " ".join(f"{count:3}" for count in coverage.runs)
+        yield f"  {coverage.parameter:<{name_width}}  {range_text:<{range_width}}  {counts_text}"
 
 
 # --------------------------------------------------------------------------------------------------- descents
@@ -381,21 +381,21 @@ class Descents:
         self._cma: Any = cma
         # pycma does not support one dimension (https://github.com/CMA-ES/pycma/issues/86); a second one
         # without effect does no harm
-        self._size, self._searched = size, max(size, 2)
+        self._size, self._search_size = size, max(size, 2)
         self._random = np.random.default_rng([seed, 0])
         self._strategy: Any = None
-        self._least, self._stalled = np.inf, 0
-        self._asked: list[NDArray[np.float64]] = []
+        self._least_cost, self._stalled_generations = np.inf, 0
+        self._round_points: list[NDArray[np.float64]] = []
         # the current generation: remaining proposals, and points with their costs so far
-        self._drawn: list[NDArray[np.float64]] = []
+        self._proposals: list[NDArray[np.float64]] = []
         self._generation: list[tuple[NDArray[np.float64], float]] = []
         self._points: list[NDArray[np.float64]] = []
         self._costs: list[float] = []
 
     def ask(self) -> list[NDArray[np.float64]]:
         """Return the points of the next round, each (size,) with numbers from 0 to 1."""
-        self._asked = self._look() if self._strategy is None else self._promising()
-        return [point[: self._size] for point in self._asked]
+        self._round_points = self._look() if self._strategy is None else self._promising()
+        return [point[: self._size] for point in self._round_points]
 
     def take(self, costs: Sequence[float], *, is_found: bool) -> None:
         """Receive the cost of each point of the last round.
@@ -404,61 +404,63 @@ class Descents:
             is_found: whether one of the points is a failure; if so, the next descent begins elsewhere.
         """
         self._remember(costs)
-        self._generation += zip(self._asked, costs, strict=True)
+        self._generation += zip(self._round_points, costs, strict=True)
         if is_found:
             self._strategy = None
         elif self._strategy is None:
-            self._strategy = self._descent(self._asked[int(np.argmin(costs))])
-            self._least, self._stalled = min(costs), 0
+            self._strategy = self._descent(self._round_points[int(np.argmin(costs))])
+            self._least_cost, self._stalled_generations = min(costs), 0
         elif len(self._generation) < self._strategy.popsize:
             return
         else:
             self._end_generation()
-        self._generation, self._drawn = [], []
+        self._generation, self._proposals = [], []
 
     def _look(self) -> list[NDArray[np.float64]]:
         """Return a Latin hypercube: each tenth of each dimension has one point."""
         columns = [
             (self._random.permutation(_LOOK) + self._random.random(_LOOK)) / _LOOK
-            for _ in range(self._searched)
+            for _ in range(self._search_size)
         ]
         return list(np.array(columns).T)
 
     def _end_generation(self) -> None:
         points, costs = map(list, zip(*self._generation, strict=True))
         self._strategy.tell(points, costs)
-        least = min(costs)
-        is_lower = least < self._least - _FALLS * abs(self._least)
-        self._stalled = 0 if is_lower else self._stalled + 1
-        self._least = min(self._least, least)
-        if self._strategy.stop() or self._stalled == _STALLED:
+        least_cost = min(costs)
+        is_lower = least_cost < self._least_cost - _FALLS * abs(self._least_cost)
+        self._stalled_generations = 0 if is_lower else self._stalled_generations + 1
+        self._least_cost = min(self._least_cost, least_cost)
+        if self._strategy.stop() or self._stalled_generations == _STALLED:
             self._strategy = None
 
     def _promising(self) -> list[NDArray[np.float64]]:
         """Return the proposals with the least expected costs, for one round of a generation."""
-        size = self._strategy.popsize
-        if not self._drawn:
-            self._drawn = self._strategy.ask(_PROPOSED * size)
-        expected = expected_costs(
+        population_size = self._strategy.popsize
+        if not self._proposals:
+            self._proposals = self._strategy.ask(_PROPOSED * population_size)
+        proposal_costs = expected_costs(
             np.array(self._points),
             np.array(self._costs),
-            np.array([point[: self._size] for point in self._drawn]),
+            np.array([point[: self._size] for point in self._proposals]),
         )
-        count = min(-(-size // _PARTS), size - len(self._generation))
-        order = np.argsort(expected, kind="stable").tolist()
-        promising = [self._drawn[place] for place in order[:count]]
-        self._drawn = [self._drawn[place] for place in sorted(order[count:])]
-        return promising
+        point_count = min(-(-population_size // _PARTS), population_size - len(self._generation))
+        cost_order = np.argsort(proposal_costs, kind="stable").tolist()
+        points = [self._proposals[index] for index in cost_order[:point_count]]
+        self._proposals = [self._proposals[index] for index in sorted(cost_order[point_count:])]
+        return points
 
     def _remember(self, costs: Sequence[float]) -> None:
         """Store the newest points, and the best older points."""
-        self._points += [point[: self._size] for point in self._asked]
+        self._points += [point[: self._size] for point in self._round_points]
         self._costs += costs
-        older = len(self._costs) - _KNOWN // 2
-        best = sorted(sorted(range(max(older, 0)), key=lambda place: self._costs[place])[: _KNOWN // 2])
-        places = [*best, *range(max(older, 0), len(self._costs))]
-        self._points = [self._points[place] for place in places]
-        self._costs = [self._costs[place] for place in places]
+        older_count = len(self._costs) - _KNOWN // 2
+        best_indices = sorted(
+            sorted(range(max(older_count, 0)), key=lambda index: self._costs[index])[: _KNOWN // 2]
+        )
+        indices = [*best_indices, *range(max(older_count, 0), len(self._costs))]
+        self._points = [self._points[index] for index in indices]
+        self._costs = [self._costs[index] for index in indices]
 
     def _descent(self, start: NDArray[np.float64]) -> Any:
         options = {
@@ -488,26 +490,28 @@ def expected_costs(
         others: (M, D), points of the prediction.
     """
     # impossible cases and infinite costs count as the worst finite cost
-    finite = costs[costs < LARGEST_COST]
-    centred = np.minimum(costs, finite.max()) if finite.size else np.zeros_like(costs)
-    centred = centred - centred.mean()
-    among, between = _squares(points, points), _squares(others, points)
-    best, expected = -np.inf, np.zeros(len(others))
+    finite_costs = costs[costs < LARGEST_COST]
+    centred_costs = np.minimum(costs, finite_costs.max()) if finite_costs.size else np.zeros_like(costs)
+    centred_costs = centred_costs - centred_costs.mean()
+    point_squares, cross_squares = _squares(points, points), _squares(others, points)
+    best_likelihood, predicted_costs = -np.inf, np.zeros(len(others))
     for length in _LENGTHS:
-        scale = -0.5 / (length * length * points.shape[1])
-        lower = np.linalg.cholesky(np.exp(scale * among) + _NOISE * np.eye(len(points)))
-        weights = np.linalg.solve(lower.T, np.linalg.solve(lower, centred))
+        exponent_factor = -0.5 / (length * length * points.shape[1])
+        cholesky_factor = np.linalg.cholesky(
+            np.exp(exponent_factor * point_squares) + _NOISE * np.eye(len(points))
+        )
+        weights = np.linalg.solve(cholesky_factor.T, np.linalg.solve(cholesky_factor, centred_costs))
         # the maximum-likelihood variance of the costs
-        variance = max(float(centred @ weights) / len(points), np.finfo(float).tiny)
-        likelihood = -0.5 * len(points) * np.log(variance) - np.log(np.diag(lower)).sum()
-        if likelihood > best:
-            best, expected = likelihood, np.exp(scale * between) @ weights
-    return expected
+        variance = max(float(centred_costs @ weights) / len(points), np.finfo(float).tiny)
+        likelihood = -0.5 * len(points) * np.log(variance) - np.log(np.diag(cholesky_factor)).sum()
+        if likelihood > best_likelihood:
+            best_likelihood, predicted_costs = likelihood, np.exp(exponent_factor * cross_squares) @ weights
+    return predicted_costs
 
 
-def _squares(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+def _squares(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the squared distances between points (N, D) and other points (M, D), as (N, M)."""
-    return np.asarray(((some[:, None] - others[None]) ** 2).sum(axis=-1))
+    return np.asarray(((points[:, None] - others[None]) ** 2).sum(axis=-1))
 
 
 # --------------------------------------------------------------------------------------------- runs in a file
@@ -527,29 +531,30 @@ class RunFile:
             OutputError: the file cannot be written.
         """
         self._path = path
-        self._known: dict[str, SearchedRun] = {}
-        data = path.read_bytes() if path.exists() else b""
-        whole = data[: data.rfind(b"\n") + 1]
-        for number, line in enumerate(whole.splitlines(), start=1):
+        self._runs_by_case: dict[str, SearchedRun] = {}
+        content = path.read_bytes() if path.exists() else b""
+        whole_lines = content[: content.rfind(b"\n") + 1]
+        for line_number, line in enumerate(whole_lines.splitlines(), start=1):
             try:
                 run = SearchedRun.from_document(json.loads(line))
             except (AttributeError, KeyError, TypeError, ValueError) as error:
                 raise LogError(
-                    f"{path}:{number}: this line is not a run ({error}); delete the file, and search again"
+                    f"{path}:{line_number}: this line is not a run ({error}); delete the file, "
+                    "and search again"
                 ) from None
-            self._known[key_of(run.case)] = run
+            self._runs_by_case[key_of(run.case)] = run
         try:
             self._stream = path.open("ab")
             # remove the incomplete line of a killed search
-            self._stream.truncate(len(whole))
+            self._stream.truncate(len(whole_lines))
         except OSError as error:
             raise output_error(path, error) from error
 
     def __getitem__(self, case: Case) -> SearchedRun:
-        return self._known[key_of(case)]
+        return self._runs_by_case[key_of(case)]
 
     def __contains__(self, case: Case) -> bool:
-        return key_of(case) in self._known
+        return key_of(case) in self._runs_by_case
 
     def add(self, run: SearchedRun) -> None:
         """Append a run.
@@ -563,7 +568,7 @@ class RunFile:
             self._stream.flush()
         except OSError as error:
             raise output_error(self._path, error) from error
-        self._known[key_of(run.case)] = run
+        self._runs_by_case[key_of(run.case)] = run
 
     def close(self) -> None:
         """Close the file."""
@@ -627,83 +632,83 @@ class _Queue(Generic[_Result]):
     result: _Result
 
     def __init__(
-        self, rounds: Rounds[_Result], known: RunFile, advance: Callable[[int], None], logs: Path | None
+        self, rounds: Rounds[_Result], run_file: RunFile, advance: Callable[[int], None], logs: Path | None
     ) -> None:
-        self._rounds, self._known, self._advance, self._logs = rounds, known, advance, logs
-        self._round: Sequence[Case] | None = None
-        self._first = 1
-        self._waiting: deque[_Task] = deque()
-        self._unwritten: deque[_Task] = deque()
-        self._arrived: dict[int, SearchedRun] = {}
+        self._rounds, self._run_file, self._advance, self._logs = rounds, run_file, advance, logs
+        self._round_cases: Sequence[Case] | None = None
+        self._first_number = 1
+        self._waiting_tasks: deque[_Task] = deque()
+        self._unwritten_tasks: deque[_Task] = deque()
+        self._arrived_runs: dict[int, SearchedRun] = {}
         self._begin()
 
     def __iter__(self) -> Iterator[_Task]:
         return self
 
     def __next__(self) -> _Task:
-        if not self._waiting:
+        if not self._waiting_tasks:
             raise StopIteration
-        return self._waiting.popleft()
+        return self._waiting_tasks.popleft()
 
     def take(self, task: _Task, run: SearchedRun) -> None:
         """Receive the run of a task, and write finished runs in the order of their tasks."""
-        self._arrived[task.number] = run
-        while self._unwritten and self._unwritten[0].number in self._arrived:
-            self._known.add(self._arrived.pop(self._unwritten.popleft().number))
+        self._arrived_runs[task.number] = run
+        while self._unwritten_tasks and self._unwritten_tasks[0].number in self._arrived_runs:
+            self._run_file.add(self._arrived_runs.pop(self._unwritten_tasks.popleft().number))
             self._advance(1)
         self._begin()
 
     def _begin(self) -> None:
         """Start the next rounds, up to a round with a case that is not in the file."""
-        while not self._unwritten:
+        while not self._unwritten_tasks:
             try:
-                if self._round is None:
+                if self._round_cases is None:
                     cases = next(self._rounds)
                 else:
-                    self._first += len(self._round)
-                    cases = self._rounds.send([self._known[case] for case in self._round])
+                    self._first_number += len(self._round_cases)
+                    cases = self._rounds.send([self._run_file[case] for case in self._round_cases])
             except StopIteration as end:
                 self.result = end.value
                 return
-            self._round = cases
-            for number, case in enumerate(cases, start=self._first):
-                if case not in self._known:
-                    log = None if self._logs is None else self._logs / f"run-{number:04d}.mcap"
-                    self._waiting.append(_Task(number, case, log))
-            self._unwritten.extend(self._waiting)
-            self._advance(len(cases) - len(self._waiting))
+            self._round_cases = cases
+            for run_number, case in enumerate(cases, start=self._first_number):
+                if case not in self._run_file:
+                    log = None if self._logs is None else self._logs / f"run-{run_number:04d}.mcap"
+                    self._waiting_tasks.append(_Task(run_number, case, log))
+            self._unwritten_tasks.extend(self._waiting_tasks)
+            self._advance(len(cases) - len(self._waiting_tasks))
 
 
 def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
     """Simulate and evaluate a case; write its log if it violates."""
     try:
-        simulated = simulation.run(task.case)
+        simulated_case = simulation.run(task.case)
     except Exception as error:
         error.add_note(f"in the case {key_of(task.case)}")
         raise
-    results = [result for file in simulation.files for result in evaluate(file, simulated.trace)]
-    worst = min(results, key=lambda result: result.upper)
+    results = [result for file in simulation.files for result in evaluate(file, simulated_case.trace)]
+    worst_result = min(results, key=lambda result: result.upper)
     verdict = worst_verdict(result.verdict for result in results)
-    times_ns = simulated.trace.times_ns
+    times_ns = simulated_case.trace.times_ns
     run = SearchedRun(
         task.number,
         task.case,
         verdict,
-        worst.upper,
-        worst.title,
-        declared_unit(worst.formula, {"": simulated.unit}),
+        worst_result.upper,
+        worst_result.title,
+        declared_unit(worst_result.formula, {"": simulated_case.unit}),
         int(times_ns[-1] - times_ns[0]) / 1e9,
     )
     if run.is_violated and task.log is not None:
-        write_whole(simulated.write, task.log)
+        write_whole(simulated_case.write, task.log)
     return run
 
 
 def write_whole(write: Callable[[Path], None], log: Path) -> None:
     """Write a log under another name and rename it, so that it is never incomplete."""
-    unfinished = log.with_name(f".{log.name}.partial")
-    write(unfinished)
-    unfinished.replace(log)
+    partial_log = log.with_name(f".{log.name}.partial")
+    write(partial_log)
+    partial_log.replace(log)
 
 
 def lost_worker_error(worker: WorkerLost) -> OutputError:
@@ -772,12 +777,14 @@ def falsify(
     if isinstance(simulation, str):
         if isinstance(vary, Mapping):
             raise UsageError('what is varied in a scenario is a list of texts, such as ["noise=0:0.01"]')
-        simulated, parameters = scenario_simulation(simulation, files, vary, is_planned=planned)
+        searched_simulation, parameters = scenario_simulation(simulation, files, vary, is_planned=planned)
     elif planned:
         raise UsageError("planned is for scenarios; let the planner act within the simulation")
     else:
-        simulated, parameters = own_simulation(simulation, files, vary, jobs)
-    return search_failures(simulated, parameters, output, workers_of(jobs), budget=budget, seed=seed)
+        searched_simulation, parameters = own_simulation(simulation, files, vary, jobs)
+    return search_failures(
+        searched_simulation, parameters, output, workers_of(jobs), budget=budget, seed=seed
+    )
 
 
 def search_failures(
@@ -855,9 +862,9 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
         UsageError: the folder has another search, or other files.
         LogError: the mark is damaged.
     """
-    names = files.names()
-    if _SEARCH not in names:
-        if names:
+    file_names = files.names()
+    if _SEARCH not in file_names:
+        if file_names:
             raise UsageError(f"{files} holds files, but no search; give an empty folder, or a new one")
         files.write(_SEARCH, json.dumps(identity, indent=1).encode() + b"\n")
         return
@@ -865,18 +872,22 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
         (content,) = files.read([_SEARCH])
         stored_identity = json.loads(content)
         key = next((key for key in identity if stored_identity.get(key) != identity[key]), None)
-        varied = [_varied_text(stored["varied"]) for stored in (stored_identity, identity) if key == "varied"]
+        varied_texts = [
+            _varied_text(search_identity["varied"])
+            for search_identity in (stored_identity, identity)
+            if key == "varied"
+        ]
     except (AttributeError, LookupError, TypeError, ValueError):
         raise LogError(f"{files.path / _SEARCH} is damaged; delete {files}, or give another folder") from None
     if key is not None:
-        what = {
+        difference = {
             "seed": f"its seed is {stored_identity.get('seed')}",
             "simulation": f"it is of {stored_identity.get('simulation')}",
-            "varied": f"it varies {', and this one '.join(varied)}",
+            "varied": f"it varies {', and this one '.join(varied_texts)}",
             "specifications": "it has other specifications",
             "version": f"it is of version {stored_identity.get('version')}",
         }.get(key, f"its {key} is {stored_identity.get(key)}")
-        raise UsageError(f"{files} holds another search: {what}; give another folder, or delete it")
+        raise UsageError(f"{files} holds another search: {difference}; give another folder, or delete it")
 
 
 def _varied_text(varied: Mapping[str, Sequence[Any]]) -> str:
@@ -902,19 +913,22 @@ class _Search:
         """Search, reduce the failures, and cut their clips."""
         with self._progress("runs", budget) as advance:
             runs = self._simulate_rounds(self._descend(budget, seed), "runs", advance, self._folder / "runs")
-        failing = sorted(
+        failing_runs = sorted(
             (run for run in runs if run.is_violated), key=lambda run: (run.robustness, run.number)
         )
         runs_by_case = {key_of(run.case): run for run in runs}
         with self._progress("smaller runs", None) as advance:
-            smaller, simulations = self._simulate_rounds(
-                self._shrink(failing, runs_by_case), "smaller", advance
+            smaller_runs, simulations = self._simulate_rounds(
+                self._shrink(failing_runs, runs_by_case), "smaller", advance
             )
-        failures = tuple(self._failure(run, least) for run, least in zip(failing, smaller, strict=True))
+        failures = tuple(
+            self._failure(run, smaller_run)
+            for run, smaller_run in zip(failing_runs, smaller_runs, strict=True)
+        )
         with self._progress("clips", len(failures)) as advance:
-            for _, finished in self._workers.results(partial(_finish, self._simulation), failures):
-                if isinstance(finished, WorkerLost):
-                    raise lost_worker_error(finished)
+            for _, outcome in self._workers.results(partial(_finish, self._simulation), failures):
+                if isinstance(outcome, WorkerLost):
+                    raise lost_worker_error(outcome)
                 advance(1)
         result = Falsification(
             self._simulation.name,
@@ -936,104 +950,117 @@ class _Search:
 
     def _descend(self, budget: int, seed: int) -> Rounds[list[SearchedRun]]:
         """Yield the cases that an optimiser chooses, with the robustness as cost; return all runs."""
-        (first,) = yield [self._space.at_rest()]
-        runs = [replace(first, number=1)]
-        self._space = space = self._space.ending_at(first.seconds)
-        late = next(
+        (first_run,) = yield [self._space.at_rest()]
+        runs = [replace(first_run, number=1)]
+        self._space = space = self._space.ending_at(first_run.seconds)
+        late_parameter = next(
             (
                 parameter
                 for parameter in space.parameters
-                if parameter.unit == "s" and parameter.low >= first.seconds
+                if parameter.unit == "s" and parameter.low >= first_run.seconds
             ),
             None,
         )
-        if late is not None and not first.is_violated:
+        if late_parameter is not None and not first_run.is_violated:
             raise UsageError(
-                f"--vary {late.name}@{late.low:g}s:{late.high:g}s: with nothing varied the run ends after"
-                f" {first.seconds:g} s; begin before that, in another folder"
+                f"--vary {late_parameter.name}@{late_parameter.low:g}s:{late_parameter.high:g}s: "
+                f"with nothing varied the run ends after {first_run.seconds:g} s; "
+                "begin before that, in another folder"
             )
         descents = Descents(len(space.ordered), seed) if space.ordered else None
         # another random stream than that of the descents
-        random, barren = np.random.default_rng([seed, 1]), 0
-        costs = {key_of(first.case): _cost(first)}
-        best: tuple[float, list[float]] | None = None
-        while len(runs) < budget and barren < _BARREN and not first.is_violated:
+        generator, barren_rounds = np.random.default_rng([seed, 1]), 0
+        cost_by_key = {key_of(first_run.case): _cost(first_run)}
+        best_draw: tuple[float, list[float]] | None = None
+        while len(runs) < budget and barren_rounds < _BARREN and not first_run.is_violated:
             points: Sequence[Any] = descents.ask() if descents is not None else [()] * _DRAWN
             draws = [
                 # the seeds with the least cost so far, or new ones
-                best[1] if best is not None and random.random() < 0.5 else space.draw(random)
+                best_draw[1] if best_draw is not None and generator.random() < 0.5 else space.draw(generator)
                 for _ in points
             ]
             cases = [space.case_at(point, draw) for point, draw in zip(points, draws, strict=True)]
-            new: dict[str, Case] = {}
+            new_cases: dict[str, Case] = {}
             for case in cases:
-                key = key_of(case)
-                if key not in costs and not self._simulation.is_possible(case):
-                    self._impossible.add(key)
-                    costs[key] = 2 * LARGEST_COST
-                elif key not in costs:
-                    new[key] = case
-            asked = [*new.values()][: budget - len(runs)]
-            barren = 0 if asked else barren + 1
-            for run in (yield asked) if asked else ():
+                case_key = key_of(case)
+                if case_key not in cost_by_key and not self._simulation.is_possible(case):
+                    self._impossible.add(case_key)
+                    cost_by_key[case_key] = 2 * LARGEST_COST
+                elif case_key not in cost_by_key:
+                    new_cases[case_key] = case
+            round_cases = [*new_cases.values()][: budget - len(runs)]
+            barren_rounds = 0 if round_cases else barren_rounds + 1
+            for run in (yield round_cases) if round_cases else ():
                 runs.append(replace(run, number=len(runs) + 1))
-                costs[key_of(run.case)] = _cost(run)
+                cost_by_key[key_of(run.case)] = _cost(run)
             # the budget ends within this round, so some cases have no costs
-            if len(asked) < len(new):
+            if len(round_cases) < len(new_cases):
                 break
-            reported = [costs[key_of(case)] for case in cases]
+            point_costs = [cost_by_key[key_of(case)] for case in cases]
             # a failure that is already known does not end a descent
-            is_found = any(key_of(case) in new and costs[key_of(case)] < 0 for case in cases)
-            least = int(np.argmin(reported))
+            is_found = any(key_of(case) in new_cases and cost_by_key[key_of(case)] < 0 for case in cases)
+            least_index = int(np.argmin(point_costs))
             if is_found:
-                best = None
-            elif best is None or reported[least] < best[0]:
-                best = reported[least], draws[least]
+                best_draw = None
+            elif best_draw is None or point_costs[least_index] < best_draw[0]:
+                best_draw = point_costs[least_index], draws[least_index]
             if descents is not None:
-                descents.take(reported, is_found=is_found)
-        self._is_exhausted = barren == _BARREN
+                descents.take(point_costs, is_found=is_found)
+        self._is_exhausted = barren_rounds == _BARREN
         return runs
 
     def _shrink(
-        self, failing: Sequence[SearchedRun], known: Mapping[str, SearchedRun]
+        self, failing_runs: Sequence[SearchedRun], runs_by_case: Mapping[str, SearchedRun]
     ) -> Rounds[tuple[list[SearchedRun], int]]:
         """Reduce all failures, by one run each in a round; return them and the number of further runs."""
-        tried: dict[str, SearchedRun] = {}
-        least = list(failing)
-        trials = [self._smaller(run) for run in failing]
-        asked = {place: case for place, trial in enumerate(trials) if (case := next(trial, None)) is not None}
-        while asked:
-            new = {key_of(case): case for case in asked.values()}
-            unknown = [case for key, case in new.items() if key not in known and key not in tried]
-            for run in (yield unknown) if unknown else ():
-                tried[key_of(run.case)] = run
-            for place, case in list(asked.items()):
-                key = key_of(case)
-                run = known[key] if key in known else tried[key]
+        tried_runs: dict[str, SearchedRun] = {}
+        smaller_runs = list(failing_runs)
+        reductions = [self._smaller(run) for run in failing_runs]
+        case_by_index = {
+            index: case
+            for index, reduction in enumerate(reductions)
+            if (case := next(reduction, None)) is not None
+        }
+        while case_by_index:
+            round_cases = {key_of(case): case for case in case_by_index.values()}
+            unknown_cases = [
+                case
+                for case_key, case in round_cases.items()
+                if case_key not in runs_by_case and case_key not in tried_runs
+            ]
+            for run in (yield unknown_cases) if unknown_cases else ():
+                tried_runs[key_of(run.case)] = run
+            for index, case in list(case_by_index.items()):
+                case_key = key_of(case)
+                run = runs_by_case[case_key] if case_key in runs_by_case else tried_runs[case_key]
                 if run.is_violated:
-                    least[place] = replace(run, number=failing[place].number)
+                    smaller_runs[index] = replace(run, number=failing_runs[index].number)
                 try:
-                    asked[place] = trials[place].send(run)
+                    case_by_index[index] = reductions[index].send(run)
                 except StopIteration:
-                    del asked[place]
-        return least, len(tried)
+                    del case_by_index[index]
+        return smaller_runs, len(tried_runs)
 
     def _smaller(self, failure: SearchedRun) -> Generator[Case, SearchedRun, None]:
         """Yield cases with fewer or smaller variations, until no group can return to rest on its own."""
-        case, halvings = failure.case, dict.fromkeys(self._space.groups, _HALVINGS)
+        case, halvings_left = failure.case, dict.fromkeys(self._space.groups, _HALVINGS)
         is_changed = True
         while is_changed:
             is_changed = False
             for group in self._space.groups:
-                trial = self._space.at_rest(case, group)
-                if trial != case and self._simulation.is_possible(trial) and (yield trial).is_violated:
-                    case, is_changed = trial, True
+                smaller_case = self._space.at_rest(case, group)
+                if (
+                    smaller_case != case
+                    and self._simulation.is_possible(smaller_case)
+                    and (yield smaller_case).is_violated
+                ):
+                    case, is_changed = smaller_case, True
             for group in self._space.groups if not is_changed else ():
-                nearer = self._space.nearer(case, group)
-                if nearer is not None and halvings[group]:
-                    halvings[group] -= 1
-                    if (yield nearer).is_violated:
-                        case, is_changed = nearer, True
+                nearer_case = self._space.nearer(case, group)
+                if nearer_case is not None and halvings_left[group]:
+                    halvings_left[group] -= 1
+                    if (yield nearer_case).is_violated:
+                        case, is_changed = nearer_case, True
 
     def _failure(self, run: SearchedRun, smaller: SearchedRun) -> Failure:
         name = f"run-{run.number:04d}.mcap"

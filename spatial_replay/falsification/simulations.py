@@ -122,8 +122,10 @@ class Space:
     @property
     def groups(self) -> tuple[str, ...]:
         """The groups in the order of reduction: mishaps, numbers, starts; seeds cannot be reduced."""
-        places = sorted(self.ordered, key=lambda parameter: (parameter.unit != "s", parameter.rest is None))
-        return tuple(dict.fromkeys(parameter.group for parameter in places))
+        sorted_parameters = sorted(
+            self.ordered, key=lambda parameter: (parameter.unit != "s", parameter.rest is None)
+        )
+        return tuple(dict.fromkeys(parameter.group for parameter in sorted_parameters))
 
     def at_rest(self, case: Case | None = None, group: str | None = None) -> dict[str, float | None]:
         """Return a case with one group at rest; without a case, return the case with all at rest."""
@@ -136,20 +138,22 @@ class Space:
 
     def nearer(self, case: Case, group: str) -> dict[str, float | None] | None:
         """Return a case with a group half way to rest; None if it is at rest, or has no value at rest."""
-        values = dict(case)
+        new_case = dict(case)
         for parameter in self.parameters:
             value = case[parameter.name]
             if parameter.group == group:
                 if parameter.rest is None or value is None:
                     return None
-                values[parameter.name] = round((value + parameter.rest) / 2, parameter.digits)
-        return None if values == dict(case) else values
+                new_case[parameter.name] = round((value + parameter.rest) / 2, parameter.digits)
+        return None if new_case == dict(case) else new_case
 
     def case_at(self, shares: Iterable[float], drawn: Sequence[float]) -> dict[str, float | None]:
         """Return the case at fractions of the ordered parameters' ranges, with drawn values of the others."""
-        coming, others = iter(shares), iter(drawn)
+        ordered_shares, drawn_values = iter(shares), iter(drawn)
         return {
-            parameter.name: next(others) if parameter.is_drawn else parameter.value_at(float(next(coming)))
+            parameter.name: next(drawn_values)
+            if parameter.is_drawn
+            else parameter.value_at(float(next(ordered_shares)))
             for parameter in self.parameters
         }
 
@@ -184,11 +188,11 @@ def parse_range(text: str) -> tuple[str, str, str]:
     Raises:
         UsageError: the text has another form.
     """
-    name, _, span = (part.strip() for part in text.partition("="))
-    low, _, high = (part.strip() for part in span.partition(":"))
-    if not (name and low and high):
+    name, _, range_text = (part.strip() for part in text.partition("="))
+    low_text, _, high_text = (part.strip() for part in range_text.partition(":"))
+    if not (name and low_text and high_text):
         raise UsageError(f"--vary: {text!r} is incomplete; write NAME=LOW:HIGH, such as noise=0:0.01")
-    return name, low, high
+    return name, low_text, high_text
 
 
 def number_from(text: str, of: str) -> float:
@@ -269,15 +273,15 @@ def own_simulation(
             for name, low, high in map(parse_range, texts)
         }
     name = getattr(simulate, "__name__", type(simulate).__name__)
-    runs = OwnSimulation(simulate, tuple(files), name)
+    simulation = OwnSimulation(simulate, tuple(files), name)
     if jobs > 1:
         try:
-            pickle.dumps(runs)
+            pickle.dumps(simulation)
         except (AttributeError, TypeError, pickle.PicklingError) as error:
             raise UsageError(
                 f"{name} cannot be sent to other processes ({error}); define it in a module, or take jobs=1"
             ) from None
-    return runs, tuple(Parameter.of_range(name_of_range, *span) for name_of_range, span in vary.items())
+    return simulation, tuple(Parameter.of_range(name_of_range, *ends) for name_of_range, ends in vary.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,10 +317,10 @@ class OwnSimulation:
         values = {name: value for name, value in case.items() if value is not None}
         samples = list(self.simulate(values))
         if not samples or not all(isinstance(sample, Sample) for sample in samples):
-            what = f"{type(samples[0]).__name__} objects" if samples else "nothing"
-            raise UsageError(f"{self.name} returns {what}; a simulation returns one Sample or more")
-        about = {"source": self.name, "options": json.dumps(values)}
-        return _simulated_case(samples, self.files, about)
+            result_text = f"{type(samples[0]).__name__} objects" if samples else "nothing"
+            raise UsageError(f"{self.name} returns {result_text}; a simulation returns one Sample or more")
+        metadata = {"source": self.name, "options": json.dumps(values)}
+        return _simulated_case(samples, self.files, metadata)
 
     def command(self, case: Case) -> None:
         """Return the command that records the run of a case; None for a user's simulation."""
@@ -361,8 +365,8 @@ class ScenarioRuns:
         if self.is_planned:
             return self._plan(conditions)
         samples = simulate_script(self.name, **conditions)
-        about = about_run(self.name, **conditions)
-        return _simulated_case(samples, self.files, about, unit="m")
+        metadata = about_run(self.name, **conditions)
+        return _simulated_case(samples, self.files, metadata, unit="m")
 
     def command(self, case: Case) -> str:
         """See `OwnSimulation`."""
@@ -375,25 +379,32 @@ class ScenarioRuns:
         for start in conditions["starts"]:
             options += ["--start", str(start)]
         # the planner plans for the scenario's specification; other files are only evaluated
-        others = ["--also" if word == "--spec" else word for word in self.spec_options]
-        verb = ["plan", self.name, *others] if self.is_planned else ["record", self.name, *self.spec_options]
-        words = ["spatial-replay", *verb, "-o", "again.mcap", *options]
+        plan_options = ["--also" if word == "--spec" else word for word in self.spec_options]
+        command_words = (
+            ["plan", self.name, *plan_options]
+            if self.is_planned
+            else ["record", self.name, *self.spec_options]
+        )
+        words = ["spatial-replay", *command_words, "-o", "again.mcap", *options]
         return shlex.join(words)
 
-    def _plan(self, given: Conditions) -> SimulatedCase:
+    def _plan(self, conditions: Conditions) -> SimulatedCase:
         specification = default_specification(self.name)
-        task, also = specification, [file for file in self.files if file != specification]
+        task_specification, other_specifications = (
+            specification,
+            [file for file in self.files if file != specification],
+        )
         if self.spec_options and "--spec" not in self.spec_options:
             # without --spec, the only file is the scenario's specification with other constants
-            (task,), also = self.files, []
+            (task_specification,), other_specifications = self.files, []
         with TemporaryDirectory() as folder:
             log = Path(folder, "run.mcap")
-            record_plan(self.name, log, task, also=also, **given)
-            trace, data = read_trace(log), log.read_bytes()
+            record_plan(self.name, log, task_specification, also=other_specifications, **conditions)
+            trace, log_content = read_trace(log), log.read_bytes()
 
         def write(output: Path) -> None:
             with replacing(output) as stream:
-                stream.write(data)
+                stream.write(log_content)
 
         return SimulatedCase(trace, write, unit="m")
 
@@ -404,9 +415,9 @@ class ScenarioRuns:
             UsageError: a parameter that cannot be varied in this world.
         """
         name = text.partition("=")[0].strip()
-        kind, at, when = text.partition("@")
-        if at and kind in _KINDS:
-            return [self._mishap(kind, when.strip())]
+        kind, at_sign, time_text = text.partition("@")
+        if at_sign and kind in _KINDS:
+            return [self._mishap(kind, time_text.strip())]
         if name == "start" or name.startswith("start."):
             return self._starts(text)
         if name in ("noise", "seed"):
@@ -425,35 +436,35 @@ class ScenarioRuns:
         hint = nearest_hint(name, ["noise", "seed", "start", *_KINDS])
         raise UsageError(f"--vary: {name!r} cannot be varied in {self.name}; {hint or f'write {_FORMS}'}")
 
-    def _mishap(self, kind: str, when: str) -> Parameter:
-        begin, colon, end = when.partition(":")
+    def _mishap(self, kind: str, time_text: str) -> Parameter:
+        begin_text, colon, end_text = time_text.partition(":")
         try:
             # the world refuses injections that cannot happen in it
             with closing(make_world(self.name, injections=[Injection.parse(f"{kind}@1s")])):
                 pass
-            span = (0.0, math.inf)
-            if when != "T":
+            range_s = (0.0, math.inf)
+            if time_text != "T":
                 if not colon:
                     raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
-                span = duration_ns_from_text(begin) / 1e9, duration_ns_from_text(end) / 1e9
+                range_s = duration_ns_from_text(begin_text) / 1e9, duration_ns_from_text(end_text) / 1e9
         except UsageError as error:
             # the message omits the time of the trial, 1 s, which the user did not write
-            why = str(error).removeprefix(f"{kind}@1s: ")
-            raise UsageError(f"--vary {kind}@{when}: {why}") from None
+            reason = str(error).removeprefix(f"{kind}@1s: ")
+            raise UsageError(f"--vary {kind}@{time_text}: {reason}") from None
         if colon:
-            refuse_range(kind, *span)
-        return Parameter(kind, *span, digits=3, rest=None, group=kind, unit="s")
+            refuse_range(kind, *range_s)
+        return Parameter(kind, *range_s, digits=3, rest=None, group=kind, unit="s")
 
     def _starts(self, text: str) -> list[Parameter]:
-        name, equals, metres = (part.strip() for part in text.partition("="))
+        name, equals_sign, distance_text = (part.strip() for part in text.partition("="))
         scenario = scenario_of(self.name)
-        bodies = [placement.body.name for placement in scenario.placements]
+        body_names = [placement.body.name for placement in scenario.placements]
         body_name = name.removeprefix("start").removeprefix(".")
-        if body_name and body_name not in bodies:
-            hint = nearest_hint(body_name, bodies) or f"there are {', '.join(bodies)}"
+        if body_name and body_name not in body_names:
+            hint = nearest_hint(body_name, body_names) or f"there are {', '.join(body_names)}"
             raise UsageError(f"--vary {text}: {self.name} has no {body_name!r}; {hint}")
-        off = number_from(metres, name) if equals else scenario.scatter_m
-        if not (math.isfinite(off) and off > 0):
+        distance_m = number_from(distance_text, name) if equals_sign else scenario.scatter_m
+        if not (math.isfinite(distance_m) and distance_m > 0):
             raise UsageError(
                 f"--vary {text}: write how far an object may be from its place, such as {name}=0.02"
             )
@@ -461,14 +472,14 @@ class ScenarioRuns:
         for placement in scenario.placements:
             if body_name in ("", placement.body.name):
                 group = f"start.{placement.body.name}"
-                centres = {
-                    "x": (placement.x, off),
-                    "y": (placement.y, off),
+                ranges_by_axis = {
+                    "x": (placement.x, distance_m),
+                    "y": (placement.y, distance_m),
                     "turn": (placement.yaw, scenario.scatter_rad),
                 }
-                for axis, (centre, wide) in centres.items():
+                for axis, (centre, half_width) in ranges_by_axis.items():
                     digits, unit = (3, "rad") if axis == "turn" else (4, "m")
-                    ends = round(centre - wide, digits), round(centre + wide, digits)
+                    ends = round(centre - half_width, digits), round(centre + half_width, digits)
                     parameters.append(Parameter(f"{group}.{axis}", *ends, digits, None, group, unit))
         return parameters
 
@@ -477,7 +488,9 @@ Simulation: TypeAlias = OwnSimulation | ScenarioRuns
 
 
 def _conditions(case: Case) -> Conditions:
-    injections = [Injection(kind, round(at * 1e9)) for kind in _KINDS if (at := case.get(kind)) is not None]
+    injections = [
+        Injection(kind, round(time_s * 1e9)) for kind in _KINDS if (time_s := case.get(kind)) is not None
+    ]
     starts = []
     for name in case:
         if name.startswith("start.") and name.endswith(".x"):
@@ -491,28 +504,28 @@ def _conditions(case: Case) -> Conditions:
 
 def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:
     """Return the footprint of a body at the start; without a given start it includes the scatter of seeds."""
-    x, y, turn, room = placement.x, placement.y, placement.yaw, scatter_m
+    x, y, yaw, room_m = placement.x, placement.y, placement.yaw, scatter_m
     if (start := starts.get(placement.body.name)) is not None:
-        x, y, turn, room = start.x, start.y, turn if start.turn is None else start.turn, 0.0
+        x, y, yaw, room_m = start.x, start.y, yaw if start.turn is None else start.turn, 0.0
     shape = placement.body.shape
     if isinstance(shape, Box):
-        return rectangle(x, y, shape.length + 2 * room, shape.width + 2 * room, turn)
-    return Footprint.disc(x, y, shape.radius + room)
+        return rectangle(x, y, shape.length + 2 * room_m, shape.width + 2 * room_m, yaw)
+    return Footprint.disc(x, y, shape.radius + room_m)
 
 
-def _is_beside(one: Placement, other: Placement) -> bool:
+def _is_beside(first_placement: Placement, second_placement: Placement) -> bool:
     """Return whether two bodies have common heights, so that their footprints must not overlap."""
     return (
-        one.bottom < other.bottom + other.body.shape.height
-        and other.bottom < one.bottom + one.body.shape.height
+        first_placement.bottom < second_placement.bottom + second_placement.body.shape.height
+        and second_placement.bottom < first_placement.bottom + first_placement.body.shape.height
     )
 
 
 def _simulated_case(
-    samples: Sequence[Sample], files: Sequence[Specification], about: Mapping[str, str], unit: str = ""
+    samples: Sequence[Sample], files: Sequence[Specification], metadata: Mapping[str, str], unit: str = ""
 ) -> SimulatedCase:
     def write(output: Path) -> None:
-        with run_log(output, files, about) as log:
+        with run_log(output, files, metadata) as log:
             for sample in samples:
                 log.write(sample)
 
