@@ -1,7 +1,7 @@
-"""Search for failing simulated runs, which are then reduced and cut to clips.
+"""Search for failing simulated runs; failures are then reduced and cut to clips.
 
-Runs are simulated in rounds. CMA-ES chooses the next cases by the robustness of earlier runs. A search
-continues from the file of its earlier runs. No other module imports the package `cma`.
+Runs are simulated in rounds. CMA-ES chooses the next cases by the robustness of earlier runs. A repeated
+search reads the file of its earlier runs. No other module imports the package `cma`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SearchedRun:
 
     Attributes:
         number: number of the run in the search, from 1.
-        case: value of each parameter by name; None if it is left out.
+        case: value of each parameter by name; None for a parameter without a value.
         verdict: worst verdict of all specifications.
         robustness: least upper end of all robustness intervals, below 0 if and only if a spec is violated.
         spec: title of the spec with this robustness.
@@ -158,7 +158,7 @@ class Falsification(Printed):
     Attributes:
         name: name of the scenario or the simulation.
         parameters: varied parameters.
-        runs: all runs in the order of the search; the first one has no variation.
+        runs: all runs in the order of the search; the first run has no variation.
         failures: violating runs, the worst first.
         impossible: number of cases that were skipped because objects would overlap.
         simulations: number of further runs for reducing failures.
@@ -194,7 +194,7 @@ class Falsification(Printed):
         return tuple(map(self._coverage_of, self.parameters))
 
     def text_of(self, case: Case) -> str:
-        """Return the variations of a case: "noise 0.004 m, slip@3.2s, start.red 0.47,-0.09,0.4"."""
+        """Return the variations of a case as text: "noise 0.004 m, slip@3.2s, start.red 0.47,-0.09,0.4"."""
         texts_by_group: dict[str, str] = {}
         for parameter in self.parameters:
             value = case[parameter.name]
@@ -211,7 +211,7 @@ class Falsification(Printed):
         return ", ".join(texts_by_group.values()) or "nothing varied"
 
     def lines(self) -> Iterator[str]:
-        """Yield lines of text: the failures, the worst first, or else the lowest run, and the coverage."""
+        """Yield lines of text: the failures from the worst on, or else the lowest run; then the coverage."""
         yield f"run 1, with nothing varied: {_verdict_text(self.first)}"
         for parameter in self.parameters:
             if parameter.unit == "s" and self.first.seconds < parameter.high < math.inf:
@@ -268,7 +268,7 @@ class Falsification(Printed):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The result as values for JSON; runs without a violation are left out, paths are relative."""
+        """The result as values for JSON: first run, lowest run, failures, coverage; paths are relative."""
         return {
             "simulation": self.name,
             "runs": len(self.runs),
@@ -295,7 +295,7 @@ class Falsification(Printed):
         }
 
     def _coverage_of(self, parameter: Parameter) -> Coverage:
-        # the first run has no variation, and a parameter that is left out has no value
+        # the first run has no variation, and parameters can lack a value
         values = [
             (value, run.robustness)
             for run in self.runs[1:]
@@ -337,7 +337,7 @@ def _table(coverages: tuple[Coverage, ...]) -> Iterator[str]:
 # --------------------------------------------------------------------------------------------------- descents
 
 LARGEST_COST: Final = 1e9
-"""Substitute for an infinite cost, which an optimiser cannot use; impossible cases cost more."""
+"""Substitute for an infinite cost, because the optimiser needs finite costs; impossible cases cost more."""
 _LOOK: Final = 10
 """Points before each descent, spread over the whole space."""
 _STEP: Final = 0.2
@@ -352,11 +352,11 @@ _FALLS: Final = 1e-3
 _PROPOSED: Final = 20
 """Proposals of CMA-ES for each simulated point."""
 _PARTS: Final = 3
-"""Rounds of a generation; the model uses the costs of earlier rounds to choose the points of the next."""
+"""Rounds of a generation; the model chooses the points of a round by the costs of earlier rounds."""
 _KNOWN: Final = 80
-"""Points that the model is fitted to: the best and the newest, one half each."""
+"""Number of points for fitting the model: the newest points and the best older points, half each."""
 _LENGTHS: Final = (0.15, 0.3, 0.6)
-"""Candidate length scales of the costs, as fractions of the ranges; the likeliest is used."""
+"""Candidate length scales of the costs, as fractions of the ranges; the likeliest scale is used."""
 _NOISE: Final = 1e-2
 """Fraction of the variance of costs that points do not explain, because of contacts and seeds."""
 
@@ -364,11 +364,11 @@ _NOISE: Final = 1e-2
 class Descents:
     """Optimiser of one search: it proposes points of the unit cube in rounds, and receives their costs.
 
-    The seed and the costs decide all points. The global random state is neither used nor changed.
+    The seed and the costs determine all points, independently of the global random state.
     """
 
     def __init__(self, size: int, seed: int) -> None:
-        """Prepare the first round, which is spread over the whole space.
+        """Prepare the first round, whose points are spread over the whole space.
 
         Raises:
             UsageError: `cma` is not installed.
@@ -379,8 +379,8 @@ class Descents:
             remedy = "pip install 'spatial-replay[falsify]'"
             raise UsageError(f"searching for failures needs cma, which is not installed: {remedy}") from None
         self._cma: Any = cma
-        # pycma does not support one dimension (https://github.com/CMA-ES/pycma/issues/86); a second one
-        # without effect does no harm
+        # pycma does not support one dimension (https://github.com/CMA-ES/pycma/issues/86), so a second
+        # dimension without effect is added
         self._size, self._search_size = size, max(size, 2)
         self._random = np.random.default_rng([seed, 0])
         self._strategy: Any = None
@@ -401,7 +401,7 @@ class Descents:
         """Receive the cost of each point of the last round.
 
         Args:
-            is_found: whether one of the points is a failure; if so, the next descent begins elsewhere.
+            is_found: whether a point is a failure; then the next descent begins elsewhere.
         """
         self._remember(costs)
         self._generation += zip(self._round_points, costs, strict=True)
@@ -465,7 +465,7 @@ class Descents:
     def _descent(self, start: NDArray[np.float64]) -> Any:
         options = {
             "bounds": [0.0, 1.0],
-            # own random numbers, because the default is the global state of NumPy; NaN leaves its seed alone
+            # the default is the global random state of NumPy; the seed NaN leaves that state unchanged
             "randn": lambda *shape: self._random.standard_normal(shape),
             "seed": np.nan,
             "tolx": _NARROWEST,
@@ -481,8 +481,8 @@ def expected_costs(
     """Return the costs that a Gaussian process predicts at other points, (M,), relative to the mean cost.
 
     The method is algorithm 2.1 of Rasmussen and Williams, Gaussian Processes for Machine Learning
-    (https://gaussianprocess.org/gpml), with a squared exponential kernel. The length of the kernel has the
-    greatest likelihood.
+    (https://gaussianprocess.org/gpml), with a squared exponential kernel. The length of the kernel is the
+    candidate with the greatest likelihood.
 
     Args:
         points: (N, D), points with numbers from 0 to 1.
@@ -518,9 +518,9 @@ def _squares(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArra
 
 
 class RunFile:
-    """File of runs, which are looked up by case; only one search may use it at a time.
+    """File of runs by case; only one search may use the file at a time.
 
-    Each run is written at once as a line. An incomplete last line is removed when the file is opened again.
+    Each finished run is appended as a line. Opening the file removes an incomplete last line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -545,7 +545,7 @@ class RunFile:
             self._runs_by_case[key_of(run.case)] = run
         try:
             self._stream = path.open("ab")
-            # remove the incomplete line of a killed search
+            # remove the incomplete last line of a killed search
             self._stream.truncate(len(whole_lines))
         except OSError as error:
             raise output_error(path, error) from error
@@ -603,7 +603,7 @@ def simulate_rounds(
     """Simulate the new cases of each round, and return the result of the generator of rounds.
 
     Args:
-        file: file of runs; runs in it are not simulated again. New lines have the order of the cases.
+        file: file of runs, which are not simulated again. New lines have the order of the cases.
         advance: function that is called with the number of runs finished since its last call.
         logs: folder for the logs of violating runs; None writes no logs.
 
@@ -621,9 +621,9 @@ def simulate_rounds(
 
 
 class _Queue(Generic[_Result]):
-    """Tasks of one round after another; the next round starts when all runs of a round are finished.
+    """Tasks of successive rounds; the next round starts when all runs of a round are finished.
 
-    Unlike other iterators, this one can continue after its end, as workers ask again after each result.
+    Unlike other iterators, a queue can continue after its end: workers ask again after each result.
 
     Attributes:
         result: result of the generator of rounds, set after the last round.
@@ -680,7 +680,7 @@ class _Queue(Generic[_Result]):
 
 
 def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
-    """Simulate and evaluate a case; write its log if it violates."""
+    """Simulate and evaluate a case; write its log if it violates a specification."""
     try:
         simulated_case = simulation.run(task.case)
     except Exception as error:
@@ -705,7 +705,7 @@ def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
 
 
 def write_whole(write: Callable[[Path], None], log: Path) -> None:
-    """Write a log under another name and rename it, so that it is never incomplete."""
+    """Write a log under another name and rename it, so that `log` is never an incomplete file."""
     partial_log = log.with_name(f".{log.name}.partial")
     write(partial_log)
     partial_log.replace(log)
@@ -722,11 +722,11 @@ FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
-"""Maximum number of moves of a value half way to rest, if the failure needs a value other than rest."""
+"""Maximum number of halvings of a group's distance from rest, if the failure needs a variation."""
 _BARREN: Final = 50
 """Rounds without a new case after which the search ends."""
 _DRAWN: Final = 10
-"""Runs of a round in which only seeds are varied."""
+"""Number of runs in a round if only seeds are varied."""
 
 
 @named_arguments
@@ -749,12 +749,12 @@ def falsify(
     Args:
         simulation: scenario ("push", "pick-place", "table-setting"), or function from the values of the
             parameters by name to the samples of a run. Equal values must give equal samples.
-        specifications: specifications or their files; by default the one of the scenario.
+        specifications: specifications or their files; by default the specification of the scenario.
         output: folder for runs, logs and clips.
         vary: parameters to vary. For a scenario they are texts as on the command line,
             `["noise=0:0.01", "slip@T"]`, by default `["start"]`; for a function ranges by name,
             `{"wind": (-2, 2)}`.
-        budget: maximum number of runs, without those that reduce failures.
+        budget: maximum number of runs, without the runs that reduce failures.
         seed: seed of the search.
         planned: whether the planner acts in the scenario instead of the script.
         jobs: number of processes that simulate; the result does not depend on it.
@@ -797,11 +797,11 @@ def search_failures(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> Falsification:
-    """Search for runs that violate a specification; runs of an earlier search in the folder are used.
+    """Search for runs that violate a specification; continue an earlier search in the folder.
 
     Args:
         folder: folder for runs, logs and clips; it is created if it is missing.
-        budget: maximum number of runs, without those that reduce failures.
+        budget: maximum number of runs, without the runs that reduce failures.
         seed: seed of the search; equal arguments give equal files with any number of workers.
         progress: display of the number of runs.
 
@@ -825,7 +825,7 @@ def search_failures(
         try:
             return _Search(simulation, space, files, workers, progress).run(budget, seed)
         except KeyboardInterrupt as interruption:
-            # notes about the log that was being written would mislead
+            # existing notes concern the unfinished log and would mislead
             interruption.__notes__ = [f"{files} keeps all runs so far; the same command goes on from there"]
             raise
 
@@ -856,7 +856,7 @@ def _identity(simulation: Simulation, space: Space, seed: int) -> dict[str, Any]
 
 
 def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
-    """Mark an empty folder as the folder of a search, or check that its mark is of the same search.
+    """Mark an empty folder as the folder of a search, or check that it is marked for the same search.
 
     Raises:
         UsageError: the folder has another search, or other files.
@@ -949,7 +949,7 @@ class _Search:
         return simulate_rounds(rounds, self._simulation, self._workers, file, advance, logs)
 
     def _descend(self, budget: int, seed: int) -> Rounds[list[SearchedRun]]:
-        """Yield the cases that an optimiser chooses, with the robustness as cost; return all runs."""
+        """Yield cases from an optimiser, whose cost is the robustness; return all runs."""
         (first_run,) = yield [self._space.at_rest()]
         runs = [replace(first_run, number=1)]
         self._space = space = self._space.ending_at(first_run.seconds)
@@ -968,14 +968,14 @@ class _Search:
                 "begin before that, in another folder"
             )
         descents = Descents(len(space.ordered), seed) if space.ordered else None
-        # another random stream than that of the descents
+        # a random stream different from the descents' stream
         generator, barren_rounds = np.random.default_rng([seed, 1]), 0
         cost_by_key = {key_of(first_run.case): _cost(first_run)}
         best_draw: tuple[float, list[float]] | None = None
         while len(runs) < budget and barren_rounds < _BARREN and not first_run.is_violated:
             points: Sequence[Any] = descents.ask() if descents is not None else [()] * _DRAWN
             draws = [
-                # the seeds with the least cost so far, or new ones
+                # the seeds with the least cost so far, or new seeds
                 best_draw[1] if best_draw is not None and generator.random() < 0.5 else space.draw(generator)
                 for _ in points
             ]
@@ -1012,7 +1012,10 @@ class _Search:
     def _shrink(
         self, failing_runs: Sequence[SearchedRun], runs_by_case: Mapping[str, SearchedRun]
     ) -> Rounds[tuple[list[SearchedRun], int]]:
-        """Reduce all failures, by one run each in a round; return them and the number of further runs."""
+        """Reduce all failures, by one run per failure and round.
+
+        Return the reduced failures and the number of further runs.
+        """
         tried_runs: dict[str, SearchedRun] = {}
         smaller_runs = list(failing_runs)
         reductions = [self._smaller(run) for run in failing_runs]

@@ -1,4 +1,4 @@
-"""Simulations to search, by a scenario or by a function of a user, with their varied parameters."""
+"""Simulations to search, with their varied parameters: scenarios, and functions of users."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from spatial_replay.trace.trace import Sample, Trace, duration_ns_from_text
 # ------------------------------------------------------------------------------------------------- parameters
 
 Case: TypeAlias = Mapping[str, float | None]
-"""Value of each parameter by name; None if it is left out."""
+"""Value of each parameter by name; None for a parameter without a value."""
 
 Range: TypeAlias = tuple[float, float]
 
 TENTHS: Final = 10
-"""Parts of a range, in each of which runs are counted."""
+"""Number of parts of a range; runs are counted in each part."""
 _DIGITS: Final = 6
-"""Digits of a value relative to the width of its range, if the range has no resolution of its own."""
+"""Digits of a value relative to the width of its range, if the parameter has no fixed resolution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +50,10 @@ class Parameter:
     Attributes:
         low, high: range; for a time in a run, `high` is infinite until the first run has ended.
         digits: decimals of a rounded value, so that a written value is read back exactly.
-        rest: value in the run without variations; None if that run does not have the parameter.
-        group: name of the parameters that a search sets back to rest together.
+        rest: value in the run without variations; None if the parameter has no value in that run.
+        group: name of a group of parameters, which a search resets to rest together.
         unit: "m", "rad", "s", or "".
-        is_drawn: whether values have no order, such as seeds, and are drawn instead of optimised.
+        is_drawn: whether values are drawn instead of optimised, because they have no order, as seeds.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Parameter:
         return min(TENTHS - 1, int(TENTHS * (value - self.low) / (self.high - self.low)))
 
     def text_of(self, value: float) -> str:
-        """Return a value with name and unit, and with all digits, because fewer digits are another case."""
+        """Return a value with name, unit and all digits; fewer digits would be another case."""
         number = f"{value:.12g}"
         if self.unit == "s":
             return f"{self.name}@{number}s"
@@ -128,7 +128,7 @@ class Space:
         return tuple(dict.fromkeys(parameter.group for parameter in sorted_parameters))
 
     def at_rest(self, case: Case | None = None, group: str | None = None) -> dict[str, float | None]:
-        """Return a case with one group at rest; without a case, return the case with all at rest."""
+        """Return a case with one group at rest; without a case, return the case with all groups at rest."""
         return {
             parameter.name: parameter.rest
             if case is None or parameter.group == group
@@ -137,7 +137,7 @@ class Space:
         }
 
     def nearer(self, case: Case, group: str) -> dict[str, float | None] | None:
-        """Return a case with a group half way to rest; None if it is at rest, or has no value at rest."""
+        """Return a case with a group half way to rest; None if it is at rest or lacks a value at rest."""
         new_case = dict(case)
         for parameter in self.parameters:
             value = case[parameter.name]
@@ -148,7 +148,7 @@ class Space:
         return None if new_case == dict(case) else new_case
 
     def case_at(self, shares: Iterable[float], drawn: Sequence[float]) -> dict[str, float | None]:
-        """Return the case at fractions of the ordered parameters' ranges, with drawn values of the others."""
+        """Return the case at fractions of the ordered parameters' ranges, and with drawn values."""
         ordered_shares, drawn_values = iter(shares), iter(drawn)
         return {
             parameter.name: next(drawn_values)
@@ -166,7 +166,7 @@ class Space:
         ]
 
     def ending_at(self, seconds: float) -> Space:
-        """Return the space with the duration of a run as the end of all times."""
+        """Return the space with the duration of a run as the upper end of infinite ranges."""
         return Space(
             tuple(
                 replace(parameter, high=round(seconds, parameter.digits))
@@ -214,7 +214,7 @@ _FORMS: Final = "noise=0:0.01, seed=0:999, start, start=0.02, start.OBJECT=0.02,
 
 
 class SimulatedCase(NamedTuple):
-    """Run of a case: its samples, a function that writes its log, and its unit of lengths if declared."""
+    """Run of a case: its samples, a function that writes its log, and the declared unit of lengths or ""."""
 
     trace: Trace
     write: Callable[[Path], None]
@@ -254,7 +254,7 @@ def own_simulation(
     vary: Mapping[str, tuple[float, float]] | Sequence[str],
     jobs: int = 1,
 ) -> tuple[Simulation, tuple[Parameter, ...]]:
-    """Return the simulation by a function and its varied parameters.
+    """Return the simulation of a user's function and its varied parameters.
 
     Args:
         vary: ranges by name, or texts `NAME=LOW:HIGH`.
@@ -301,7 +301,7 @@ class OwnSimulation:
 
     @property
     def identity(self) -> Mapping[str, bool]:
-        """Further inputs of the runs, which identify the folder of a search."""
+        """Further inputs of the runs; a folder belongs to a search with equal inputs."""
         return {}
 
     def is_possible(self, case: Case) -> bool:
@@ -332,7 +332,7 @@ class ScenarioRuns:
 
     Attributes:
         spec_options: options of `record` for the specifications: files, constants.
-        is_planned: whether the planner acts for the scenario's specification, instead of the script.
+        is_planned: whether the planner acts instead of the script, for the scenario's specification.
     """
 
     name: str
@@ -448,7 +448,7 @@ class ScenarioRuns:
                     raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
                 range_s = duration_ns_from_text(begin_text) / 1e9, duration_ns_from_text(end_text) / 1e9
         except UsageError as error:
-            # the message omits the time of the trial, 1 s, which the user did not write
+            # the message omits 1 s, the time of the check, because the user did not write it
             reason = str(error).removeprefix(f"{kind}@1s: ")
             raise UsageError(f"--vary {kind}@{time_text}: {reason}") from None
         if colon:
@@ -503,7 +503,7 @@ def _conditions(case: Case) -> Conditions:
 
 
 def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:
-    """Return the footprint of a body at the start; without a given start it includes the scatter of seeds."""
+    """Return a body's footprint at the start, with the scatter of seeds if `starts` lacks the body."""
     x, y, yaw, room_m = placement.x, placement.y, placement.yaw, scatter_m
     if (start := starts.get(placement.body.name)) is not None:
         x, y, yaw, room_m = start.x, start.y, yaw if start.turn is None else start.turn, 0.0
@@ -514,7 +514,7 @@ def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float
 
 
 def _is_beside(first_placement: Placement, second_placement: Placement) -> bool:
-    """Return whether two bodies have common heights, so that their footprints must not overlap."""
+    """Return whether two bodies overlap in height, so that their footprints must not overlap."""
     return (
         first_placement.bottom < second_placement.bottom + second_placement.body.shape.height
         and second_placement.bottom < first_placement.bottom + first_placement.body.shape.height
