@@ -768,7 +768,7 @@ def falsify(
     """
     if isinstance(specifications, Specification | str | PathLike):
         specifications = [specifications]
-    files = [
+    parsed_specifications = [
         specification
         if isinstance(specification, Specification)
         else load_specifications([local_copy(specification)])[0]
@@ -777,11 +777,13 @@ def falsify(
     if isinstance(simulation, str):
         if isinstance(vary, Mapping):
             raise UsageError('what is varied in a scenario is a list of texts, such as ["noise=0:0.01"]')
-        searched_simulation, parameters = scenario_simulation(simulation, files, vary, is_planned=planned)
+        searched_simulation, parameters = scenario_simulation(
+            simulation, parsed_specifications, vary, is_planned=planned
+        )
     elif planned:
         raise UsageError("planned is for scenarios; let the planner act within the simulation")
     else:
-        searched_simulation, parameters = own_simulation(simulation, files, vary, jobs)
+        searched_simulation, parameters = own_simulation(simulation, parsed_specifications, vary, jobs)
     return search_failures(
         searched_simulation, parameters, output, workers_of(jobs), budget=budget, seed=seed
     )

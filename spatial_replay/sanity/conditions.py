@@ -149,7 +149,8 @@ def _add(left: Tree, right: Tree) -> Tree:
         weight_by_quantity[quantity] = weight_by_quantity.get(quantity, Fraction(0)) + weight
     # in a fixed order, so that equal sums are equal values
     weights = sorted(
-        ((key, value) for key, value in weight_by_quantity.items() if value), key=lambda item: repr(item[0])
+        ((quantity, weight) for quantity, weight in weight_by_quantity.items() if weight),
+        key=lambda item: repr(item[0]),
     )
     return Linear(tuple(weights), left.constant + right.constant)
 
@@ -497,13 +498,13 @@ class FactDiagrams:
             self.facts.append(fact)
         fact_number = self._fact_numbers[fact_key]
         self._written_texts.setdefault(fact_number, {})[written_text] = None
-        existing = self.facts[fact_number]
+        existing_fact = self.facts[fact_number]
         # several relations can have the same fact; texts without "not" are preferred
         true_text, false_text = (
             new if is_negated(old) and not is_negated(new) else old
-            for old, new in zip(existing.texts, fact.texts, strict=True)
+            for old, new in zip(existing_fact.texts, fact.texts, strict=True)
         )
-        self.facts[fact_number] = existing._replace(texts=(true_text, false_text))
+        self.facts[fact_number] = existing_fact._replace(texts=(true_text, false_text))
         return self.diagrams.variable(fact_number)
 
 

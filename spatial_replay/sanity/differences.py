@@ -104,11 +104,11 @@ def _run_lines(accepting: str, rejecting: str, example: Example | None) -> Itera
     note = f", in words only: {example.note}" if example.note else ""
     yield ""
     yield f"accepted by {accepting}, rejected by {rejecting}: {length_text}{note}"
-    number = 0
+    first_index = 0
     for sentence, samples in groupby(example.sentences):
-        last_number = number + len(list(samples)) - 1
-        yield f"  {number if number == last_number else f'{number}-{last_number}'}  {sentence}"
-        number = last_number + 1
+        last_index = first_index + len(list(samples)) - 1
+        yield f"  {first_index if first_index == last_index else f'{first_index}-{last_index}'}  {sentence}"
+        first_index = last_index + 1
 
 
 @named_arguments

@@ -365,7 +365,7 @@ class _Attempt:
         )
         return start_values
 
-    def _relation(self, quantity: Quantity, is_lower_limit: bool, bound: float, index: int) -> Ways:
+    def _relation(self, quantity: Quantity, is_lower_limit: bool, bound: float, sample_index: int) -> Ways:
         """Return alternatives that bound a distance or protrusion from below (`is_lower_limit`) or above."""
         if isinstance(quantity, SignedDistance):
             first_term, second_term = plain(quantity.first), plain(quantity.second)
@@ -381,8 +381,8 @@ class _Attempt:
             if isinstance(quantity, SignedDistance)
             else (not is_lower_limit, is_lower_limit)
         )
-        first_sides = self._sides(first_term, index, outer=use_outer_boxes[0])
-        second_sides = self._sides(second_term, index, outer=use_outer_boxes[1])
+        first_sides = self._sides(first_term, sample_index, outer=use_outer_boxes[0])
+        second_sides = self._sides(second_term, sample_index, outer=use_outer_boxes[1])
         gaps: list[_Amount] = []
         for (a_low, a_high), (b_low, b_high) in zip(first_sides, second_sides, strict=False):
             if isinstance(quantity, SignedDistance):
@@ -411,18 +411,18 @@ class _Attempt:
             sides.append((low, low.plus(_Amount({("size", object_name, axis): 1.0}))))
         return sides
 
-    def _amount(self, quantity: Quantity, index: int) -> _Amount:
+    def _amount(self, quantity: Quantity, sample_index: int) -> _Amount:
         if isinstance(quantity, Rate):
             raise CannotPlaceError("rates of change are not drawn")
         if isinstance(quantity, Signal):
-            return _Amount({("signal", quantity.name, index): 1.0})
+            return _Amount({("signal", quantity.name, sample_index): 1.0})
         assert isinstance(quantity, (Projection, CentroidProjection))
         axis_index = "xyz".index(quantity.axis)
         if isinstance(quantity, CentroidProjection) and isinstance(quantity.term, RegionName):
             footprint = footprint_from_outline(self._setting.regions[quantity.term.name])
             centre_coordinates = [centre_of(Footprint((part,)))[axis_index] for part in footprint.parts]
             return _Amount({}, min(centre_coordinates) if quantity.side == "min" else max(centre_coordinates))
-        sides = self._sides(quantity.term, index, outer=True)
+        sides = self._sides(quantity.term, sample_index, outer=True)
         if axis_index >= len(sides):
             raise CannotPlaceError("a region without a height is compared along z")
         low, high = sides[axis_index]
@@ -431,14 +431,14 @@ class _Attempt:
         return low if quantity.side == "min" else high
 
 
-def _object(term: Term, index: int) -> tuple[str, int]:
+def _object(term: Term, sample_index: int) -> tuple[str, int]:
     """Return the object of a term, and the index of its sample."""
     if isinstance(term, Earlier):
-        if term.samples is None or not isinstance(term.term, TrackedName) or term.samples > index:
+        if term.samples is None or not isinstance(term.term, TrackedName) or term.samples > sample_index:
             raise CannotPlaceError("it looks back over a time, or before the first sample")
-        return term.term.name, index - term.samples
+        return term.term.name, sample_index - term.samples
     if isinstance(term, TrackedName):
-        return term.name, index
+        return term.name, sample_index
     raise CannotPlaceError("a group of a class, or of all objects, is not placed")
 
 

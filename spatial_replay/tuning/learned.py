@@ -608,20 +608,20 @@ def _check(runs: Sequence[LabelledRun]) -> None:
         if len(run.trace) < _FEWEST_SAMPLES:
             have_text = plural(len(run.trace), "sample")
             raise UsageError(f"{run.name} is too short to learn from: it has {have_text}; leave it out")
-    for good_run in good:
-        for other_run in runs:
-            if other_run is good_run or (len(good_run.trace), good_run.trace.names) != (
-                len(other_run.trace),
-                other_run.trace.names,
+    for first_run in good:
+        for second_run in runs:
+            if second_run is first_run or (len(first_run.trace), first_run.trace.names) != (
+                len(second_run.trace),
+                second_run.trace.names,
             ):
                 continue
-            if good_run.trace == other_run.trace:
-                if good_run.name == other_run.name:
-                    raise UsageError(f"{good_run.name} is given twice; give each run once")
-                kind = "good" if other_run.is_good else "bad"
+            if first_run.trace == second_run.trace:
+                if first_run.name == second_run.name:
+                    raise UsageError(f"{first_run.name} is given twice; give each run once")
+                kind = "good" if second_run.is_good else "bad"
                 raise UsageError(
-                    f"the {kind} run {other_run.name} holds the same samples as the good run "
-                    f"{good_run.name}; leave one of them out"
+                    f"the {kind} run {second_run.name} holds the same samples as the good run "
+                    f"{first_run.name}; leave one of them out"
                 )
 
 
@@ -702,16 +702,25 @@ class _Writer:
         return parse_specification("\n".join([*texts, ""]))
 
     def text(
-        self, written: _Written, head: Sequence[str], evidence: Sequence[LearnedLine], good: int, bad: int
+        self,
+        written: _Written,
+        head_lines: Sequence[str],
+        evidence: Sequence[LearnedLine],
+        good_count: int,
+        bad_count: int,
     ) -> str:
         """Return the text of the file: each spec in canonical form, under a comment with its evidence."""
-        lines = [*map(_comment, head), f"use {self.profile}"]
+        lines = [*map(_comment, head_lines), f"use {self.profile}"]
         for spec, line in zip(written.specification.specs, evidence, strict=True):
             lowest_text = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
-            lines += ["", _comment(f"Holds in {good} of {plural(good, 'good run')}, {lowest_text}.")]
-            if bad:
+            lines += [
+                "",
+                _comment(f"Holds in {good_count} of {plural(good_count, 'good run')}, {lowest_text}."),
+            ]
+            if bad_count:
                 violating_text = (
-                    f"{len(line.violated_by)} of {plural(bad, 'bad run')}{_names_text(line.violated_by)}"
+                    f"{len(line.violated_by)} of {plural(bad_count, 'bad run')}"
+                    f"{_names_text(line.violated_by)}"
                 )
                 lines.append(_comment(f"Violated by {violating_text}."))
             title = quote_name(f"{spec.id}: {spec.title}")

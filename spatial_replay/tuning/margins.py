@@ -340,13 +340,13 @@ def _sign(difference: float) -> Direction:
     return 1 if difference > 0 else -1 if difference < 0 else 0
 
 
-def _of_formula(before: Formula, after: Formula) -> Direction | None:
-    if before == after:
+def _of_formula(old_formula: Formula, new_formula: Formula) -> Direction | None:
+    if old_formula == new_formula:
         return 0
     # these operators rise with an operand in some samples, and fall with it in others
-    if isinstance(before, Boolean) and before.operator in ("xor", "<->"):
+    if isinstance(old_formula, Boolean) and old_formula.operator in ("xor", "<->"):
         return None
-    match expand(before), expand(after):
+    match expand(old_formula), expand(new_formula):
         case Atom() as old, Atom() as new:
             return _of_expression(old.expression, new.expression)
         case Quantified() as old, Quantified() as new:
@@ -370,20 +370,20 @@ def _alike(old: Boolean | Temporal, new: Boolean | Temporal) -> bool:
     return old.operator == new.operator and len(old.operands) == len(new.operands)
 
 
-def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
+def _of_bound(old_bound: Bound | None, new_bound: Bound | None) -> Direction | None:
     """Return 1 if the window of an operator such as F grew, so that it is looser; -1 if it shrank."""
-    if before == after:
+    if old_bound == new_bound:
         return 0
-    if before is None or after is None or before.unit != after.unit:
+    if old_bound is None or new_bound is None or old_bound.unit != new_bound.unit:
         return None
-    upper_ends = [float("inf") if bound.upper is None else bound.upper for bound in (before, after)]
-    return _common([_sign(before.lower - after.lower), _sign(upper_ends[1] - upper_ends[0])])
+    upper_ends = [float("inf") if bound.upper is None else bound.upper for bound in (old_bound, new_bound)]
+    return _common([_sign(old_bound.lower - new_bound.lower), _sign(upper_ends[1] - upper_ends[0])])
 
 
-def _of_expression(before: Expression, after: Expression) -> Direction | None:
-    if before == after:
+def _of_expression(old_expression: Expression, new_expression: Expression) -> Direction | None:
+    if old_expression == new_expression:
         return 0
-    match before, after:
+    match old_expression, new_expression:
         case Number() as old, Number() as new:
             return _sign(new.value - old.value)
         case Sum() as old, Sum() as new:
@@ -404,12 +404,12 @@ def _of_expression(before: Expression, after: Expression) -> Direction | None:
     return None
 
 
-def _of_term(before: Term, after: Term) -> Direction | None:
+def _of_term(old_term: Term, new_term: Term) -> Direction | None:
     """Return 1 if a footprint is enlarged more, -1 if less."""
-    if before == after:
+    if old_term == new_term:
         return 0
-    if isinstance(before, Enlarged) and isinstance(after, Enlarged):
-        return _common([_of_term(before.term, after.term), _sign(after.radius - before.radius)])
+    if isinstance(old_term, Enlarged) and isinstance(new_term, Enlarged):
+        return _common([_of_term(old_term.term, new_term.term), _sign(new_term.radius - old_term.radius)])
     return None
 
 
