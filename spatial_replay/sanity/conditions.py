@@ -378,7 +378,7 @@ class FactDiagrams:
     """Facts in some formulas, and diagrams of propositions over these facts.
 
     Attributes:
-        diagrams: diagrams of all conditions; their variables are numbers of facts.
+        diagrams: diagrams of all conditions; a variable of a diagram is the number of a fact.
         facts: facts by number.
         diameters: diameters of regions by name; empty if a formula or a region has heights.
         between: distances of disjoint regions, and protrusions of regions from enclosing regions.

@@ -317,7 +317,7 @@ class _Examiner:
         return self._readings[part.name]
 
     def _answer(self, part: NamedSpec, satisfied: bool) -> Answer | None:
-        """Return the answer on the shortest run that satisfies, or violates, a part; None if undecided."""
+        """Return the answer to the search for a run that satisfies or violates a part; None if undecided."""
         key = part.name, satisfied
         if key not in self._answers:
             reading = self._reading(part)
@@ -410,7 +410,7 @@ class _Examiner:
         self._add("idle antecedent", (part.name,), node.span, answer, message, _IDLE)
 
     def _sometime(self, part: NamedSpec, formula: Formula) -> Runs | None:
-        """Return the runs in which a formula holds in some sample; None if it has no automaton."""
+        """Return the runs in which a formula holds in some sample; None if the formula has no automaton."""
         eventually = loosen(Temporal("F", (formula,)))
         try:
             return ((Side(automaton_of(self._specification, part.name, eventually)),),)

@@ -319,7 +319,7 @@ def check_names(
     classes: Iterable[str] = (),
     each: Mapping[str, str] = _NO_CHOICE,
 ) -> tuple[Diagnostic, ...]:
-    """Compare the names of a specification with those of a log.
+    """Compare the names of a specification with the names of a log.
 
     Args:
         known: names of the log's objects.

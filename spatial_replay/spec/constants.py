@@ -178,7 +178,7 @@ def value_from_outside(name: str, value: object) -> Value:
     """Return the value of a constant that a caller or the command line sets.
 
     Raises:
-        UsageError: neither a finite number nor the text of a number or a duration.
+        UsageError: the value is not a finite number, and not the text of a number or duration.
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         # float() of an integer above 1.8e308 raises OverflowError

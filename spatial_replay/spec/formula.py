@@ -508,7 +508,7 @@ BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "sp
 
 `spec` has the value of its one operand: the spec only repeats another spec under a new name. `given` and
 `with` occur only in expansions: they make an operator skip samples without a rate (see `judged_operands`).
-Their first operand is the condition that the rate has a value; their last operand is that of the text.
+Their first operand is the condition that the rate has a value; their last operand is in the text.
 """
 
 
@@ -758,7 +758,7 @@ class Outline:
     """Shape of a region: a polygon, or a disc, which has one vertex and a radius.
 
     Attributes:
-        vertices: corners (x, y) in text order; those of a box counter-clockwise from (xmin, ymin).
+        vertices: corners (x, y) in text order; for a box, counter-clockwise from (xmin, ymin).
         radius: radius of a disc; 0 for polygons and boxes.
         height: bottom and top, or None.
     """

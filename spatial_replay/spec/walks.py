@@ -288,7 +288,7 @@ def other_names(formula: Formula) -> frozenset[str]:
 
 
 def operand_signs(formula: Formula, operand: int) -> tuple[int, ...]:
-    """Return the signs of an operand's robustness in the robustness of its node: 1, -1 or both.
+    """Return the signs with which an operand enters its node's robustness: 1, -1 or both.
 
     Args:
         operand: index of the operand.
@@ -327,9 +327,9 @@ def horizon_ns(formula: Formula) -> float:
 
 
 def can_settle(formula: Formula, *, satisfied: bool) -> bool:
-    """Return whether a prefix of a run may permanently satisfy a formula; violate it if not `satisfied`.
+    """Return whether a prefix of a run may settle a formula as satisfied, or as violated if not `satisfied`.
 
-    The check looks only at operators: without such a prefix, the result can still be True.
+    The check looks only at operators: the result can be True although no prefix settles the formula.
     """
     match formula:
         case Boolean(operator="not", operands=(operand,)):
@@ -408,7 +408,7 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
 
 
 def without_variables(formula: Quantified) -> Formula:
-    """Return the body of a quantifier with numbered variables, so that their names do not affect equality."""
+    """Return the body of a quantifier with numbered variables, so that equality ignores variable names."""
     quantifier_count = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
     # a name of a text begins with a blank only in quotes, so in practice these clash with no other name
     return substitute(

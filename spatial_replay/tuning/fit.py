@@ -405,7 +405,7 @@ class FittedLimits:
         return frozenset([*map(Party, still_names), *(Party(name, True) for name in still_classes)])
 
     def bits_between(self, quantity: int) -> float:
-        """Return the information of "the distance is between its limits at the end", bits."""
+        """Return the information of a line that limits the distance at the end from both sides, bits."""
         limits = self.limits[FINALLY, :, quantity, None]
         limits = np.where(np.isfinite(limits), limits, -np.inf)
         inside_shares = [
@@ -496,7 +496,7 @@ def _by_pattern(run: Observed, end: int) -> Floats:
 
 
 def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
-    """Invalidate limits that another quantity expresses better, or that nobody would write."""
+    """Invalidate limits that another quantity expresses better, or that people do not write."""
     inside_by_pair: dict[frozenset[Party], Booleans] = {}
     for index, quantity in enumerate(quantities):
         if quantity.relation == "enclosedin":

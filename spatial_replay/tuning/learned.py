@@ -295,7 +295,7 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
     """Yield distances at the end as weight and index.
 
-    With landmarks, the weight is nearness; otherwise it tells how well a distance defines a place.
+    With landmarks, the weight is nearness; otherwise it says how well a distance defines a place.
     """
     for index, quantity in enumerate(fit.quantities):
         lower_limit, negated_upper_limit = fit.limits[FINALLY, :, index]

@@ -797,8 +797,8 @@ class Tuning(Displayed):
         runs: all runs in the given order.
         conflict: reason why nothing was found, or None.
         is_widest: whether it is proven that no other values have a wider margin or are tighter. False if the
-            search ran out of evaluations, a constant has no direction, or a constant that no bad run decides
-            kept its value.
+            search reached its limit of evaluations, if a constant has no direction, or if an undecided
+            constant kept its value.
         specification: specification with the values; comments and layout are unchanged.
     """
 
