@@ -350,11 +350,11 @@ def _load_code(folder: Path) -> None:
     try:
         while not _process.finish(trial_index):
             task, trial = _process.trials[trial_index]
-            note = _note_of(task, folder)
+            note_file = _note_of(task, folder)
             # waits for children of other processes; the child inherits the lock, and keeps it until its end
             with turn(folder, "warmup") as lock:
-                status = 0 if note.exists() else _compile_in_child(task, folder, lock)
-            if not note.exists():
+                status = 0 if note_file.exists() else _compile_in_child(task, folder, lock)
+            if not note_file.exists():
                 raise OSError(f"the child process that compiles it has ended with status {status}")
             with _process.loading(), _no_collection():
                 trial()

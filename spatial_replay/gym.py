@@ -311,10 +311,10 @@ class _Episodes:
                 self._remarked.add(remark.message)
                 # level 4 is the caller of `reset` or `step`
                 warnings.warn(f"{remark.message}; {remark.hint}", stacklevel=4)
-        numbers = update.numbers[0]
-        if numbers is None:
+        node_numbers = update.numbers[0]
+        if node_numbers is None:
             raise UsageError("the monitor has no numbers")
-        margin, _, lower, upper = numbers[0].tolist()
+        margin, _, lower, upper = node_numbers[0].tolist()
         verdict = final_verdict(*self._monitor.interval(self._spec))
         judgement: Judged = {
             **self._env_entry,
@@ -325,7 +325,7 @@ class _Episodes:
             "margin": margin,
         }
         if self._stages is not None:
-            stage, progress = self._stages.extend(update.time_ns, numbers, self._monitor.leaves)
+            stage, progress = self._stages.extend(update.time_ns, node_numbers, self._monitor.leaves)
             judgement |= {"stage": stage.name, "owed": stage.owed, "progress": progress}
         return judgement
 

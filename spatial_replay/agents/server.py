@@ -396,19 +396,21 @@ class Tools:
         if not outcomes.outcomes:
             return _failure(outcomes.reason)
         (outcome,) = outcomes.outcomes
-        values = outcome.document or files.json(command)
-        if values is None:
+        answer_values = outcome.document or files.json(command)
+        if answer_values is None:
             # errors in the text are an answer of `check`; `answer_schema` describes the codes
             is_answer = outcome.code in (0, 1, 4) or (outcome.code == 3 and outcome.out)
             if not is_answer and not (tool == "check" and _CARET.search(outcome.err)):
                 return _failure(self._error(outcome.err, files))
-            values = document
-        values = _without({_ROWS[tool]: values} if isinstance(values, list) else values, _LEFT_OUT)
+            answer_values = document
+        answer_values = _without(
+            {_ROWS[tool]: answer_values} if isinstance(answer_values, list) else answer_values, _LEFT_OUT
+        )
         lines = _lines(outcome.out)
         if tool != "report":
             # paths of the call's files are left out, because the files are temporary
             lines = [line for line in lines if not line.startswith("wrote ")]
-        return _answer(tool, outcome.code, lines, _lines(outcome.err), values, start)
+        return _answer(tool, outcome.code, lines, _lines(outcome.err), answer_values, start)
 
     def _error(self, text: str, files: Files) -> str:
         """Return the error of a command, with names of arguments instead of options."""

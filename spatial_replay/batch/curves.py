@@ -127,11 +127,13 @@ def _lines(curve: Curve, end_s: float, high: float, span: float) -> Iterator[Htm
     """Yield a curve's tooltip, a wide invisible line for the pointer, and the visible line."""
     yield element("title", f"{curve.title}, {curve.verdict}")
     commands, is_open = list[str](), False
-    for time_s, value in zip(curve.times, curve.values, strict=True):
-        if math.isfinite(value):
+    for time_s, robustness in zip(curve.times, curve.values, strict=True):
+        if math.isfinite(robustness):
             letter = "L" if is_open else "M"
-            commands.append(f"{letter}{_WIDTH * time_s / end_s:.1f} {_HEIGHT * (high - value) / span:.1f}")
-        is_open = math.isfinite(value)
+            commands.append(
+                f"{letter}{_WIDTH * time_s / end_s:.1f} {_HEIGHT * (high - robustness) / span:.1f}"
+            )
+        is_open = math.isfinite(robustness)
     path = "".join(commands)
     yield element("path", d=path, **{"class": "area"})
     yield element("path", d=path, **{"class": "bad" if curve.verdict == "violated" else "quiet"})

@@ -127,8 +127,8 @@ class RunDiff:
         width = max([4, *map(len, titles.values())])
         yield f"  {'spec':<{width}}  {'  '.join(f'{heading:>7}' for heading in [*columns, 'same'])}"
         for spec, count in counts.items():
-            numbers = [*(count[kind] for kind in columns), self.specs[spec] - count.total()]
-            cells = "  ".join(f"{number or '-':>7}" for number in numbers)
+            spec_counts = [*(count[kind] for kind in columns), self.specs[spec] - count.total()]
+            cells = "  ".join(f"{number or '-':>7}" for number in spec_counts)
             yield f"  {titles[spec]:<{width}}  {cells}{'  edited' if spec in edited_specs else ''}"
 
     @property

@@ -55,8 +55,8 @@ def write_junit(
     """
     text = ""
     # the full report, then with short texts, then without passing test cases
-    for text_limit, has_passing in ((None, True), (_SHORT, True), (_SHORT, False)):
-        text = "".join(_lines(table, name, reports or {}, text_limit, has_passing))
+    for text_limit, is_full in ((None, True), (_SHORT, True), (_SHORT, False)):
+        text = "".join(_lines(table, name, reports or {}, text_limit, is_full))
         if len(text.encode()) <= largest:
             break
     with replacing(path, inputs) as stream:
@@ -64,7 +64,7 @@ def write_junit(
 
 
 def _lines(
-    table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, keeps: bool
+    table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, is_full: bool
 ) -> Iterator[str]:
     rows_by_spec: dict[tuple[str, ...], list[Values]] = {}
     key_columns = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
@@ -87,7 +87,7 @@ def _lines(
         f'time="{_time(row for rows in rows_by_spec.values() for row in rows)}">\n'
     )
     for (case, file, spec), rows in rows_by_spec.items():
-        listed_rows = rows if keeps else [row for row in rows if row["failure"] is not None]
+        listed_rows = rows if is_full else [row for row in rows if row["failure"] is not None]
         failures, errors = _counts(rows)
         title = f"{case}.{spec or file}"
         yield (
@@ -130,12 +130,12 @@ def _case(
     if row["failure"] is not None:
         # in JUnit, an error is a fault of the test, and a failure is a fault of its subject
         tag = "failure" if row["error"] is None else "error"
-        kind = row["error_kind"] or _unmet(row)
-        texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
-        text = "\n".join(filter(None, [requirement_of(row), *texts, *tested_lines]))
+        failure_kind = row["error_kind"] or _unmet(row)
+        reason_texts = [*dict.fromkeys([*(row["explanation"] or ()), *row["vacuous"]])] or [row["failure"]]
+        text = "\n".join(filter(None, [requirement_of(row), *reason_texts, *tested_lines]))
         text = cut(text, text_limit or len(text))
         message = printable(row["failure"], text_limit or 1_000)
-        yield f"<{tag} type={_quote(kind)} message={_quote(message)}>{_text(text)}</{tag}>\n"
+        yield f"<{tag} type={_quote(failure_kind)} message={_quote(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
     elif row["untested"] and text_limit is None:
@@ -147,10 +147,10 @@ def _case(
 def _unmet(row: Values) -> str:
     """Return the kind of a failure; equal kinds have equal words."""
     failure = row["failure"]
-    kinds = {UNTESTED: "untested"}
-    kinds |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
-    kinds |= {"cut": "cut", "left": "left", DROPPED: "dropped", DAMAGED: "damaged log"}
-    for beginning, kind in kinds.items():
+    kind_by_beginning = {UNTESTED: "untested"}
+    kind_by_beginning |= {kind: kind for kind in (DOUBTFUL, WORSE_THAN, EDITED_SINCE, VACUOUS)}
+    kind_by_beginning |= {"cut": "cut", "left": "left", DROPPED: "dropped", DAMAGED: "damaged log"}
+    for beginning, kind in kind_by_beginning.items():
         if failure.startswith(beginning):
             return kind
     return "gone" if row["verdict"] is None else f"expected {row['expected']}"

@@ -266,9 +266,11 @@ def _matrix(
         *map(_sortable, map(add, titles, units), ["number"] * len(titles), requirements),
     ]
     body = []
-    for name, rows_by_spec in rows_by_log.items():
+    for log_name, rows_by_spec in rows_by_log.items():
         row_cells = [_cell(rows_by_spec.get(spec_key)) for spec_key in specs]
-        report = next(((case, name) for case, _, _ in specs if (case, name) in reports), ("", name))
+        report = next(
+            ((case, log_name) for case, _, _ in specs if (case, log_name) in reports), ("", log_name)
+        )
         if is_judged:
             row_cells.insert(0, _label_cell(next(iter(rows_by_spec.values()))))
         body.append(element("tr", element("td", _log_link(report, reports)), *row_cells))
@@ -314,7 +316,7 @@ def _cell(row: Values | None) -> Html:
         )
     words = verdict if robustness is None or verdict in ("untested", "doubtful") else f"{robustness:.4g}"
     # finite, so that errors and empty cells sort outside
-    value = "0" if robustness is None else f"{max(-1e300, min(1e300, robustness)):.17g}"
+    sort_value = "0" if robustness is None else f"{max(-1e300, min(1e300, robustness)):.17g}"
     failure_text = f": {row['failure'].rstrip('.')}" if fails else ""
     tooltip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{failure_text}."
     tooltip = " ".join(
@@ -326,7 +328,7 @@ def _cell(row: Values | None) -> Html:
     )
     words = f"{words}{damage_word(row)}{note}"
     return element(
-        "td", with_signs(words), title=with_signs(tooltip), **{"class": classes, "data-value": value}
+        "td", with_signs(words), title=with_signs(tooltip), **{"class": classes, "data-value": sort_value}
     )
 
 

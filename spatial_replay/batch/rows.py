@@ -329,8 +329,8 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> TaskRows:
         except SpatialReplayError:
             rows.append((error_row,))
         else:
-            lines = spec_lines(file)
-            rows.append(tuple(_about(error_row, spec, lines) for spec in file.results))
+            line_by_spec = spec_lines(file)
+            rows.append(tuple(_about(error_row, spec, line_by_spec) for spec in file.results))
     return tuple(rows)
 
 
@@ -373,7 +373,7 @@ def _rows_of_file(
     file_index: int,
     explained: Collection[ResultName] | None,
 ) -> tuple[ResultRow, ...]:
-    lines = spec_lines(file)
+    line_by_spec = spec_lines(file)
     tree_results = zip(trees, replayed.results, strict=True)
     # a replay renames specs of several files with the same name; a row has the name in its file
     results = [
@@ -382,7 +382,7 @@ def _rows_of_file(
         if tree.file == file_index
     ]
     parts = {part.text: part for part in replayed.vacuous}
-    rows = [_row(log_row, result, replayed.first_ns, lines) for result in results]
+    rows = [_row(log_row, result, replayed.first_ns, line_by_spec) for result in results]
     rows = [
         _with_explanation(row, result, replayed.first_ns)
         if explained is None or (file_index, row.spec, row.object) in explained
@@ -392,7 +392,8 @@ def _rows_of_file(
     result_names = {result.name for result in results}
     idle = [spec for spec in file.results if spec.name not in result_names and spec.parameter is not None]
     rows += [
-        _idle_row(_about(log_row, spec, lines), parts[f"{spec.name}({spec.parameter})"]) for spec in idle
+        _idle_row(_about(log_row, spec, line_by_spec), parts[f"{spec.name}({spec.parameter})"])
+        for spec in idle
     ]
     return tuple(rows)
 

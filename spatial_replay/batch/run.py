@@ -338,7 +338,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
         RemoteError: a bucket cannot be listed.
     """
     faults = _Faults(suite)
-    texts: dict[Path | str, SpecificationText | None] = {}
+    text_by_path: dict[Path | str, SpecificationText | None] = {}
     cases = []
     with progress("finding logs", None):
         for case in suite.cases:
@@ -354,7 +354,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
                     faults.add(
                         f"{place}{count_text}, and at_least_logs is {case.at_least_logs}; check the patterns"
                     )
-            cases.append(PreparedCase(case, tuple(logs), _files(case, suite.folder, texts, faults)))
+            cases.append(PreparedCase(case, tuple(logs), _files(case, suite.folder, text_by_path, faults)))
     faults.check()
     return tuple(cases)
 
@@ -568,14 +568,14 @@ def _evaluated_groups(
     sized_groups = _Groups(tasks)
     single_tasks: list[tuple[Task, ...]] = []
     for task_groups in (sized_groups, single_tasks):
-        for group, rows in workers.results(rows_from_tasks, task_groups) if task_groups else ():
-            if not isinstance(rows, WorkerLost):
-                sized_groups.note(rows)
-                yield group, rows
+        for group, group_rows in workers.results(rows_from_tasks, task_groups) if task_groups else ():
+            if not isinstance(group_rows, WorkerLost):
+                sized_groups.note(group_rows)
+                yield group, group_rows
             elif len(group) > 1:
                 single_tasks += [(task,) for task in group]
             else:
-                yield group, [error_rows(group[0], str(rows), "machine")]
+                yield group, [error_rows(group[0], str(group_rows), "machine")]
 
 
 class _Groups:

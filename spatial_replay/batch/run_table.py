@@ -613,13 +613,13 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
     index = table.schema.get_field_index("failure")
     table = table.set_column(index, table.schema.field(index), pa.array(failures, pa.string()))
     earlier_results = [baseline_results.get(key, (None, None)) for key in keys]
-    for name, column_type, values in (
+    for column_name, column_type, values in (
         (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in earlier_results]),
         (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in earlier_results]),
         (WORSE, pa.bool_(), [key in worse_texts for key in keys]),
         (EDITED, pa.bool_(), [(case, file, spec) in edited_names for case, _, file, spec, _ in keys]),
     ):
-        table = table.append_column(name, pa.array(values, column_type))
+        table = table.append_column(column_name, pa.array(values, column_type))
     indices = {key: index for index, key in enumerate(keys_of(baseline))} if gone_results else {}
     baseline_rows = baseline.take(
         pa.array([indices[result.key] for result in gone_results], pa.int64())

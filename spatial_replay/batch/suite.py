@@ -332,16 +332,16 @@ def _case(
     line_texts = {key: f"{path.name}:{document.line_of(place)}" for key, place in places.items()}
 
     def texts_of(key: str) -> Iterator[tuple[Place, str]]:
-        for number, value in enumerate(_as_list(entry.get(key))):
-            place = (*places[key], number)
-            if isinstance(value, str) and place not in faults:
-                yield place, value
+        for index, text in enumerate(_as_list(entry.get(key))):
+            place = (*places[key], index)
+            if isinstance(text, str) and place not in faults:
+                yield place, text
 
     logs = [LogPattern(log, f"{path.name}:{document.line_of(place)}") for place, log in texts_of("logs")]
     specs = dict.fromkeys(spec for _, spec in texts_of("specs"))
     is_whole = bool(specs) and not any(places.get(key) in faults for key in ("specs", "each", "constants"))
     name = str(entry.get("name", ""))
-    entry = {key: value for key, value in entry.items() if places.get(key) not in faults}
+    entry = {key: text for key, text in entry.items() if places.get(key) not in faults}
     mapping = entry.get("mapping")
     # YAML reads a time such as 5 as a number
     start, end = entry.get("from"), entry.get("to")

@@ -364,8 +364,8 @@ def _heading(spec: NamedSpec) -> str:
 
 
 def _lines(specification: Specification, comparison: _Compared) -> Iterator[str]:
-    for number, spec in enumerate(specification.results):
-        if number:
+    for index, spec in enumerate(specification.results):
+        if index:
             yield ""
         yield _heading(spec)
         branches = list(iter_branches(spec.formula))

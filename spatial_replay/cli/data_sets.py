@@ -209,8 +209,8 @@ def _lines(
     if bodies:
         yield f"objects  {', '.join(_body_text(body) for body in bodies)}"
     features = mappable_features(data_set)
-    for number, line in enumerate(align_rows((feature.name, places_text(feature)) for feature in features)):
-        yield f"{'features' if number == 0 else '':8} {line.strip()}"
+    for index, line in enumerate(align_rows((feature.name, places_text(feature)) for feature in features)):
+        yield f"{'features' if index == 0 else '':8} {line.strip()}"
     picture_names = [feature.name for feature in data_set.features if not feature.width]
     if picture_names:
         yield f"pictures {printable(', '.join(picture_names), 400)}"

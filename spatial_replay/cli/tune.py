@@ -195,8 +195,8 @@ def _lines(tuning: Tuning) -> Iterator[str]:
         beginning = (
             f"no values of {names} exist" if tuning.conflict.is_proven else f"found no values of {names}"
         )
-        for number, (heading, lines) in enumerate(tuning.conflict.sections):
-            yield f"and {heading}:" if number else f"{beginning} that fit {runs_text}; {heading}:"
+        for index, (heading, lines) in enumerate(tuning.conflict.sections):
+            yield f"and {heading}:" if index else f"{beginning} that fit {runs_text}; {heading}:"
             yield from (f"  {line}" for line in lines)
         return
     label = ("widest margin" if tuning.is_widest else "margin") if counts[False] else "tightest values"

@@ -438,9 +438,11 @@ class PreparedJudgement:
         Args:
             is_exported: whether all other violated episodes are explained, too.
         """
-        kinds: set[Kind] = {"only_theirs", "only_ours", "undecided"}
+        explained_kinds: set[Kind] = {"only_theirs", "only_ours", "undecided"}
         rows = self.judgement(batch, allow).rows
-        log_paths = {row.log for row in rows if row.kind in kinds or (is_exported and not row.is_success)}
+        log_paths = {
+            row.log for row in rows if row.kind in explained_kinds or (is_exported and not row.is_success)
+        }
         log_names = {log.name for log in self.case.logs if log.path in log_paths}
         row_keys = zip(
             *(batch.table.column(name).to_pylist() for name in ("log", "file", "spec")), strict=True

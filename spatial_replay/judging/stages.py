@@ -139,10 +139,10 @@ def _subtask(content: str, timestamp: float) -> dict[str, Any]:
 def _row_type() -> pa.StructType:
     import pyarrow as pa
 
-    text = ("role", "content", "style")
+    text_fields = ("role", "content", "style")
     return pa.struct(
         [
-            *((name, pa.string()) for name in text),
+            *((name, pa.string()) for name in text_fields),
             ("timestamp", pa.float32()),
             ("camera", pa.null()),
             ("tool_calls", pa.null()),
