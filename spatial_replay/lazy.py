@@ -14,7 +14,7 @@ from typing import Any
 def lazy_attributes(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
 
-    The package's source has imports for type checkers, which name the module of each name in `__all__`.
+    Imports for type checkers in the package's source give the module of each name in `__all__`.
 
     Args:
         package: `globals()` of the package, which gets the loaded names.

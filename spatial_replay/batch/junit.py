@@ -66,6 +66,12 @@ def write_junit(
 def _lines(
     table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, is_full: bool
 ) -> Iterator[str]:
+    """Yield pieces of the report.
+
+    Args:
+        limit: length limit of texts, characters; None for full texts.
+        is_full: whether passing test cases are listed.
+    """
     rows_by_spec: dict[tuple[str, ...], list[Values]] = {}
     key_columns = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
     result_columns = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")

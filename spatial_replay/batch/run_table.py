@@ -170,7 +170,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     aggregations = [(f"n_{name}", "sum") for name in flags]
     spec_columns = ("requirement", "title", "unit") if by == "spec" else ()
     columns |= {name: table.column(name) for name in spec_columns}
-    # the first value is the run's: rows of gone results come last, with values of the baseline
+    # the first value belongs to the run, because rows of the baseline (gone results) come last
     aggregations += [(name, "first") for name in spec_columns]
     aggregations += [("edited", "max")] if "edited" in columns else []
     # with several threads, pyarrow's TableGroupBy does not keep the order of the rows

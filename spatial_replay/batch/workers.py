@@ -35,7 +35,7 @@ _AHEAD: Final = 2
 _PRELOADED: Final = "spatial_replay.batch.run"
 """Module that the fork server imports once for all workers."""
 _PATIENCE_S: Final = 10
-"""Delay of the report that a cluster has no workers, seconds without a finished task."""
+"""Idle time of a cluster before its lack of workers is reported, seconds."""
 _ANSWER_S: Final = 15
 """Timeout for the scheduler of a cluster, seconds."""
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _EXTENSION = "spatial-replay.foxe"
 """File name of the extension for Foxglove and Lichtblick."""
 _EPOCH_LIKELY_NS = 10**18
-"""Least time since 1970, ns: a moment in 2001. Smaller times count from the start of the run."""
+"""Limit in 2001, ns: smaller times count from the start of the run, other times from 1970."""
 
 
 _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})

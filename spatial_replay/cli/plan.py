@@ -261,7 +261,7 @@ def _plan(
 
     inputs = [*([] if spec is None else [spec]), *also]
     files = load_spec_options(inputs, constants, lambda: default_specification(scenario))
-    # constants alone are values of the scenario's own specification
+    # without --spec, the constants apply to the scenario's own specification
     specification = files.pop(0) if files and (spec is not None or not also) else None
     if specification is not None:
         require_choice(specification, result_name)
