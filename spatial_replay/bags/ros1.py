@@ -393,7 +393,7 @@ class _Scan:
 
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
-        self._size = size
+        self._file_bytes = size
         self._faults = faults
         self._name = name
         self._directory = BagDirectory()
@@ -402,13 +402,13 @@ class _Scan:
     def directory(self) -> BagDirectory:
         position = len(BAG_MAGIC)
         gap_count = 0
-        while position < self._size:
+        while position < self._file_bytes:
             try:
                 position = self._read_record(position)
             except DamageError as damage:
                 gap_count += 1
                 next_offset = self._next_chunk(position + 1) if gap_count < _MOST_GAPS else None
-                self._lose(position, damage, (next_offset or self._size) - position)
+                self._lose(position, damage, (next_offset or self._file_bytes) - position)
                 if next_offset is None:
                     break
                 position = next_offset
@@ -419,7 +419,7 @@ class _Scan:
 
     def _read_record(self, position: int) -> int:
         """Read the record at a position; return the position of the next record."""
-        record = _record(self._stream, position, self._size)
+        record = _record(self._stream, position, self._file_bytes)
         if record.opcode == CHUNK:
             self._chunk(position, record)
         elif record.opcode == CONNECTION:
@@ -451,7 +451,7 @@ class _Scan:
     def _next_chunk(self, position: int) -> int | None:
         """Return the offset of the next chunk with a consistent head; None if no chunk follows a position."""
         overlap_bytes = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
-        while position < self._size:
+        while position < self._file_bytes:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap_bytes)
             mark_offset = window.find(_CHUNK_MARK)
@@ -469,7 +469,7 @@ class _Scan:
 
     def _is_chunk(self, position: int) -> bool:
         try:
-            record = _record(self._stream, position, self._size)
+            record = _record(self._stream, position, self._file_bytes)
             return record.opcode == CHUNK and "compression" in record.fields and "size" in record.fields
         except DamageError:
             return False

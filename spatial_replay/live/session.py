@@ -327,7 +327,7 @@ class LiveSession:
         self._noted_diagnostics: set[Diagnostic] = set()
         self._members = ClassMembers(self._ends.needs.classes)
         self._is_closed = False
-        self._next_doubts = _SAMPLES_BEFORE_DOUBTS
+        self._next_doubt_sample = _SAMPLES_BEFORE_DOUBTS
         self._noted_doubts: set[tuple[str, str]] = set()
         self.remarks: tuple[str, ...] = ()
         self.doubts: tuple[Doubt, ...] = ()
@@ -788,7 +788,7 @@ class LiveSession:
 
     def _note_doubts(self) -> None:
         """Note new contradictions of the run to its mapping; compare again after twice as many samples."""
-        self._next_doubts *= 2
+        self._next_doubt_sample *= 2
         if self._assembler is None:
             return
         for doubt in distinct_doubts(self._assembler.find_doubts(), self._ends.begin_ns or 0):
@@ -807,7 +807,7 @@ class LiveSession:
                     f"{remark.filename}:{remark.line}:{remark.column}: {remark.message}; {remark.hint}"
                 )
         self._sample_count += 1
-        if self._sample_count >= self._next_doubts:
+        if self._sample_count >= self._next_doubt_sample:
             self._note_doubts()
         self._time_ns = sample.time_ns
         now_s = time.monotonic()

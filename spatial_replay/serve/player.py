@@ -292,7 +292,7 @@ class Session:
         # the evaluation after the next requests, and the evaluation after the present requests
         self._next_evaluation: Future[Evaluated] | None = None
         self._due_evaluation: Future[Evaluated] | None = None
-        self._requested = Condition()
+        self._condition = Condition()
         self._is_over = False
         self._is_looping = False
         self._is_behind = False
@@ -317,7 +317,7 @@ class Session:
     @property
     def state(self) -> PlaybackState:
         """The state of the playback."""
-        with self._requested:
+        with self._condition:
             return self._transport.state(self._pace.now())
 
     @property
@@ -335,7 +335,7 @@ class Session:
 
         At the end of the log, playback starts again at the first time.
         """
-        with self._requested:
+        with self._condition:
             now_s = self._pace.now()
             status = self._transport.state(now_s).status
             if seek_ns is None and is_playing and status is Status.ENDED:
@@ -349,7 +349,7 @@ class Session:
                 self._pending.seek_ns = self._transport.time_ns(now_s)
             (self._transport.play if is_playing else self._transport.pause)(now_s)
             self._pending.is_controlled = True
-            self._requested.notify()
+            self._condition.notify()
             # without did_seek: the player reports the jump right before it sends the messages of that time
             return self._transport.state(now_s)
 
@@ -388,9 +388,9 @@ class Session:
         """
         if not isinstance(arrow, str):
             raise UsageError(f'{ARROW} cannot be {arrow!r}: give the title of a result, or "" for the first')
-        with self._requested:
+        with self._condition:
             self._pending.arrow = self.arrow = arrow
-            self._requested.notify()
+            self._condition.notify()
 
     def set_constants(self, values: Values) -> None:
         """Set the values of constants. After an error, all constants are unchanged.
@@ -399,17 +399,17 @@ class Session:
             UsageError: a constant does not exist, or its value has another type.
             SpecificationError: the specification is invalid with these values.
         """
-        with self._requested:
+        with self._condition:
             edited = self.edited
             self._pending.edited = self.edited = edited.loaded.edit({**edited.given, **values})
-            self._requested.notify()
+            self._condition.notify()
 
     def replace_log(self, loaded: LoadedLog) -> None:
         """Evaluate other specifications over the same log.
 
         A constant that a viewer changed keeps the viewer's value, unless its file changed, too.
         """
-        with self._requested:
+        with self._condition:
             edited_before = self.edited
             constants_before = edited_before.loaded.constants
             values_from_viewers = {
@@ -424,13 +424,13 @@ class Session:
             except SpatialReplayError:
                 edited = loaded.edit({})
             self._pending.edited = self.edited = edited
-            self._requested.notify()
+            self._condition.notify()
 
     def resend(self, topic: str) -> None:
         """Send the latest messages of a topic again, for a viewer that has just subscribed to it."""
-        with self._requested:
+        with self._condition:
             self._pending.topics.add(topic)
-            self._requested.notify()
+            self._condition.notify()
 
     def wait_for_evaluation(self) -> Evaluated:
         """Return the evaluation that viewers see, once all earlier requests are performed.
@@ -438,19 +438,19 @@ class Session:
         Raises:
             UsageError: the session is over.
         """
-        with self._requested:
+        with self._condition:
             if self._is_over:
                 raise session_over()
             evaluation = self._next_evaluation = self._next_evaluation or Future()
-            self._requested.notify()
+            self._condition.notify()
         return evaluation.result()
 
     def stop(self) -> None:
         """End the session, and wake the player's thread."""
         self.end()
-        with self._requested:
+        with self._condition:
             self._pending.stop = True
-            self._requested.notify()
+            self._condition.notify()
 
     # -------------------------------------------------------------------------- called by the player
 
@@ -461,9 +461,9 @@ class Session:
             patience_s: longest wait in seconds while the log plays or work is due; otherwise without limit.
             is_due: whether the player has work that needs no request.
         """
-        with self._requested:
+        with self._condition:
             is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
-            self._requested.wait_for(
+            self._condition.wait_for(
                 lambda: self._pending or self._next_evaluation is not None,
                 patience_s if is_playing or is_due else None,
             )
@@ -479,7 +479,7 @@ class Session:
         Args:
             reach_ns: latest time that one turn can reach. Playback then lags behind the clock.
         """
-        with self._requested:
+        with self._condition:
             elapsed_s = self._pace.next_turn()
             now_s = self._pace.now()
             state = self._transport.state(now_s)
@@ -496,7 +496,7 @@ class Session:
 
         The duration of showing a time is not played.
         """
-        with self._requested:
+        with self._condition:
             if self._pending.seek_ns is None:
                 self._transport.move_to(time_ns, self._pace.now())
 
@@ -506,7 +506,7 @@ class Session:
         Args:
             failure: error of the latest specifications.
         """
-        with self._requested:
+        with self._condition:
             self.failure = failure
             if self._pending.edited is None:
                 self.edited = edited
@@ -514,7 +514,7 @@ class Session:
 
     def pause(self) -> PlaybackState:
         """Pause unless a seek is pending; return the state."""
-        with self._requested:
+        with self._condition:
             now_s = self._pace.now()
             if self._pending.seek_ns is None:
                 self._transport.pause(now_s)
@@ -528,14 +528,14 @@ class Session:
 
     def provide_evaluation(self, evaluated: Evaluated) -> None:
         """Give an evaluation to all calls of `wait_for_evaluation` before the last `next_requests`."""
-        with self._requested:
+        with self._condition:
             due_evaluation, self._due_evaluation = self._due_evaluation, None
         if due_evaluation is not None:
             due_evaluation.set_result(evaluated)
 
     def end(self) -> None:
         """Refuse waiting and later calls of `wait_for_evaluation` by an error."""
-        with self._requested:
+        with self._condition:
             self._is_over = True
             open_futures = [
                 future for future in (self._next_evaluation, self._due_evaluation) if future is not None

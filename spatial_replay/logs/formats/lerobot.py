@@ -318,11 +318,11 @@ def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
 
 
 def _remarks(
-    columns: Mapping[str, Floats], frames: Floats, fps: float, expected: int | None
+    columns: Mapping[str, Floats], frames: Floats, fps: float, expected_count: int | None
 ) -> Iterator[str]:
     """Yield remarks on unusual values in the rows of an episode; all rows are read nevertheless."""
-    if expected is not None and expected != len(frames):
-        yield f"meta says {plural(expected, 'frame')}, and data has {len(frames)}"
+    if expected_count is not None and expected_count != len(frames):
+        yield f"meta says {plural(expected_count, 'frame')}, and data has {len(frames)}"
     frame_steps = np.diff(frames)
     irregular_rows = np.flatnonzero(frame_steps != 1)
     if len(frames) and frames[0] != 0:

@@ -318,7 +318,7 @@ class _Scan:
 
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
-        self._size = size
+        self._file_bytes = size
         # greater than the size while the scan is inside a chunk that breaks off
         self._end = size
         self._faults = faults
@@ -337,7 +337,7 @@ class _Scan:
                 gap_count += 1
                 next_chunk = self._next_chunk(sound_end) if gap_count < _MOST_GAPS else None
                 self._lose(position, next_chunk, damage)
-                self._end = self._size
+                self._end = self._file_bytes
                 if next_chunk is None:
                     break
                 position = next_chunk.offset
@@ -376,9 +376,9 @@ class _Scan:
         next_position = int(position + RECORD_HEAD.size + length)
         if opcode == 0:
             raise DamageError(f"there is no record (opcode {opcode})")
-        if next_position > self._size:
+        if next_position > self._file_bytes:
             content_position = _uncompressed_content(position, beginning, next_position)
-            if content_position is None or self._end > self._size:
+            if content_position is None or self._end > self._file_bytes:
                 raise DamageError("the file breaks off in a " + ("chunk" if content_position else "record"))
             self._end_loose()
             self._end = next_position
@@ -405,7 +405,7 @@ class _Scan:
         elif opcode == Opcode.METADATA:
             self._directory.metadata.append((position, next_position - position))
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            if self._end > self._size:
+            if self._end > self._file_bytes:
                 raise DamageError("the data end within a chunk")
             # damage can look like the end of the data
             if self._next_chunk(next_position) is not None:
@@ -422,11 +422,11 @@ class _Scan:
         """
         self._stream.seek(next_position)
         head = self._stream.read(RECORD_HEAD.size)
-        is_followed = next_position == self._size - len(MAGIC)
+        is_followed = next_position == self._file_bytes - len(MAGIC)
         if len(head) == RECORD_HEAD.size:
             next_opcode, next_length = RECORD_HEAD.unpack(head)
             is_followed = is_followed or (
-                next_opcode != 0 and next_position + RECORD_HEAD.size + next_length <= self._size
+                next_opcode != 0 and next_position + RECORD_HEAD.size + next_length <= self._file_bytes
             )
         with suppress(DamageError):
             # the head fits a chunk, so only the opcode is damaged
@@ -459,7 +459,7 @@ class _Scan:
         """Return the next chunk with a consistent head, from a position on; None if no chunk follows."""
         # a chunk at the end of a window needs bytes of the next window
         overlap_bytes = _BEFORE_COMPRESSION + _CHUNK_HEAD_BYTES
-        while position < self._size:
+        while position < self._file_bytes:
             self._stream.seek(position)
             window = self._stream.read(_STRIDE + overlap_bytes)
             # in file order, with both compressions
@@ -468,7 +468,7 @@ class _Scan:
                 opcode, length = RECORD_HEAD.unpack_from(record)
                 if (
                     opcode != Opcode.CHUNK
-                    or position + window_offset + RECORD_HEAD.size + length > self._size
+                    or position + window_offset + RECORD_HEAD.size + length > self._file_bytes
                 ):
                     continue
                 try:
