@@ -765,7 +765,7 @@ def user_cache_folder(name: str) -> Path:
 
 
 def gigabytes(variable: str, otherwise: float) -> int:
-    """Return the size that an environment variable gives in gigabytes, in bytes.
+    """Convert the gigabytes in an environment variable to bytes.
 
     Raises:
         UsageError: the variable is not a number of at least 0.

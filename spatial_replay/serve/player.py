@@ -264,7 +264,7 @@ class PlaySpan(NamedTuple):
 
 
 class Session:
-    """Requests of viewers, collected on any thread for the thread of the player.
+    """Requests of viewers. Any thread adds requests, and the player's thread performs them.
 
     Only `wait_for_evaluation` waits for the player. If requests arrive faster than the player performs them,
     the last request of a kind counts.
