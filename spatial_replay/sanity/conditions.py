@@ -239,7 +239,6 @@ def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Meas
 
 
 def _diameter(outline: Outline) -> Fraction:
-    """Return the diameter of a region in the plane."""
     vertex_diameter = max((dist(*pair) for pair in combinations(outline.vertices, 2)), default=0.0)
     return exact(vertex_diameter + 2.0 * outline.radius)
 

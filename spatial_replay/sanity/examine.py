@@ -87,7 +87,7 @@ class SpecExamination:
         reason: reason why the spec has no automaton, so that only a looser reading was examined; ""
             with an automaton.
         undecided: undecided questions as sentences.
-        unrelated: formulas without laws of geometry, which may hold or fail independently of all others:
+        unrelated: formulas without laws of geometry, which may hold or fail independently of other formulas:
             quantifiers over open groups, relations to earlier samples.
         satisfied, violated: shortest run with that verdict; None if no such run exists or was found.
     """

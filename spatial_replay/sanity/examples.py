@@ -179,8 +179,8 @@ def placements(
 ) -> Iterator[tuple[tuple[Sample, ...] | None, Core | None]]:
     """Yield placements in which facts have given values, from wide to narrow margins.
 
-    Each item has the samples of a placement, or the facts that exclude each other. Both are None if an
-    attempt reaches its limit.
+    Each item has the samples of a placement, or the facts that exclude each other. An attempt that reaches
+    its limit yields (None, None).
 
     Args:
         facts: facts of each sample with their values.
@@ -656,7 +656,7 @@ def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tu
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
-    """Return the setting of a spec, with the objects and signals of all specs, which are all evaluated."""
+    """Return the setting of a spec, with objects and signals of all specs, because all are evaluated."""
     own_atoms = _atoms(spec)
     all_atoms = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
     is_upright = is_about_heights(all_atoms)

@@ -104,7 +104,6 @@ def _distance(a: Term, b: Term) -> SignedDistance:
 
 
 def _single(quantities: Iterable[Quantity]) -> Iterator[Inequality]:
-    """Yield the laws of single measurements."""
     for quantity in quantities:
         match quantity:
             case Misalignment():

@@ -65,7 +65,7 @@ class Side(NamedTuple):
         return state in (self.automaton.can_accept if self.accepts else self.automaton.can_reject)
 
     def least_remaining(self, state: int) -> int:
-        """Return a lower bound of the samples from a state to the required outcome."""
+        """Return a lower bound of the number of samples from a state to the required outcome."""
         return self.automaton.distances[state] if self.accepts else int(not self.agrees(state))
 
 

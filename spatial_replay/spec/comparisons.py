@@ -231,7 +231,6 @@ class ComparisonBuilder:
         return Number(0.0)
 
     def _multiple(self, written: Arithmetic, scope: Scope) -> Expression:
-        """Return a number multiplied or divided by a constant."""
         operand, factor = written.operands
         is_product = written.operator == "*"
         if is_product and self._is_constant(operand, scope):
@@ -411,7 +410,7 @@ def _written_terms(expression: Expression) -> tuple[Term, ...]:
 
 
 def _kind(expression: Expression) -> str:
-    """Return "length" or "speed", the dimension of a number; "" for constants and signals, which fit both."""
+    """Return the dimension of a number: "length", "speed", or "" for constants and signals (either)."""
     match expression:
         case SignedDistance():
             return "length"

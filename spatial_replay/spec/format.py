@@ -272,7 +272,7 @@ def _format_spec(spec: NamedSpec, relations: frozenset[str]) -> str:
 
 
 def title_text(spec: NamedSpec) -> str:
-    """Return the requirement id and title of a spec as one text; "" without both."""
+    """Return the requirement id and title of a spec as one text; "" without id and title."""
     return ": ".join(text for text in (spec.id, spec.title) if text is not None)
 
 

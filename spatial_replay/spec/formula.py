@@ -188,7 +188,7 @@ class Measurement(_Arithmetic):
 
     @abstractmethod
     def with_terms(self, *terms: Term) -> Self:
-        """Return the same measurement of as many other terms."""
+        """Return the measurement with its terms replaced, one for one."""
 
     @property
     @abstractmethod
@@ -514,7 +514,7 @@ Their first operand is the condition that the rate has a value; their last opera
 
 @dataclass(frozen=True, slots=True)
 class Boolean:
-    """Boolean operator: `not` and `spec` have one operand, `and` and `or` two or more, the others two.
+    """Boolean operator: `not` and `spec` have one operand, `and` and `or` two or more, other operators two.
 
     Attributes:
         expansion: formula that defines the operator; None for `not`, `and` and `or` (see `expand`).
@@ -537,11 +537,11 @@ PAST_OPERATORS: frozenset[str] = frozenset({"Y", "O", "H", "S"})
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """Temporal operator: U, R, W and S have two operands, the others one; X, WX and Y have no bound.
+    """Temporal operator: U, R, W and S have two operands, other operators one; X, WX and Y have no bound.
 
     Attributes:
         expansion: formula that defines R, W, WX, an operator over a rate (see `judged_operands`), or U and S
-            with `true` on the left; None for the others (see `expand`).
+            with `true` on the left; None for other operators (see `expand`).
     """
 
     operator: TemporalOperator

@@ -819,8 +819,8 @@ def load_specification(
     Raises:
         MissingFileError: the file is missing or cannot be read.
         SpecificationError: the text has faults; the error lists them.
-        UsageError: the path is a log, a YAML file, a formula or not a path, or `parse_specification` refuses
-            an argument.
+        UsageError: `path` is a log, a YAML file, a formula or no path; or an argument is invalid (see
+            `parse_specification`).
     """
     _require_path(path)
     path = Path(path)

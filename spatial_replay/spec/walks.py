@@ -583,7 +583,7 @@ def _units(expression: Expression) -> list[Unit]:
 def _unit_leaves(expression: Expression) -> list[Signal | Measurement]:
     """Return the parts that determine the unit of an expression.
 
-    Summands have the same unit, so one of them is enough. A multiple is left out, because its constant may
+    Summands have the same unit, so one summand is enough. A multiple is left out, because its constant may
     convert the unit.
     """
     match expression:

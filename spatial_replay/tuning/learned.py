@@ -201,7 +201,7 @@ def _goals(fit: FittedLimits) -> list[Line]:
 
 
 def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
-    """Return whether no good run begins with a relation that holds at the end."""
+    """Return whether a relation that holds at the end fails at the beginning of every good run."""
     return bool(max(run.first[0, 1, index] for run in fit.good) < fit.limits[FINALLY, 0, index])
 
 

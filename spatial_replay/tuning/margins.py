@@ -295,7 +295,7 @@ def _decimal(name: str, value: Value, written: Constant) -> Decimal:
     if isinstance(parsed_value, Duration) != (written.duration_ns is not None):
         kind = "a number" if written.duration_ns is None else "a duration such as 2s"
         raise UsageError(f"{name} cannot be {value!r}: it is {kind} ({text_of_constant(written)} as written)")
-    # repr gives the digits of the text; Decimal(0.1) would have those of the binary float
+    # repr gives the digits of the text; Decimal(0.1) would have the digits of the binary float
     return Decimal(parsed_value.ns) if isinstance(parsed_value, Duration) else Decimal(repr(parsed_value))
 
 
