@@ -132,29 +132,29 @@ class _Part:
             raise UsageError("a clip needs the leaves of every sample, which were not stored")
         self._result, self._node = result, kept_node.node
         self._leaves, self._times_ns = result.leaves, result.times_ns
-        self._order = result.evidence.instance.program.leaves
+        self._leaf_order = result.evidence.instance.program.leaves
         self._trace, self._regions = trace, regions
-        self._reach = look_back([result.formula])
+        self._look_back = look_back([result.formula])
         # an instance lasts from the first to the last appearance of its object
-        self._seen_ns: Integers | None = None
+        self._object_times_ns: Integers | None = None
         if result.object is not None and trace is not None:
             object_column = trace.names.index(result.object)
-            self._seen_ns = trace.times_ns[trace.rows[:, object_column] != ABSENT]
+            self._object_times_ns = trace.times_ns[trace.rows[:, object_column] != ABSENT]
         self._decision = self._decide(result, self._leaves)
         # if several events have the same time, the last entry is shown
-        self._moments = {
+        self._moment_clauses = {
             self._decision.settled.decided_ns: f", where `{kept_node.title}` was settled",
             self._decision.path.decided_ns: f", where the robustness of `{kept_node.title}` is decided",
         }
         if self._decision.certain_ns is not None:
             certain_clause = f", where `{kept_node.title}` became {self._decision.verdict} for certain"
-            self._moments[self._decision.certain_ns] = certain_clause
-        self.span_ns = min(self._moments), max(self._moments)
+            self._moment_clauses[self._decision.certain_ns] = certain_clause
+        self.span_ns = min(self._moment_clauses), max(self._moment_clauses)
         self._title = kept_node.title
 
     def moment(self, time_ns: int) -> str | None:
         """Return the event at a deciding time as a clause; None at other times."""
-        return self._moments.get(time_ns)
+        return self._moment_clauses.get(time_ns)
 
     def holds_over(self, start_ns: int, end_ns: int) -> bool:
         """Return whether the samples between two times, inclusive, have the decision of the whole log."""
@@ -169,11 +169,11 @@ class _Part:
 
     def _decision_over(self, start_ns: int, end_ns: int) -> _Decision | None:
         """Return the decision over the samples between two times; None without a sample."""
-        if self._seen_ns is not None:
-            begin_index, end_index = window_of(self._seen_ns, start_ns, end_ns + 1)
+        if self._object_times_ns is not None:
+            begin_index, end_index = window_of(self._object_times_ns, start_ns, end_ns + 1)
             if begin_index == end_index:
                 return None
-            start_ns, end_ns = self._seen_ns[[begin_index, end_index - 1]].tolist()
+            start_ns, end_ns = self._object_times_ns[[begin_index, end_index - 1]].tolist()
         begin_index, end_index = window_of(self._times_ns, start_ns, end_ns + 1)
         if begin_index == end_index:
             return None
@@ -186,8 +186,8 @@ class _Part:
     def _within(self, begin_index: int, end_index: int, start_ns: int) -> Floats:
         """Return the leaves of a log that has only the window's samples, and nothing before `start_ns`."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin_index:end_index])
-        delay_samples, delay_ns, has_report_delay = self._reach
-        if self._trace is None or not self._reach:
+        delay_samples, delay_ns, has_report_delay = self._look_back
+        if self._trace is None or not self._look_back:
             return leaves
         times_ns = self._times_ns[begin_index:end_index]
         head_length = max(
@@ -201,7 +201,7 @@ class _Part:
         if not len(head_trace):
             return leaves
         instance = self._result.evidence.instance
-        head_leaves = leaf_values(TraceScene(head_trace, self._regions), self._order, instance.bindings)
+        head_leaves = leaf_values(TraceScene(head_trace, self._regions), self._leaf_order, instance.bindings)
         channel_count = max(len(head_leaves), len(leaves))
         leaves = np.array(in_channels(leaves, channel_count))
         leaves[:, :, : len(head_trace)] = in_channels(head_leaves, channel_count)
@@ -214,14 +214,14 @@ class _Part:
         deciding_node, settled_ns = (
             (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
         )
-        evaluation = evaluate_offline(result.formula, self._order, leaves, times_ns)
+        evaluation = evaluate_offline(result.formula, self._leaf_order, leaves, times_ns)
         path = _path(evaluation, self._node)
         if settled_ns is None:
             settled_path = _path(evaluation, deciding_node)
         else:
             prefix_length = int(np.searchsorted(times_ns, settled_ns, side="right"))
             prefix_evaluation = evaluate_prefix(
-                result.formula, self._order, leaves[:, :, :prefix_length], times_ns[:prefix_length]
+                result.formula, self._leaf_order, leaves[:, :, :prefix_length], times_ns[:prefix_length]
             )
             settled_path = _path(prefix_evaluation, deciding_node)
         numbers = (*_deciding_numbers(evaluation, self._node), *_deciding_numbers(evaluation, deciding_node))
@@ -276,12 +276,12 @@ class ClipSearch:
         inner_start_ns = min(part.span_ns[0] for part in self._parts) - around_ns
         inner_end_ns = max(part.span_ns[1] for part in self._parts) + around_ns
         last_index = len(self._times_ns) - 1
-        self._inner = (
+        self._inner_window = (
             int(np.searchsorted(self._times_ns, inner_start_ns)),
             min(last_index, int(np.searchsorted(self._times_ns, inner_end_ns, side="right")) - 1),
         )
         self._around_ns = around_ns
-        self._known: dict[tuple[int, int], bool] = {}
+        self._known_windows: dict[tuple[int, int], bool] = {}
 
     def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
         """Yield sentences on why the window cannot begin later or end earlier; times count from 0."""
@@ -298,7 +298,7 @@ class ClipSearch:
             change_clauses = (part.change_over(*window_ns) for part in self._parts if window_ns)
             reason = next(filter(None, (*moment_clauses, *change_clauses)), None)
             is_log_end = edge_index in (0, len(self._times_ns) - 1)
-            if reason is None and self._around_ns and edge_index in self._inner and not is_log_end:
+            if reason is None and self._around_ns and edge_index in self._inner_window and not is_log_end:
                 reason = f", {format_duration(self._around_ns)} from the samples that decide, by --around"
             if window_ns and reason is not None:
                 yield Sentence(f"it {verb} at ", Instant(time_ns, 0), reason)
@@ -307,15 +307,15 @@ class ClipSearch:
         """Return the times of the first and the last sample of the clip."""
         first_index, last_index = self._outwards()
         while True:
-            cut_first = self._cut(first_index, self._inner[0], partial(self._holds, last=last_index))
-            cut_last = self._cut(last_index, self._inner[1], partial(self._holds, cut_first))
+            cut_first = self._cut(first_index, self._inner_window[0], partial(self._holds, last=last_index))
+            cut_last = self._cut(last_index, self._inner_window[1], partial(self._holds, cut_first))
             if (cut_first, cut_last) == (first_index, last_index):
                 return int(self._times_ns[first_index]), int(self._times_ns[last_index])
             first_index, last_index = cut_first, cut_last
 
     def _outwards(self) -> tuple[int, int]:
         """Widen the window in doubling steps until it has the same decisions. Small windows cost least."""
-        inner_first, inner_last = self._inner
+        inner_first, inner_last = self._inner_window
         last_index, margin_samples = len(self._times_ns) - 1, 0
         while True:
             window = max(inner_first - margin_samples, 0), min(inner_last + margin_samples, last_index)
@@ -336,10 +336,10 @@ class ClipSearch:
 
     def _holds(self, first: int, last: int) -> bool:
         """Return whether all decisions are unchanged over a window, given by sample indices."""
-        if (first, last) not in self._known:
+        if (first, last) not in self._known_windows:
             window_ns = int(self._times_ns[first]), int(self._times_ns[last])
-            self._known[first, last] = all(part.holds_over(*window_ns) for part in self._parts)
-        return self._known[first, last]
+            self._known_windows[first, last] = all(part.holds_over(*window_ns) for part in self._parts)
+        return self._known_windows[first, last]
 
 
 def _join_times(times_ns: Sequence[Integers]) -> Integers:

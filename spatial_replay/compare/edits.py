@@ -157,16 +157,16 @@ class TextVersions:
         statement_keys = [
             key for key in dict.fromkeys((*old_statements, *new_statements)) if key[0] != "SPEC"
         ]
-        self._keys = [
+        self._changed_keys = [
             key for key in statement_keys if _words(old_statements, key) != _words(new_statements, key)
         ][:_MOST_CHANGES]
         self.changes = tuple(
             DeclarationChange(
                 _KINDS[key[0]], key[1], _place(old_statements, key), _place(new_statements, key)
             )
-            for key in self._keys
+            for key in self._changed_keys
         )
-        self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
+        self._parsed_versions: dict[tuple[bool, frozenset[int]], Specification | None] = {}
 
     def version(self, changes: Collection[int], *, is_undone: bool) -> Specification | None:
         """Parse the old text with some new declarations; None if this mixed version has errors.
@@ -176,17 +176,17 @@ class TextVersions:
             is_undone: whether the new text with some old declarations is parsed instead.
         """
         mixture = is_undone, frozenset(changes)
-        if mixture not in self._known:
-            exchanged_keys = [self._keys[index] for index in changes]
+        if mixture not in self._parsed_versions:
+            exchanged_keys = [self._changed_keys[index] for index in changes]
             # an exchanged declaration may need other declarations of its text
             candidate_texts = (
                 self._exchange(exchanged_keys, is_undone, is_strict) for is_strict in (True, False)
             )
             candidates = (self._parse(text, exchanged_keys, is_undone) for text in candidate_texts)
-            self._known[mixture] = next(
+            self._parsed_versions[mixture] = next(
                 (candidate for candidate in candidates if candidate is not None), None
             )
-        return self._known[mixture]
+        return self._parsed_versions[mixture]
 
     def edited_lines(
         self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
@@ -231,7 +231,7 @@ class TextVersions:
         base_file, donor_file = (self.new, self.old) if is_undone else (self.old, self.new)
         replacements: list[tuple[Span, str]] = []
         added_texts = []
-        for key in self._keys:
+        for key in self._changed_keys:
             if key in base_statements and key in donor_statements and key in exchanged_keys:
                 replacements.append(
                     (base_statements[key].span, _text(donor_file, donor_statements[key].span))
@@ -257,7 +257,9 @@ class TextVersions:
             atoms = (atom for spec in specification.specs for atom in iter_atoms(spec.formula))
             signal_names = {name for atom in atoms for name in signals_in(atom.expression)}
             # without its declaration, a constant of the other text is parsed as a signal
-            if not any(first_word == "CONST" and name in signal_names for first_word, name in self._keys):
+            if not any(
+                first_word == "CONST" and name in signal_names for first_word, name in self._changed_keys
+            ):
                 return with_numbers(specification, self._units)
         return None
 
@@ -663,11 +665,11 @@ class _Comparison:
     ) -> None:
         name_by_outline: dict[Outline, str] = {}
         first_names = {name: name_by_outline.setdefault(outline, name) for name, outline in regions.items()}
-        self._alike = partial(_rename_regions, regions=first_names, without_groups=True)
+        self._unify_term = partial(_rename_regions, regions=first_names, without_groups=True)
         self._specs = specs
-        self._renamed: set[tuple[str | None, str | None]] = set()
-        self._numbers: dict[Hashable, int] = {}
-        self._known: dict[int, tuple[Formula, int]] = {}
+        self._renamed_specs: set[tuple[str | None, str | None]] = set()
+        self._meaning_numbers: dict[Hashable, int] = {}
+        self._known_meanings: dict[int, tuple[Formula, int]] = {}
         self.sites: list[FoundSite] = []
 
     def meaning(self, node: Formula) -> int:
@@ -675,9 +677,9 @@ class _Comparison:
 
         Names, and the order of operands of commutative operators, do not matter.
         """
-        cache_entry = self._known.get(id(node))
+        cache_entry = self._known_meanings.get(id(node))
         if cache_entry is None:
-            cache_entry = self._known[id(node)] = (node, self._meaning(node))
+            cache_entry = self._known_meanings[id(node)] = (node, self._meaning(node))
         return cache_entry[1]
 
     def _meaning(self, node: Formula) -> int:
@@ -686,9 +688,9 @@ class _Comparison:
             case Truth():
                 meaning_key = node.value
             case Atom():
-                meaning_key = map_leaves(node.expression, partial(changed_leaf, change=self._alike))
+                meaning_key = map_leaves(node.expression, partial(changed_leaf, change=self._unify_term))
             case Quantified():
-                group = self._alike(node.group)
+                group = self._unify_term(node.group)
                 meaning_key = (
                     node.quantifier,
                     len(node.variables),
@@ -707,7 +709,7 @@ class _Comparison:
                 meaning_key = (node.operator, tuple(map(self.meaning, node.operands)))
             case Temporal():
                 meaning_key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
-        return self._numbers.setdefault(meaning_key, len(self._numbers))
+        return self._meaning_numbers.setdefault(meaning_key, len(self._meaning_numbers))
 
     def align(self, old: Place, new: Place) -> Merged:
         """Compare two corresponding nodes."""
@@ -722,7 +724,7 @@ class _Comparison:
             # the reference changed to another spec; neither spec was edited
             return self._site(FoundSite("replaced", old, new))
         if is_renamed:
-            self._renamed.add(spec_names)
+            self._renamed_specs.add(spec_names)
             self.sites.append(FoundSite("renamed", old, new))
         if has_equal_meaning:
             self._align_names(old, new)
@@ -844,7 +846,7 @@ class _Comparison:
         return tuple(
             name_pair
             for name_pair in name_pairs
-            if name_pair[0] == name_pair[1] or name_pair in self._renamed
+            if name_pair[0] == name_pair[1] or name_pair in self._renamed_specs
         )
 
     def _unit(

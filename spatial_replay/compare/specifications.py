@@ -83,28 +83,30 @@ class EditOutcomes:
         self._diff = diff
         self._times_ns = one.times_ns
         self._semantics = one.semantics
-        self._rows: dict[Atom | Quantified, Floats] = {}
+        self._leaf_rows: dict[Atom | Quantified, Floats] = {}
         result_leaves = [(result, result.leaves) for result in (one, other) if result.leaves is not None]
         channel_count = max((len(leaves) for _, leaves in result_leaves), default=0)
         for result, leaves in result_leaves:
             channel_leaves = in_channels(leaves, channel_count)
             for leaf_index, leaf in enumerate(result.evidence.instance.program.leaves):
-                self._rows[leaf] = channel_leaves[:, leaf_index]
-        self._known: dict[frozenset[int], EditOutcome] = {}
+                self._leaf_rows[leaf] = channel_leaves[:, leaf_index]
+        self._known_outcomes: dict[frozenset[int], EditOutcome] = {}
         self.count = 0
 
     def __call__(self, units: Sequence[int]) -> EditOutcome:
         """Return the outcome of the old formula with the edits of some units, given by index."""
         edited_units = frozenset(units)
-        if edited_units not in self._known:
+        if edited_units not in self._known_outcomes:
             self.count += 1
-            self._known[edited_units] = self._evaluate(self._diff.formula(edited_units))
-        return self._known[edited_units]
+            self._known_outcomes[edited_units] = self._evaluate(self._diff.formula(edited_units))
+        return self._known_outcomes[edited_units]
 
     def _evaluate(self, formula: Formula) -> EditOutcome:
         leaves = new_leaves(formula, ())
-        leaf_shape = next(iter(self._rows.values())).shape if self._rows else (1, len(self._times_ns))
-        leaf_rows = [self._rows[leaf] for leaf in leaves]
+        leaf_shape = (
+            next(iter(self._leaf_rows.values())).shape if self._leaf_rows else (1, len(self._times_ns))
+        )
+        leaf_rows = [self._leaf_rows[leaf] for leaf in leaves]
         leaf_values = (
             np.stack(leaf_rows, axis=1) if leaf_rows else np.empty((leaf_shape[0], 0, leaf_shape[1]))
         )

@@ -353,7 +353,7 @@ class Replay:
         self._source = source
         self._written_files = files
         self._selection = Selection(source, files, options)
-        self._ends = self._selection.run_ends()
+        self._run_ends = self._selection.run_ends()
         plan = ReplayPlan.of(self._selection)
         self.files = plan.files
         self._account = LogAccount(plan)
@@ -369,14 +369,14 @@ class Replay:
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
-        self._kept: list[list[SeriesBlock]] = [[] for _ in self.trees]
+        self._kept_blocks: list[list[SeriesBlock]] = [[] for _ in self.trees]
         self._hashes = (
             EvaluationHashes([(tree.name, tree.object) for tree in self.trees]) if certify else None
         )
-        self._topics: set[str] = set()
-        self._images: set[str] = set()
-        self._encoded = self._end_ns = 0
-        self._start_ns, self._is_beside = LATEST_NS, False
+        self._own_topics: set[str] = set()
+        self._image_topics: set[str] = set()
+        self._encoded_count = self._last_message_ns = 0
+        self._first_message_ns, self._is_layer = LATEST_NS, False
         self._zero_ns: int | None = None
         self._traces = _KeptTraces(self._selection, min(_KEPT_BYTES * len(self.trees), _MOST_KEPT_BYTES))
 
@@ -402,7 +402,7 @@ class Replay:
             UsageError: the window has no sample.
             SpecificationError: a name is missing, and names are strict.
         """
-        self._is_beside = layer
+        self._is_layer = layer
         needs_messages = write is not None or self._hashes is not None
         # while the messages of this block are made, a free core evaluates the next block
         for block, trace, stretches in read_ahead(self._evaluate(messages=needs_messages)):
@@ -410,15 +410,15 @@ class Replay:
             window_samples = self._selection.inside(trace)
             messages = Messages()
             if needs_messages:
-                messages = self._selection.own_messages(block, self._encoded)
-            self._encoded += len(self._selection.inside(block.trace))
+                messages = self._selection.own_messages(block, self._encoded_count)
+            self._encoded_count += len(self._selection.inside(block.trace))
             self._account.add(block, window_samples)
             if not layer:
-                self._topics.update(channel.topic for channel in messages.channels.values())
-                self._images |= image_topics(messages.channels.values())
+                self._own_topics.update(channel.topic for channel in messages.channels.values())
+                self._image_topics |= image_topics(messages.channels.values())
             self._keep(window_samples, messages, stretches)
             if self._zero_ns is None:
-                self._zero_ns = log_zero_ns(self._source, self._selection.window, self._ends)
+                self._zero_ns = log_zero_ns(self._source, self._selection.window, self._run_ends)
                 begin(self._zero_ns)
             if write is not None:
                 self._evaluation.annotator.count_from(self._zero_ns)
@@ -427,7 +427,7 @@ class Replay:
         replayed = self._results()
         if write is not None:
             annotator, finals = self._evaluation.annotator, self._evaluation.finals
-            write(merge(annotator.end(self._end_ns, finals, replayed.results)))
+            write(merge(annotator.end(self._last_message_ns, finals, replayed.results)))
         return replayed
 
     def _annotate(
@@ -450,7 +450,9 @@ class Replay:
             part_samples = trace.slice(begin, min(begin + part_length, len(trace)))
             derived_messages = self._evaluation.annotator.messages(*with_stretches(part_samples, stretches))
             messages = merge([*derived_messages, own_messages.within(start_ns, end_ns)])
-            self._start_ns = min(self._start_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS)
+            self._first_message_ns = min(
+                self._first_message_ns, *messages.log_time_ns[:1].tolist(), LATEST_NS
+            )
             write(messages)
 
     def draw_samples(
@@ -500,9 +502,9 @@ class Replay:
         """Return the viewer layout of the annotated log. It needs a finished `run`."""
         planner_file = planned_for(self._source, self.files)
         return self._evaluation.layout(
-            self._topics,
+            self._own_topics,
             self._source.axes,
-            self._images,
+            self._image_topics,
             planner_file,
             self._shown_start(),
             planned_result(self._source),
@@ -514,24 +516,24 @@ class Replay:
         An annotated log without the source's messages is opened next to the source.
         """
         is_bag = self._selection.options.keep == () and not isinstance(self._source, McapSource)
-        start_ns = first_message_ns(self._source) if self._is_beside or is_bag else None
-        return (self._start_ns, "this log") if start_ns is None else (start_ns, self._source.name)
+        start_ns = first_message_ns(self._source) if self._is_layer or is_bag else None
+        return (self._first_message_ns, "this log") if start_ns is None else (start_ns, self._source.name)
 
     def _evaluate(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
-        with closing(self._selection.read_blocks(messages=messages, ends=self._ends)) as blocks:
+        with closing(self._selection.read_blocks(messages=messages, ends=self._run_ends)) as blocks:
             for block, trace in blocks:
                 yield block, trace, self._evaluation.extend(trace)
 
     def _keep(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
         if len(messages):
-            self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
+            self._last_message_ns = max(self._last_message_ns, int(messages.log_time_ns[-1]))
         if self._hashes is not None:
             self._hashes.add_samples(trace, messages)
             self._hashes.add_results(stretches)
         for result_index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
-                kept_blocks = self._kept[result_index]
+                kept_blocks = self._kept_blocks[result_index]
                 kept_blocks.append(self._kept_part(stretch))
                 # joined arrays are in temporary files: a million samples take 0.25 instead of 0.64 GB
                 while len(kept_blocks) > 1 and len(kept_blocks[-2].times_ns) <= len(kept_blocks[-1].times_ns):
@@ -551,7 +553,7 @@ class Replay:
             self._evaluation.streams,
             self.trees,
             self.files,
-            [join_blocks(blocks) if blocks else None for blocks in self._kept],
+            [join_blocks(blocks) if blocks else None for blocks in self._kept_blocks],
             self._traces.read,
             first_ns,
             units=self._evaluation.units,

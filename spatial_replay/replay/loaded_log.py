@@ -82,15 +82,15 @@ class OwnMessages:
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
         self._samples: list[Trace] = []
-        self._few: dict[Channel, list[Messages]] = {}
-        self._counts: dict[Channel, int] = {}
-        self._bytes = 0
-        self._samples_ns: tuple[int, int] = 0, 0
+        self._few_messages: dict[Channel, list[Messages]] = {}
+        self._message_counts: dict[Channel, int] = {}
+        self._few_bytes = 0
+        self._sample_span_ns: tuple[int, int] = 0, 0
         self.start_ns, self.end_ns = 0, -1
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        return tuple(self._counts)
+        return tuple(self._message_counts)
 
     def add(self, block: Block) -> None:
         """Add the next block of the log."""
@@ -100,12 +100,12 @@ class OwnMessages:
         times_ns = self._selection.inside(block.trace).times_ns
         self._span(times_ns)
         if len(times_ns):
-            span_start_ns, span_end_ns = self._samples_ns
+            span_start_ns, span_end_ns = self._sample_span_ns
             # the end is tested, because a log may begin at 0
-            self._samples_ns = (span_start_ns if span_end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
+            self._sample_span_ns = (span_start_ns if span_end_ns else int(times_ns[0])), int(times_ns[-1]) + 1
         self._count(messages)
         # a log without messages is played from memory; other logs are read again
-        if self._counts:
+        if self._message_counts:
             self._samples = []
         else:
             self._samples.append(block.trace)
@@ -126,17 +126,17 @@ class OwnMessages:
         """For each topic in memory, return the last message before a time."""
         earlier_messages = [
             select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
-            for channel_pieces in self._few.values()
+            for channel_pieces in self._few_messages.values()
             for messages in channel_pieces
         ]
         return latest_messages(merge(earlier_messages), time_ns)
 
     def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
         """Read the log from a time on. A log without messages is read from memory, in small pieces."""
-        if self._counts:
+        if self._message_counts:
             for block in read_blocks(self._selection.source, start_ns, self._selection.window.end_ns):
                 # trimmed samples at the ends of the log are left out
-                yield replace(block, trace=within(block.trace, *self._samples_ns))
+                yield replace(block, trace=within(block.trace, *self._sample_span_ns))
             return
         if len(self._samples) > 1:
             self._samples = [Trace.concatenate(self._samples)]
@@ -154,25 +154,25 @@ class OwnMessages:
     def _count(self, messages: Messages) -> None:
         """Count messages in the window. Topics with many messages are removed from memory."""
         for channel, message_rows in messages.by_channel():
-            if channel not in self._counts:
-                self._few[channel] = []
-            self._counts[channel] = self._counts.get(channel, 0) + len(message_rows)
-            if channel in self._few:
+            if channel not in self._message_counts:
+                self._few_messages[channel] = []
+            self._message_counts[channel] = self._message_counts.get(channel, 0) + len(message_rows)
+            if channel in self._few_messages:
                 channel_messages = select(messages, message_rows)
-                self._few[channel].append(channel_messages)
-                self._bytes += _size(channel_messages)
-                if self._counts[channel] > _FEW or self._bytes > _FEW_BYTES:
-                    self._bytes -= sum(map(_size, self._few.pop(channel)))
+                self._few_messages[channel].append(channel_messages)
+                self._few_bytes += _size(channel_messages)
+                if self._message_counts[channel] > _FEW or self._few_bytes > _FEW_BYTES:
+                    self._few_bytes -= sum(map(_size, self._few_messages.pop(channel)))
 
 
 class MessageCursor:
     """A position in a log's own messages. It only moves forward."""
 
     def __init__(self, own_messages: OwnMessages, start_ns: int) -> None:
-        self._pieces = own_messages.iter_from(start_ns)
-        self._waiting = Messages()
-        self._taken = 0
-        self._is_over = False
+        self._message_pieces = own_messages.iter_from(start_ns)
+        self._buffer = Messages()
+        self._next_row = 0
+        self._is_exhausted = False
 
     def take_before(self, end_ns: int) -> Messages:
         """Move to a time, and return the messages before it that are not returned yet.
@@ -180,16 +180,16 @@ class MessageCursor:
         Raises:
             LogError: the log can no longer be read.
         """
-        while not self._is_over and not _reaches(self._waiting, end_ns):
-            next_messages = next(self._pieces, None)
+        while not self._is_exhausted and not _reaches(self._buffer, end_ns):
+            next_messages = next(self._message_pieces, None)
             if next_messages is None:
-                self._is_over = True
+                self._is_exhausted = True
             else:
-                remaining_messages = select(self._waiting, np.arange(self._taken, len(self._waiting)))
-                self._waiting, self._taken = merge([remaining_messages, next_messages]), 0
-        first_row = self._taken
-        self._taken = max(first_row, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
-        return select(self._waiting, np.arange(first_row, self._taken))
+                remaining_messages = select(self._buffer, np.arange(self._next_row, len(self._buffer)))
+                self._buffer, self._next_row = merge([remaining_messages, next_messages]), 0
+        first_row = self._next_row
+        self._next_row = max(first_row, int(np.searchsorted(self._buffer.log_time_ns, end_ns)))
+        return select(self._buffer, np.arange(first_row, self._next_row))
 
 
 def latest_messages(messages: Messages, time_ns: int) -> Messages:
@@ -273,11 +273,11 @@ class LoadedLog:
         keep = KEEP_ALL if options.keep is None else options.keep
         selection = Selection(source, tuple(files), replace(options, keep=keep))
         # evaluations read the samples in memory, which have no messages
-        self.name, self.options, self._keep = source.name, replace(options, keep=None), options.keep
-        self._source, self._saved = source, saved
+        self.name, self.options, self._kept_topics = source.name, replace(options, keep=None), options.keep
+        self._source, self._saved_files = source, saved
         self._looks_back = look_before(files)
         self._attachments = source.attachments
-        self._files, self._kept = tuple(files), logged_specifications(files, source.axes.units)
+        self._files, self._logged_files = tuple(files), logged_specifications(files, source.axes.units)
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
@@ -300,7 +300,7 @@ class LoadedLog:
         self.first_ns = log_zero_ns(source, options.window, run_ends)
         self.doubts = distinct_doubts(doubts, self.first_ns)
         self._needs, self._has_spans = run_ends.needs, run_ends.has_spans
-        self._places = _places(self._files)
+        self._constant_places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
@@ -315,14 +315,14 @@ class LoadedLog:
         """
         looks_back_farther = self.options.window.start_ns and look_before(files) and not self._looks_back
         if looks_back_farther or (self._has_spans and Needs.of(files, self.options.each) != self._needs):
-            options = replace(self.options, keep=self._keep)
-            return LoadedLog(self._source, files, options, saved=self._saved)
+            options = replace(self.options, keep=self._kept_topics)
+            return LoadedLog(self._source, files, options, saved=self._saved_files)
         # a shallow copy shares the samples and their cached measurements
         log = copy(self)
-        log._files, log._kept = tuple(files), logged_specifications(files, self.trace.units)
+        log._files, log._logged_files = tuple(files), logged_specifications(files, self.trace.units)
         selection = Selection(self._source, tuple(files), self.options)
         log.missing = selection.missing_names(LogNames.of(self.trace))
-        log._places = _places(log._files)
+        log._constant_places = _places(log._files)
         log.constants = log._constants(log._files)
         return log
 
@@ -337,15 +337,15 @@ class LoadedLog:
                 constant.
             SpecificationError, MissingFileError, OutputError: see `write_constants`.
         """
-        if self._saved is None:
+        if self._saved_files is None:
             raise UsageError(
                 "constants are written into files that are watched; give --spec FILE and --watch"
             )
-        return self._saved.write(self._by_file(values), self._files)
+        return self._saved_files.write(self._by_file(values), self._files)
 
     def was_written(self, name: str) -> bool:
         """Return whether a constant's file still has the value that `write_constants` wrote."""
-        return self._saved is not None and self._saved.was_written(*self._places[name])
+        return self._saved_files is not None and self._saved_files.was_written(*self._constant_places[name])
 
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
         values_by_file = [dict[str, float | str]() for _ in self._files]
@@ -374,7 +374,7 @@ class LoadedLog:
             logged_file
             if file is file_as_written
             else with_numbers(_storable(file, file_as_written, logged_file), self.trace.units)
-            for file, file_as_written, logged_file in zip(files, self._files, self._kept, strict=True)
+            for file, file_as_written, logged_file in zip(files, self._files, self._logged_files, strict=True)
         ]
         return EditedFiles(self, tuple(stored_files), MappingProxyType(dict(values)), self._constants(files))
 
@@ -405,14 +405,14 @@ class LoadedLog:
         return MappingProxyType(
             {
                 name: files[file_index].constants[constant_name]
-                for name, (file_index, constant_name) in self._places.items()
+                for name, (file_index, constant_name) in self._constant_places.items()
             }
         )
 
     def _place(self, name: str, value: object) -> tuple[int, str]:
         """Check the kind of a constant's value, and return the index of its file and its name in the file."""
-        if name not in self._places:
-            constant_names = tuple(self._places)
+        if name not in self._constant_places:
+            constant_names = tuple(self._constant_places)
             hint = (
                 nearest_hint(name, constant_names)
                 or f"the constants are: {', '.join(constant_names) or 'none'}"
@@ -426,7 +426,7 @@ class LoadedLog:
             raise UsageError(
                 f"{name} cannot be {value!r}: it is {expected_kind} ({constant_text(constant)} as written)"
             )
-        return self._places[name]
+        return self._constant_places[name]
 
     def _check_size(self, evaluation: AnnotatedEvaluation) -> None:
         node_count = sum(1 for tree in evaluation.trees for _ in iter_nodes(tree.formula))
@@ -637,10 +637,10 @@ class Playback:
         self.evaluated = evaluated
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
-        self._start = self._scene_start()
-        self._annotator = evaluated.evaluation.new_annotator(self._start)
-        self._own = MessageCursor(log_messages, self.start_ns)
-        self._next = 0
+        self._start_scene = self._scene_start()
+        self._annotator = evaluated.evaluation.new_annotator(self._start_scene)
+        self._own_cursor = MessageCursor(log_messages, self.start_ns)
+        self._next_sample = 0
         self._has_ended = False
 
     def _scene_start(self) -> SceneState:
@@ -671,13 +671,13 @@ class Playback:
             LogError: the log can no longer be read.
         """
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
-        self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        sample_index = max(self._next - 1, 0)
+        self._next_sample = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
+        sample_index = max(self._next_sample - 1, 0)
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
             self._regions = regions
-            self._start = self._scene_start()
-        scene = replace(self._annotator.scene, written_ns=None, last={}, extent=self._start.extent)
+            self._start_scene = self._scene_start()
+        scene = replace(self._annotator.scene, written_ns=None, last={}, extent=self._start_scene.extent)
         self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
         earlier_messages = merge(
@@ -685,7 +685,7 @@ class Playback:
         )
         self.past = earlier_messages.of_topics((STANDING,))
         events = _last(earlier_messages.of_topics((EVENTS, EVENT_LOG, RECENT_EVENTS)))
-        derived_messages = self._annotator.messages(*self.evaluated.part(sample_index, self._next))
+        derived_messages = self._annotator.messages(*self.evaluated.part(sample_index, self._next_sample))
         shown_messages = merge([events, *derived_messages, self._seek_own(int(self._times_ns[sample_index]))])
         return join([shown_messages, _last(self._end())])
 
@@ -696,15 +696,15 @@ class Playback:
             LogError: the log can no longer be read.
         """
         self.time_ns = min(max(time_ns, self.time_ns), self.end_ns)
-        first_sample = self._next
-        self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
-        derived_messages = self._annotator.messages(*self.evaluated.part(first_sample, self._next))
-        next_messages = merge([*derived_messages, self._own.take_before(self.time_ns + 1)])
+        first_sample = self._next_sample
+        self._next_sample = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
+        derived_messages = self._annotator.messages(*self.evaluated.part(first_sample, self._next_sample))
+        next_messages = merge([*derived_messages, self._own_cursor.take_before(self.time_ns + 1)])
         return join([next_messages, self._end()])
 
     def reach_ns(self, samples: int) -> int:
         """Return the time that is a number of samples ahead; the end of the log if it has fewer samples."""
-        sample_index = self._next + samples - 1
+        sample_index = self._next_sample + samples - 1
         return int(self._times_ns[sample_index]) if sample_index < len(self._times_ns) else self.end_ns
 
     def _end(self) -> Messages:
@@ -718,8 +718,8 @@ class Playback:
         """Return the latest of the log's own messages of each topic, and all own messages at `time_ns`."""
         log_messages = self.evaluated.loaded.own
         since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), log_messages.start_ns)
-        self._own = MessageCursor(log_messages, since_ns)
-        messages = merge([log_messages.few_before(since_ns), self._own.take_before(self.time_ns + 1)])
+        self._own_cursor = MessageCursor(log_messages, since_ns)
+        messages = merge([log_messages.few_before(since_ns), self._own_cursor.take_before(self.time_ns + 1)])
         return latest_messages(messages, self.time_ns)
 
 

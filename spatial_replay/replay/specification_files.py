@@ -58,10 +58,10 @@ class SpecificationFiles:
             raise UsageError("watching needs a specification file to watch; give --spec FILE")
         self.paths = tuple(dict.fromkeys(paths))
         self._constants = dict(constants or {})
-        self._read: list[_State | None] = []
+        self._read_states: list[_State | None] = []
         self._sources: list[str] = []
-        self._written: dict[tuple[int, str], Constant] = {}
-        self._turn = Lock()
+        self._written_constants: dict[tuple[int, str], Constant] = {}
+        self._lock = Lock()
 
     def load(self) -> list[Specification]:
         """Parse the files.
@@ -69,21 +69,21 @@ class SpecificationFiles:
         Raises:
             MissingFileError, SpecificationError, UsageError: as `load_specifications`.
         """
-        with self._turn:
+        with self._lock:
             # states are read before the files, so that a save during the reading counts as a change
-            self._read, self._sources = self._state(), []
+            self._read_states, self._sources = self._state(), []
             files = load_specifications(self.paths, constants=self._constants)
             self._sources = [file.source for file in files]
-            self._written = {
+            self._written_constants = {
                 (file_index, name): constant
-                for (file_index, name), constant in self._written.items()
+                for (file_index, name), constant in self._written_constants.items()
                 if files[file_index].constants.get(name) == constant
             }
             return files
 
     def was_written(self, index: int, name: str) -> bool:
         """Return whether a constant of the file at an index still has the value that `write` wrote."""
-        return (index, name) in self._written
+        return (index, name) in self._written_constants
 
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
         """Yield the files after each save that changes their text, or the error if they cannot be read.
@@ -109,7 +109,7 @@ class SpecificationFiles:
             yield_on_timeout=True,
             recursive=False,
         ):
-            yield self._wait_for_save() if self._state() != self._read else None
+            yield self._wait_for_save() if self._state() != self._read_states else None
 
     def write(
         self, values: Sequence[Mapping[str, float | str]] = (), loaded: Sequence[Specification] = ()
@@ -123,7 +123,7 @@ class SpecificationFiles:
         Returns:
             The changed values by name.
         """
-        with self._turn:
+        with self._lock:
             files_with_given = load_specifications(self.paths, constants=self._constants)
             files_as_written = load_specifications(self.paths)
             changed_values: dict[str, float | str] = {}
@@ -149,7 +149,9 @@ class SpecificationFiles:
                 changed_names = write_constants(path, values_to_write)
                 changed_values |= {name: values_to_write[name] for name in changed_names}
                 saved_file = load_specification(path) if changed_names else file_as_written
-                self._written |= {(file_index, name): saved_file.constants[name] for name in changed_names}
+                self._written_constants |= {
+                    (file_index, name): saved_file.constants[name] for name in changed_names
+                }
             self._constants = {}
             return changed_values
 
@@ -163,7 +165,11 @@ class SpecificationFiles:
         """Refuse to overwrite a value that another program saved after the file was loaded."""
         for name in new_names:
             constant = saved_constants.get(name)
-            if constant not in (None, loaded_constants[name], self._written.get((file_index, name))):
+            if constant not in (
+                None,
+                loaded_constants[name],
+                self._written_constants.get((file_index, name)),
+            ):
                 saved_text = str(constant_value(constant)).removesuffix(".0")
                 raise UsageError(
                     f"{name} was just saved as {saved_text}; write it again once the saved file is evaluated"
@@ -184,13 +190,13 @@ class SpecificationFiles:
                 files = self.load()
             except SpatialReplayError as error:
                 time.sleep(_ERROR_SETTLE_S)
-                if self._state() == self._read:
+                if self._state() == self._read_states:
                     return error
                 continue
-            if self._state() == self._read:
+            if self._state() == self._read_states:
                 return files if self._sources != previous_sources else None
         # the last read may have been incomplete, so the next call reads the files again
-        self._read, self._sources = [], previous_sources
+        self._read_states, self._sources = [], previous_sources
         return None
 
     def _state(self) -> list[_State | None]:

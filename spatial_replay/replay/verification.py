@@ -170,42 +170,44 @@ class FirstDifferences:
 
     def __init__(self, log: LogFile) -> None:
         self._reader = McapLog(log)
-        self._recorded: dict[str, Iterator[Message]] = {}
-        self._found: dict[str, Sentence] = {}
+        self._recorded_messages: dict[str, Iterator[Message]] = {}
+        self._differences: dict[str, Sentence] = {}
 
     def add(self, messages: Messages) -> None:
         """Compare the next messages of the evaluation."""
         for topic, row in zip(messages.topics, messages.rows(), strict=True):
-            if topic not in self._found:
+            if topic not in self._differences:
                 self._compare(topic, row.log_time_ns, row.payload)
 
     def finish(self) -> dict[str, Sentence]:
         """Check for messages that only the log has, and return the first difference of each topic."""
         for topic in (topic_of_log.name for topic_of_log in self._reader.topics()):
-            is_compared = topic in self._recorded or topic not in DERIVED
-            if topic not in self._found and is_compared:
+            is_compared = topic in self._recorded_messages or topic not in DERIVED
+            if topic not in self._differences and is_compared:
                 extra_message = next(self._messages(topic), None)
                 if extra_message is not None:
                     extra_time = Instant(extra_message.log_time_ns, 0)
-                    self._found[topic] = Sentence("the one at ", extra_time, " is only in the log")
-        return self._found
+                    self._differences[topic] = Sentence("the one at ", extra_time, " is only in the log")
+        return self._differences
 
     def _compare(self, topic: str, time_ns: int, payload: bytes) -> None:
         recorded_message = next(self._messages(topic), None)
         if recorded_message is None:
-            self._found[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
+            self._differences[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
         elif recorded_message.log_time_ns != time_ns:
             computed_time, recorded_time = Instant(time_ns, 0), Instant(recorded_message.log_time_ns, 0)
-            self._found[topic] = Sentence("one is at ", computed_time, " now, and was at ", recorded_time)
+            self._differences[topic] = Sentence(
+                "one is at ", computed_time, " now, and was at ", recorded_time
+            )
         elif recorded_message.payload != payload:
             difference = _difference(topic, payload, recorded_message.payload)
             if difference is not None:
-                self._found[topic] = Sentence("at ", Instant(time_ns, 0), f": {difference}")
+                self._differences[topic] = Sentence("at ", Instant(time_ns, 0), f": {difference}")
 
     def _messages(self, topic: str) -> Iterator[Message]:
-        if topic not in self._recorded:
-            self._recorded[topic] = self._reader.iter_messages({topic})
-        return self._recorded[topic]
+        if topic not in self._recorded_messages:
+            self._recorded_messages[topic] = self._reader.iter_messages({topic})
+        return self._recorded_messages[topic]
 
 
 def explain_differences(
