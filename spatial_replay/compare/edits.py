@@ -475,7 +475,7 @@ class Place:
 
     @property
     def bare(self) -> Place:
-        """The place of the node. If a spec only repeats another spec, the place of the other spec."""
+        """The place of the node. It is the place of the inner spec if a spec only repeats another spec."""
         place = self
         while isinstance(place.node, Boolean) and place.node.operator == "spec":
             place = place.operands[0]
@@ -675,7 +675,7 @@ class _Comparison:
     def meaning(self, node: Formula) -> int:
         """Return a number that is the same for nodes of equal meaning.
 
-        Names, and the order of operands of commutative operators, do not matter.
+        It ignores names, and the order of a commutative operator's operands.
         """
         cache_entry = self._known_meanings.get(id(node))
         if cache_entry is None:

@@ -139,7 +139,7 @@ def align_runs(
             f"{name + ' has no' if name else 'no spec has an'} automaton to align by (past operators and "
             "bounds in seconds have none); align by time, or by a spec's name"
         )
-    # the most knots win, because the automaton of a formula without temporal operators gives few knots
+    # the result with the most knots is used: a formula without temporal operators gives few knots
     name, knots = max(candidates, key=lambda candidate: len(candidate[1]))
     return _alignment("progress", name, knots, a_ns, b_ns)
 

@@ -83,7 +83,7 @@ _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 _SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
 """Limits of messages that are written together, some 30 MB: samples, and samples times results.
 
-Small parts reuse the memory of earlier messages. The system's time for new memory equals the time to fill it.
+Small parts reuse the memory of earlier messages. Filling memory that is new from the system takes twice as long.
 """
 
 
@@ -178,7 +178,7 @@ class ReplayPlan:
 
     @classmethod
     def of(cls, selection: Selection) -> ReplayPlan:
-        """Prepare the specifications of a selection. If there are templates, the log is read for objects.
+        """Prepare the specifications of a selection. Templates read the log once to find their objects.
 
         Raises:
             UsageError: the objects of a template are not given.
@@ -338,7 +338,7 @@ class Replay:
         certify: bool = True,
         show: Callable[[SceneFrames], None] = lambda frames: None,
     ) -> None:
-        """Prepare the evaluation. If there are templates, the source is read once to find objects.
+        """Prepare the evaluation. Templates read the source once to find their objects.
 
         Args:
             keep_series: whether the robustness of all nodes at each sample is kept in memory.

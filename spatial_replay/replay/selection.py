@@ -465,7 +465,7 @@ class Selection:
         return merge([window_messages, sample_messages(trace, first)])
 
     def instances(self, file: Specification) -> list[Instance]:
-        """Return the instances of a specification. If there are templates, the source is read for objects.
+        """Return the instances of a specification. Templates read the source to find their objects.
 
         Raises:
             UsageError: the objects of a template are not given.

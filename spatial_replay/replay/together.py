@@ -140,8 +140,8 @@ class JointReplay:
 def can_join(files: Sequence[Specification], options: ReplayOptions) -> bool:
     """Return whether specifications can be measured over many logs at once.
 
-    Windows, templates and terms that look back exclude it. Templates have different instances in each log,
-    and terms that look back need earlier samples.
+    A window, a template or a term that looks back rules out joint measurement. Templates have different
+    instances in each log, and terms that look back need earlier samples.
     """
     has_templates = any(spec.parameter is not None for file in files for spec in file.results)
     return options.window.is_whole and not has_templates and not look_before(files)

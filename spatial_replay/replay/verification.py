@@ -465,7 +465,7 @@ def recorded_reading(log: Source, source: str) -> dict[str, Any]:
     """Return the recorded reading options of a log's source, such as the frame rate of a video.
 
     Args:
-        source: file name of a source. For another source than the recorded one, there are no options.
+        source: file name of a source. Only the recorded source has options.
     """
     log_record = dict(log.metadata()).get(METADATA, {})
     if log_record.get("source") != source:
@@ -499,7 +499,7 @@ def _options(log_record: Mapping[str, str]) -> dict[str, Any]:
 def _topics_of_copy(log_record: Mapping[str, str], options: Mapping[str, Any]) -> tuple[str, ...] | None:
     """Return the source's topics that a log keeps: none for a recording, by default all for a copy.
 
-    A layer has no selection of topics: None.
+    For a layer, the result is None.
     """
     if log_record.get("written_by") != "replay":
         return ()
