@@ -221,7 +221,11 @@ class TextVersions:
         )
         # autojunk would ignore frequent lines of long texts (https://docs.python.org/3/library/difflib.html)
         opcodes = SequenceMatcher(None, old_words, new_words, autojunk=False).get_opcodes()
-        changed_blocks = [(old_lines[a:b], new_lines[c:d]) for tag, a, b, c, d in opcodes if tag != "equal"]
+        changed_blocks = [
+            (old_lines[old_begin:old_end], new_lines[new_begin:new_end])
+            for tag, old_begin, old_end, new_begin, new_end in opcodes
+            if tag != "equal"
+        ]
         return _edited_places(
             max(changed_blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1])))
         )

@@ -450,10 +450,10 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
                 int(np.count_nonzero(is_only_in_b)),
             )
         )
-    never_ns = int(a.times_ns[-1]) + 1
+    after_end_ns = int(a.times_ns[-1]) + 1
     diffs.sort(
         key=lambda diff: (
-            never_ns if diff.apart_ns is None else diff.apart_ns,
+            after_end_ns if diff.apart_ns is None else diff.apart_ns,
             -diff.greatest_shift,
             diff.first_ns,
             diff.name,

@@ -638,10 +638,10 @@ def _spec_diff(
 ) -> SpecDiff:
     edit_outcomes = EditOutcomes(old_result, new_result, tree)
     old_outcome, new_outcome = EditOutcome.of(old_result), EditOutcome.of(new_result)
-    units = find_cause(tree, edit_outcomes, old_outcome, new_outcome)
+    cause_units = find_cause(tree, edit_outcomes, old_outcome, new_outcome)
 
     def with_edit(edit: Edit, *, is_undone: bool) -> EditOutcome | None:
-        """Return the outcome with only one edit, or without only this edit if `is_undone`.
+        """Return the outcome with only one edit. If `is_undone`, all edits except this edit are applied.
 
         The result is None if no mixed version of the text has exactly these edits.
         """
@@ -668,12 +668,12 @@ def _spec_diff(
             (with_edit(edit, is_undone=True), old_outcome),
         )
         return all(
-            outcome is not None and outcome.same_as(goal, verdict_only=verdict_only)
-            for outcome, goal in outcomes_and_goals
+            outcome is not None and outcome.same_as(wanted_outcome, verdict_only=verdict_only)
+            for outcome, wanted_outcome in outcomes_and_goals
         )
 
-    cause_edits = [(edit, unit) for unit in units for edit in tree.units[unit]]
-    if len(units) == 1 and len(cause_edits) > 1:
+    cause_edits = [(edit, unit) for unit in cause_units for edit in tree.units[unit]]
+    if len(cause_units) == 1 and len(cause_edits) > 1:
         # of several edits that share a node, one may be enough
         cause_edits = next(
             ([edit_with_unit] for edit_with_unit in cause_edits if suffices(edit_with_unit[0])), cause_edits

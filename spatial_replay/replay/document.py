@@ -253,11 +253,13 @@ def explain_results(
     if not results and node is None and object is None:
         return []
     if not results:
-        objects = ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
+        objects_text = (
+            ", ".join(sorted({result.object for result in replayed.results if result.object})) or "none"
+        )
         if object is None:
-            raise UsageError(f"there is no result; objects with a result of their own: {objects}")
+            raise UsageError(f"there is no result; objects with a result of their own: {objects_text}")
         raise UsageError(
-            f"no result is about object {object!r}; objects with a result of their own: {objects}"
+            f"no result is about object {object!r}; objects with a result of their own: {objects_text}"
         )
     explanations = [
         explain_node(result, node_id, first_ns=replayed.first_ns, goes_on=goes_on)
@@ -265,9 +267,11 @@ def explain_results(
         for node_id in _find_nodes(result, node)
     ]
     if not explanations:
-        names = {named_node.name for result in results for _, _, named_node in iter_nodes(result.formula)}
-        names.update(result.spec.id for result in results)
-        raise UsageError(no_such_node(node or "", sorted(name for name in names if name)))
+        node_names = {
+            named_node.name for result in results for _, _, named_node in iter_nodes(result.formula)
+        }
+        node_names.update(result.spec.id for result in results)
+        raise UsageError(no_such_node(node or "", sorted(name for name in node_names if name)))
     return explanations
 
 

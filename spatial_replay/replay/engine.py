@@ -83,7 +83,7 @@ _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 _SAMPLES_AT_ONCE, _RESULTS_AT_ONCE = 2**12, 2**16
 """Limits of messages that are written together, some 30 MB: samples, and samples times results.
 
-Small parts reuse the memory of earlier messages. Filling memory that is new from the system takes twice as long.
+Small parts reuse the memory of earlier messages. Filling new memory from the system takes twice as long.
 """
 
 

@@ -174,8 +174,8 @@ def first_sample_ns(source: Source) -> int:
     source = source.keeping()
     begin_ns = source.begin_ns
     # if the index has the log's begin, a short part is read before the whole log
-    for end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
-        for block in read_blocks(source, None, end_ns):
+    for search_end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
+        for block in read_blocks(source, None, search_end_ns):
             if len(block.trace):
                 return int(block.trace.times_ns[0])
     raise LogError(f"{source.name} has no sample")
