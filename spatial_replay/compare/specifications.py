@@ -469,7 +469,7 @@ def diff_over_source(
 
     Raises:
         UsageError: the versions have no common spec or different parameters of a template, the window has no
-            sample, or `evaluate` raises it.
+            sample, or `evaluate` raises this error.
         LogError: the log cannot be read.
         SpecificationError: the log lacks a name in the specifications, and names are strict.
     """

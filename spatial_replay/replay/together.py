@@ -62,7 +62,7 @@ class JointReplay:
         """Prepare the specifications.
 
         Args:
-            source: one of the logs. All logs need its units.
+            source: one of the logs. All logs need the units of this log.
 
         Raises:
             UsageError: see `Selection`.
