@@ -518,7 +518,6 @@ def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
 
 
 def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
-    """Return a sentence on the first difference of an object and its greatest distance."""
     sentence_parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
     if diff.greatest_shift:
         sentence_parts.append(f", by up to {with_unit(diff.greatest_shift, unit)}")
@@ -533,7 +532,6 @@ def _movement_sentence(diff: ObjectDiff, start_ns: int, unit: str) -> Sentence:
 
 
 def _signal_sentence(diff: SignalDiff, start_ns: int, unit: str) -> Sentence:
-    """Return a sentence on the first and the greatest difference of a signal, and on its unit."""
     sentence_parts: list[str | Instant] = [f"{diff.name}: differs since ", Instant(diff.first_ns, start_ns)]
     greatest_difference = diff.greatest_difference
     if greatest_difference > 0.0 and not names_from_unit(unit):

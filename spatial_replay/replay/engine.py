@@ -520,7 +520,6 @@ class Replay:
         return (self._first_message_ns, "this log") if start_ns is None else (start_ns, self._source.name)
 
     def _evaluate(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
-        """Yield each block with its samples and their evaluation."""
         with closing(self._selection.read_blocks(messages=messages, ends=self._run_ends)) as blocks:
             for block, trace in blocks:
                 yield block, trace, self._evaluation.extend(trace)
@@ -597,7 +596,6 @@ class _KeptTraces:
             self._traces.append(trace)
 
     def read(self) -> Iterator[Trace]:
-        """Iterate over all samples."""
         return self._selection.iter_traces() if self._traces is None else iter(self._traces)
 
 
