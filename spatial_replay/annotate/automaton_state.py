@@ -1,4 +1,4 @@
-"""Automata of results: their states after each sample as messages, and the automata as attachments."""
+"""Automata of results as attachments, and the states of automata after each sample as messages."""
 
 from __future__ import annotations
 

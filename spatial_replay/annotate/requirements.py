@@ -1,13 +1,13 @@
 """The requirements of a formula: its demands on objects and regions in a single sample.
 
-A formula without temporal operators concerns only the present sample. The largest such subformulas of a
-specification are its *requirements*. Each requirement has a sign: the sign in which the specification needs
-its robustness. Under a negation, or left of an implication, the specification needs low robustness. A
-requirement counts until its *obligation*, the largest temporal subformula around it, is permanently
-fulfilled.
+A formula without temporal operators concerns only the present sample. The *requirements* of a specification
+are its largest subformulas without temporal operators. Each requirement has a sign: the sign in which the
+specification needs the requirement's robustness. Under a negation, or left of an implication, the
+specification needs low robustness. A requirement counts until its *obligation*, the largest temporal
+subformula around it, is permanently fulfilled.
 
-A requirement that fails now is violated only if its obligation, and the conjunct of the specification around
-it, are permanently violated. A goal that is not reached yet is pending.
+A requirement that fails now is violated only if two formulas around the requirement are permanently violated:
+its obligation, and the conjunct of the specification. A goal that is not reached yet is pending.
 """
 
 from __future__ import annotations

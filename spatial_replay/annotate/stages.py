@@ -302,7 +302,7 @@ def _way(
     owed_propositions: Mapping[int, tuple[int, ...]],
     state: int,
 ) -> tuple[int, ...]:
-    """Return the propositions that a state owes, in the order of a path with few propositions per sample."""
+    """Return the propositions that a state owes, ordered by a path with few propositions per sample."""
     nearest = [
         target
         for target, propositions in targets.items()

@@ -1,7 +1,7 @@
 """Values in notebooks: `html` returns a cell's output, `plot` draws with matplotlib.
 
-Both dispatch on the type of the value. Each view is imported with the first value of its types. So a
-formula as HTML loads neither the planner nor matplotlib.
+Both dispatch on the type of the value. A view is imported with the first value of a type
+that the view registers. So a formula as HTML loads neither the planner nor matplotlib.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.tuning.tuned": "study_view",
     }
 )
-"""Views by the module whose types they register, relative to this package.
+"""Views, relative to this package, by the module whose types the view registers.
 
 Packages that import this package register their own views."""
 

@@ -262,7 +262,7 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
 
 
 def _write_names(ax: Axes, end_labels: Sequence[tuple[float, float, str]]) -> None:
-    """Write each name at its position (x, y, name), moved up or down if an earlier name is in its way."""
+    """Write names at positions (x, y, name). A name moves up or down to avoid earlier names."""
     # the transformation is final only after the aspect is applied
     ax.apply_aspect()
     inches_from_data = ax.transData + ax.figure.dpi_scale_trans.inverted()
@@ -299,7 +299,7 @@ def _trace_title(trace: Trace) -> str:
 
 
 def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
-    """Return the outlines of one observation; `rows` has only its row."""
+    """Return the outlines of one observation; `rows` has one row."""
     return rings_of(trace.footprints.select(rows), 0.0).rings_of(0)
 
 
@@ -575,7 +575,7 @@ def _last(values: Floats) -> float:
 
 
 def _apart(heights: Sequence[float]) -> list[float]:
-    """Move heights apart by at least `_GAP`. They keep their order, and none exceeds 1."""
+    """Move heights apart by at least `_GAP`. The order stays, and no height exceeds 1."""
     moved_heights = list(heights)
     height_order = sorted(range(len(heights)), key=heights.__getitem__)
     below = -np.inf
@@ -624,7 +624,7 @@ def automaton_html(automaton: Automaton) -> Html:
 
 
 def automaton_svg(automaton: Automaton) -> str | None:
-    """Return an automaton as SVG; None if it is large, or Graphviz is missing or fails."""
+    """Return an automaton as SVG; None for a large automaton, or if Graphviz is missing or fails."""
     if _is_large(automaton):
         return None
     try:

@@ -44,7 +44,7 @@ _MOST_RUNS: Final = 50
 _MOST_LINES: Final = 40
 """Limit of runs with a line at their change of verdict."""
 _MOST_MARGINS: Final = 10_000
-"""Limit of computed margins. With many runs it lowers the resolution, but not below 25 values."""
+"""Limit of computed margins. With many runs, the limit lowers the resolution, but not below 25 values."""
 
 
 @html.register(Tuning)
@@ -101,7 +101,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """Draw the values of constants for which runs have the right verdict.
 
     One constant gives a curve for each run. Two constants give the least margin as colours, and for each
-    run a line where its verdict changes. Lines of bad runs are dashed. A circle marks the tuned values.
+    run a line at the change of its verdict. Lines of bad runs are dashed. A circle marks the tuned values.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -114,7 +114,7 @@ def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
 
 
 def write_surface(tuning: Tuning, output: Path) -> None:
-    """Write a picture (.png, .svg) of the margins over the first two constants, or a page (.html) with it.
+    """Write a picture (.png, .svg) of margins over the first two constants, or a page (.html) with a picture.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -381,7 +381,7 @@ def _best_turn(gradient: GradientMap, target_turn: float | None) -> int:
 
 
 def _colour_limit(maps: Sequence[GradientMap]) -> float:
-    """Return the greatest absolute robustness in some maps, which has the full colours."""
+    """Return the greatest absolute robustness in some maps, which is drawn in the full colours."""
     values = np.abs(np.concatenate([gradient.values.ravel() for gradient in maps]))
     return float(values[np.isfinite(values)].max(initial=0.0)) or 1.0
 

@@ -370,8 +370,8 @@ class VideoFile:
         except (av.FFmpegError, ValueError) as error:
             if _lacks_index(path):
                 raise LogError(
-                    f"{self.name} has no index, which is written when a recording ends: it was not closed, or"
-                    " it breaks off; give the whole file, or record as .mkv or .ts, which need none"
+                    f"{self.name} has no index, which is written when a recording ends: the file was not"
+                    " closed, or is cut off; give the whole file, or record as .mkv or .ts, without an index"
                 ) from None
             raise LogError(
                 f"{self.name} is no video that can be read ({reason(error)}); give a file of a camera, such"

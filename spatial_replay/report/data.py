@@ -73,7 +73,7 @@ class ReportedResult:
     Attributes:
         tree: the reported tree with the result's name.
         file: the specification of the result.
-        sentences: explanation of the verdict; empty if the page does not explain it.
+        sentences: explanation of the verdict; empty without an explanation.
         witness: deciding path and atom; None without an explanation.
         unit: declared unit of the robustness; "" if none is declared.
         compiled: the automaton, or the reason why there is none.
@@ -102,9 +102,9 @@ class ReportedResult:
     def decided(self) -> WitnessStep | None:
         """The step at which the page opens; None without an explanation.
 
-        It is the end of the deciding path, or of the path to the atom closest to a missed response. If an
-        operator on the path takes its number from an earlier sample, the page opens at that operator, because
-        the operator did not fail before.
+        The step is the end of the deciding path, or of the path to the atom closest to a missed response. If
+        an operator on the path takes its number from an earlier sample, the page opens at that operator,
+        because the operator did not fail before.
         """
         if self.witness is None:
             return None
@@ -115,7 +115,7 @@ class ReportedResult:
 
     @property
     def deciding(self) -> DecidingAtom | None:
-        """The deciding atom, or for a missed response the atom closest to fulfilling it."""
+        """The deciding atom or, for a missed response, the atom closest to fulfilling the response."""
         if self.witness is None:
             return None
         return self.witness.deciding if self.witness.closest is None else self.witness.closest[0]
@@ -208,7 +208,7 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
 
     First come evenly spaced samples, a quarter of `most`, and the first and the last sample of each curve.
     Samples around changes of sign follow, up to five eighths of `most`. The extrema of each curve in equal
-    stretches come last. If the limit cuts a group, its samples are thinned evenly.
+    stretches come last. A group that exceeds the limit is thinned evenly.
 
     Args:
         times_ns: (T,) int64, times of all samples.
@@ -415,7 +415,7 @@ def _decided_text(reported: ReportedResult) -> str:
 
 
 def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
-    """Return the arrow at the deciding atom of an unsatisfied result, and the time at which it is visible."""
+    """Return the arrow at an unsatisfied result's deciding atom, with the time at which it is visible."""
     witness, deciding = reported.witness, reported.deciding
     if reported.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None

@@ -1,6 +1,6 @@
 """The HTML page of a report: header, verdicts and explanations as text, panels for the scripts to fill.
 
-Styles, scripts and data are in the page. Its policy forbids the browser to load anything else.
+Styles, scripts and data are in the page. The page's policy forbids the browser to load anything else.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
 
 
 def chip(verdict: str, *, is_sound: bool = True) -> Html:
-    """Return a verdict on its colour, or on a neutral colour if it is not sound."""
+    """Return a verdict on its colour; a verdict that is not sound has a neutral colour."""
     return element("span", verdict, **{"class": f"chip is-{verdict if is_sound else 'vacuous'}"})
 
 

@@ -77,7 +77,7 @@ from spatial_replay.text import cut, json_fields, with_unit
 Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 """Number types of arrays in the page: float64, float32, int32, uint16, uint8."""
 Reference: TypeAlias = Mapping[str, Any]
-"""Position of an array in the page: its kind, the offset of its first byte, and its count of numbers."""
+"""Position of an array in the page: kind of numbers, offset of the first byte, and count of numbers."""
 
 _LEVEL: Final = 6
 
@@ -106,8 +106,8 @@ def packed_bytes(array: NDArray[Any], kind: Kind) -> bytes:
     """Return the numbers of an array, by rows, as bytes that compress well; read.js unpacks them.
 
     The bits of a number are read as an unsigned integer. Differences of consecutive integers are written
-    plane by plane: first the lowest bytes of all differences, then the next bytes, and so on. These bytes
-    compress to 42 % of the size of plain numbers.
+    plane by plane: first the lowest bytes of all differences, then the next bytes, and so on. The result
+    compresses to 42 % of the size of plain numbers.
     """
     numbers = np.ascontiguousarray(array, f"<{kind}").ravel()
     codes = numbers.view(f"<u{numbers.itemsize}")
@@ -450,7 +450,7 @@ MOST_FRAMES: Final = 3_000
 MOST_CORNERS: Final = 2_000_000
 """Limit of outline corners in all frames together."""
 MOST_ARROWS: Final = 30_000
-"""Limit of arrows in all frames together; it sets the number of results with arrows, the worst first."""
+"""Limit of arrows in all frames together. The worst results have arrows, up to this limit."""
 _ABSENT: Final = 65_535
 _STEPS: Final = 65_535
 """Steps of a coordinate along each side of the scene: 16 bits, finer than any screen."""
@@ -484,7 +484,8 @@ class ReportedScene:
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
         """Add the next frame. `frame_of` computes the frame, and is called only for frames that are kept.
 
-        The last frame, of the finished log, has the time of the frame before it, and replaces that frame.
+        The last frame, of the finished log, has the time of the previous frame, and replaces the previous
+        frame.
         """
         if time_ns == self._last_ns:
             while self.frames and self.frames[-1][0] == time_ns:
@@ -515,7 +516,7 @@ class ReportedScene:
 
 
 class _Box(NamedTuple):
-    """The bounding box of a drawing: its lower left corner and its size, which is positive."""
+    """The bounding box of a drawing: lower left corner and positive size."""
 
     low: Floats
     size: Floats
@@ -602,7 +603,7 @@ def scene_value(
 
 
 def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
-    """Sort regions before objects, so that objects are drawn over them."""
+    """Sort regions before objects, so that objects are drawn over regions."""
     return not item[0].startswith(REGION), item[0]
 
 
@@ -738,7 +739,7 @@ class _Drawn(NamedTuple):
     Attributes:
         values: (rows, columns), robustness, NaN where blocked.
         low, high: lower left and upper right corner.
-        owner: candidate of the map; None if the log does not record it.
+        owner: candidate of the map; None if the log does not record the candidate.
         is_chosen: whether the decision's target was chosen on this map.
         fields: arrays (rows, columns) of the message by name.
     """
@@ -821,7 +822,10 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, map_count: int) -> bool:
-    """Return whether a decision's target was chosen on a map. Without an owner, it must be the only map."""
+    """Return whether a decision's target was chosen on a map.
+
+    A map without an owner must be the decision's only map.
+    """
     if not decision.HasField("target"):
         return False
     if owner is None:
@@ -831,7 +835,7 @@ def _is_chosen(owner: _Owner | None, decision: PlanDecision, map_count: int) -> 
 
 
 def _draw_map(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
-    """Return a map as numbers; None if its message has inconsistent or empty sizes."""
+    """Return a map as numbers; None for a message with inconsistent or empty sizes."""
     fields = map_fields(grid)
     robustness = fields.get("robustness")
     if robustness is None:

@@ -95,7 +95,7 @@ def refuse_output(output: Path, inputs: Sequence[Path] = ()) -> None:
     """Check the path of a report before the log is read.
 
     Raises:
-        UsageError: the output is not named .html or .htm, is an input or a folder, or its folder is missing.
+        UsageError: the output is not named .html or .htm, is an input or a folder, or is in a missing folder.
     """
     refuse_inputs(output, inputs)
     if output.suffix.lower() not in (".html", ".htm"):
@@ -281,7 +281,7 @@ def _about(diff: SpecificationDiff | LogDiff) -> str:
 
 
 def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> Iterator[Html]:
-    """Yield the changes, each with its headline and with sentences whose times are links."""
+    """Yield the changes, each with a headline and with sentences whose times are links."""
     if diff.is_empty:
         yield element("p", "Nothing differs.")
     if isinstance(diff, SpecificationDiff):
@@ -326,7 +326,7 @@ def _is_flipped(old: SpecResult, new: SpecResult) -> bool:
 def _change(
     title: str, verdicts: Sequence[str], sentences: Sequence[Sentence], first_ns: tuple[int, int]
 ) -> Html:
-    """Return one change with its verdict, or with both verdicts if they differ."""
+    """Return one change with its verdict, or with both verdicts if these differ."""
     verdict_chips = [mark for verdict in dict.fromkeys(verdicts) for mark in (text(" → "), chip(verdict))][1:]
     title_html = element("span", text(title), **{"class": "name"})
     summary = element("div", *verdict_chips, title_html, **{"class": "summary"})

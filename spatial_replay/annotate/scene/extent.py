@@ -148,7 +148,7 @@ def _finite_boxes(footprints: FootprintBatch) -> tuple[Floats, Floats]:
 
 
 def _in_steps(sides: Floats, size: float) -> Floats:
-    """Round nondecreasing lengths (T,) up to the first positive length times a power of `_STEP`.
+    """Round nondecreasing lengths (T,) up to steps: the first positive length times powers of `_STEP`.
 
     Args:
         size: size after the earlier samples; 0 without a size so far.
