@@ -274,7 +274,7 @@ def tune(
     seed: int = 0,
     **reading: Unpack[Reading],
 ) -> Tuning:
-    """Find constants with which all good runs satisfy a specification, and all bad runs violate it.
+    """Find constants for which all good runs satisfy a specification, and all bad runs violate it.
 
     With bad runs, the constants have the widest margin. The margin is the least of the good runs' robustness
     and the bad runs' negated robustness. With good runs only, the constants are the tightest constants that

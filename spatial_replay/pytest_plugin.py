@@ -1,6 +1,6 @@
 """A pytest plugin that collects suites named `*.replay.yaml`, with one test for each log and spec.
 
-Every run of pytest imports this module. It imports the package only if there is a suite.
+Every run of pytest imports this module. The module imports the package only for a suite.
 """
 
 from __future__ import annotations

@@ -356,7 +356,7 @@ _COMPARISONS: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = Mappi
 
 @dataclass(frozen=True, slots=True)
 class _Condition:
-    """Converts the syntax tree of a condition to an Arrow expression. Python executes nothing of it."""
+    """Converts the syntax tree of a condition to an Arrow expression. Python executes no part of it."""
 
     names: list[str]
     text: str

@@ -294,5 +294,5 @@ def _plan(
     show(f"the log: {planned_run.name} is {planned_run.verdict}")
     for name, verdict in planned_run.others.items():
         show(f"  {name}, of which the planner knew nothing, is {verdict}")
-    # a planner that timed out ended the run: an unreached goal is then no violation
+    # after a timeout of the planner, an unreached goal is no violation
     return exit_code_from_verdicts(["unknown" if planned_run.ended == "wait" else planned_run.verdict])

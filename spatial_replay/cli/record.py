@@ -223,7 +223,7 @@ def _open_cameras(
 
 
 def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the shift of each camera's stamps, ns. A common shift makes all of them 0 or more."""
+    """Return the shift of each camera's stamps, ns. All are moved together until none is negative."""
     offsets_ns = [0] * len(names)
     for text in texts:
         name, _, duration_text = text.rpartition("=")
