@@ -231,7 +231,7 @@ class _Position(NamedTuple):
 
     Attributes:
         sign: sign in which the formula needs the node; 0 for both signs.
-        needs_all_above: whether all operators above need all of their operands (see `_NEEDS_ALL`).
+        needs_all_above: whether each operator above needs all its operands (see `_NEEDS_ALL`).
         is_condition, is_invariant: see `Requirement`.
     """
 

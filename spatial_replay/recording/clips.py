@@ -354,6 +354,7 @@ class ClipLog(RecorderLog):
         self.held_bytes = 0
         self._newest_ns = self._evicted_ns = -1
         self._zero_ns: int | None = None
+        # time of the newest entry, ns, and its arrival on the monotonic clock, s
         self._latest_arrivals: dict[type, tuple[int, float]] = {}
         self._open: _OpenClip | None = None
         self._manual_triggers: deque[_ManualTrigger] = deque()

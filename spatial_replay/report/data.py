@@ -420,7 +420,7 @@ def _pointer_value(reported: ReportedResult, first_ns: int, lengths: str) -> Map
     if reported.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None
     if reported.decided != (witness.closest_path or witness.path)[-1]:
-        return None  # the atom's number is of an earlier sample, with the objects at other places
+        return None  # the number belongs to an earlier sample, with objects at other places
     contact = next(
         (measurement.contact for measurement in deciding.measured if measurement.contact is not None), None
     )

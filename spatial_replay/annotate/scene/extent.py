@@ -43,7 +43,7 @@ class SceneBounds(NamedTuple):
         return SceneBounds(*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist())
 
     def contains(self, footprints: FootprintBatch) -> bool:
-        """Return whether all footprints are certainly inside. A footprint with NaN corners is not."""
+        """Return whether all footprints are certainly inside; footprints with NaN corners are not inside."""
         radius = footprints.radius.max(initial=0.0)
         columns = zip(footprints.vertices.T, self[:2], self[2:], strict=True)
         return all(
