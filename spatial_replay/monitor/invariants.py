@@ -48,8 +48,7 @@ class ViolatedInterval:
         deciding: deciding atom at `worst_ns`. For a missed response, it is the atom that came closest to
             fulfilling the response. It is None after `MOST_EXPLAINED` intervals, and if no atom decides.
         deciding_ns: time of the sample in which this atom was measured.
-        place: contact point of the deciding atom. If that atom has none, it is the contact point of the
-            condition's atom, or None.
+        place: contact point of the deciding atom, else of the condition's atom, else None.
     """
 
     start_ns: int
@@ -109,7 +108,7 @@ def find_violated_invariants(
         leaves: (C, A, T), the instance's leaves.
         times_ns: (T,), T at least 1.
         goes_on: whether samples may follow; then only permanent violations count.
-        most: number of first intervals of each invariant that get a deciding atom.
+        most: number of intervals per invariant that get a deciding atom. They are the first intervals.
     """
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:

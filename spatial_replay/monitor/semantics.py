@@ -343,8 +343,8 @@ WIDTH = 11
 NOTHING = -1
 """Table entry for no upper bound, no column, and no row of pairs."""
 
-# codes of nodes; Boolean nodes have the codes of reports
-# nodes are not expanded, because Def. 16 gives a number to each node as written
+# codes of nodes. Boolean nodes have the codes of reports. Nodes are not expanded, because Def. 16 gives a
+# number to each node as written
 LEAF_NODE, TRUTH = 0, 1
 NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
 
@@ -560,7 +560,7 @@ def scan_until_by_pairs(
 _TILE = 256
 """Number of samples per call of the kernel."""
 _FIRST_ROOM = 1024
-"""Initial capacity of the columns, samples."""
+"""Initial capacity of the columns in samples."""
 MAX_PAIRS = 1 << 26
 """Limit on pairs of samples for which untils store a number: about 11,600 samples, 0.6 GB."""
 

@@ -391,7 +391,7 @@ def how_text(
         number: robustness of the atom.
         units: declared units (see `declared_unit`).
         past: whether the text is in the past tense.
-        is_violated: whether the atom decides a violation. The text on an atom that holds then begins with
+        is_violated: whether the atom decides a violation. If such an atom holds, the text begins with
             "must not hold".
     """
     outcome = ("held" if past else "holds") if number >= 0.0 else ("failed" if past else "fails")
@@ -681,7 +681,7 @@ def _flip(
 
 
 def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
-    """Return whether only a distance below 0, a depth of overlap, would flip a verdict."""
+    """Return whether only a negative distance, which is a depth of overlap, would flip a verdict."""
     is_distance = deciding.atom.relation in ("dist", "closeto", "farfrom") and threshold.is_written
     is_settled = threshold.verdict is not Verdict.UNKNOWN
     return is_distance and is_settled and threshold.flips_at < 0.0 <= threshold.value

@@ -110,8 +110,8 @@ def check_observations(
     """Check every observation on its own, and normalise its polygons.
 
     Returns:
-        whether each observation (R,) is readable, the footprints, and a fault by sample index for each
-        sample with an invalid observation.
+        whether each observation is readable (R,), the footprints, and the faults of invalid observations by
+        sample index.
     """
     is_readable = _finite(observed) & ~observed.invalid
     faults = _wrong_numbers(observed, is_readable)
@@ -205,8 +205,8 @@ def _normalise_shapes(
     if not fault_codes.any():
         return shapes, {}
     observation_of_part = np.repeat(np.arange(len(is_readable)), part_counts)
-    # few polygons are concave, so the slow decomposition treats them one by one
-    # unreadable parts stay unknown, and parts without vertices have a fault already
+    # few polygons are concave, so the slow decomposition treats them one by one. Unreadable parts stay
+    # unknown, and parts without vertices have a fault already
     faulty_parts = np.flatnonzero(
         (fault_codes != SOUND) & is_readable[observation_of_part] & (np.diff(vertex_start) > 0)
     )

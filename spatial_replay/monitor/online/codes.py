@@ -71,8 +71,8 @@ TABLE, WINDOWED = 0, 1  # see `signals`, `windows`
 # columns of reports: index of the signal or part; rule for the number `now`
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)
 REPORT_WIDTH = 5
-# codes of reports; reports are nodes as written, so `xor`, `->` and `<->` have codes, too
-# a row for each node of an expansion would cost eight numbers per sample
+# codes of reports. Reports are nodes as written, so `xor`, `->` and `<->` have codes, too. A row for each
+# node of an expansion would cost eight numbers per sample
 REPORT_SIGNAL, REPORT_PART = 0, 1
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(

@@ -46,9 +46,9 @@ RESULT_NOW = 1
 """Result row of a part's value at the newest sample. The value at the first sample is in row 0."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: HEAD has single numbers, and the other rows have one number for each node
-# the newest sample changed its own position, and the positions from CHANGED to before CHANGED_END
-# CHANGED_END is 0 if no earlier position changed
+# rows of the state: HEAD has single numbers, and the other rows have one number for each node. The newest
+# sample changed its own position, and the positions from CHANGED to before CHANGED_END. CHANGED_END is 0 if
+# no earlier position changed
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
 STARTS = 9  # two rows follow for each window in seconds: its first position, and its last position plus one
 # columns of HEAD: number of dropped samples, the base, whether any position is absorbed, and the number of

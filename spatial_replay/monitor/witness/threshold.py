@@ -367,8 +367,8 @@ class _Search:
         ]
         for number in sorted(flipping_numbers, key=lambda number: abs(number - dial.value)):
             candidates = list(filter(self._is_possible, _short_numbers(number, dial.value)))
-            # one of the first two candidates nearly always flips the verdict
-            # each candidate costs a measurement of all bindings
+            # one of the first two candidates nearly always flips the verdict, and each candidate costs a
+            # measurement of all bindings
             for candidate_batch in filter(None, (candidates[:2], candidates[2:])):
                 verdicts = self._verdicts(candidate_batch, is_shifted=False)
                 for candidate, verdict in zip(candidate_batch, verdicts, strict=True):
@@ -554,7 +554,7 @@ class _Search:
 
 
 def _bare(formula: Formula) -> tuple[Atom, int] | None:
-    """Return the atom of a leaf, and its sign; None if a leaf has more than quantifiers and negations."""
+    """Return the atom and the sign of a leaf with only quantifiers and negations above it; else None."""
     sign = 1
     while not isinstance(formula, Atom):
         if isinstance(formula, Boolean) and formula.operator == "not":
