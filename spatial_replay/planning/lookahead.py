@@ -1062,13 +1062,13 @@ class Lookahead:
         }
         hopeless_literals: list[tuple[int, bool]] = []
         budget = Budget(self._expected.budget.left * _HOPELESS_SHARE)
-        for number, wanted in sorted(literals):
+        for number, is_wanted in sorted(literals):
             # a literal that holds now is not hopeless; `is`, because None is unknown
-            if symbol[number] is (not wanted) and budget.left > 0:
-                cause = self._why_hopeless(self._start.sample, number, wanted, budget)
+            if symbol[number] is (not is_wanted) and budget.left > 0:
+                cause = self._why_hopeless(self._start.sample, number, is_wanted, budget)
                 if cause:
-                    hopeless_literals.append((number, wanted))
-                    self._causes[f"{self._automaton.propositions[number].literal(wanted)}: {cause}"] = None
+                    hopeless_literals.append((number, is_wanted))
+                    self._causes[f"{self._automaton.propositions[number].literal(is_wanted)}: {cause}"] = None
         self._expected.budget.spend(self._expected.budget.left * _HOPELESS_SHARE - budget.left)
         return tuple(hopeless_literals)
 
