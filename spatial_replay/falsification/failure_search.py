@@ -296,13 +296,13 @@ class Falsification(Printed):
 
     def _coverage_of(self, parameter: Parameter) -> Coverage:
         # the first run has no variation, and parameters can lack a value
-        values = [
+        values_with_robustness = [
             (value, run.robustness)
             for run in self.runs[1:]
             if (value := run.case[parameter.name]) is not None
         ]
         robustness_by_tenth: list[list[float]] = [[] for _ in range(TENTHS)]
-        for value, robustness in values:
+        for value, robustness in values_with_robustness:
             robustness_by_tenth[parameter.tenth_of(value)].append(robustness)
         return Coverage(
             parameter.name,
@@ -833,11 +833,11 @@ def search_failures(
 
 
 def _distinct(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    names = [parameter.name for parameter in parameters]
-    if not names:
+    parameter_names = [parameter.name for parameter in parameters]
+    if not parameter_names:
         raise UsageError("nothing is varied; name at least one parameter with its range")
-    for name in names:
-        if names.count(name) > 1:
+    for name in parameter_names:
+        if parameter_names.count(name) > 1:
             raise UsageError(f"--vary: {name!r} is given twice; give one range")
     return tuple(parameters)
 

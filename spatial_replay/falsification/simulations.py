@@ -314,12 +314,12 @@ class OwnSimulation:
         Raises:
             UsageError: the function returns something other than samples.
         """
-        values = {name: value for name, value in case.items() if value is not None}
-        samples = list(self.simulate(values))
+        case_values = {name: value for name, value in case.items() if value is not None}
+        samples = list(self.simulate(case_values))
         if not samples or not all(isinstance(sample, Sample) for sample in samples):
             result_text = f"{type(samples[0]).__name__} objects" if samples else "nothing"
             raise UsageError(f"{self.name} returns {result_text}; a simulation returns one Sample or more")
-        metadata = {"source": self.name, "options": json.dumps(values)}
+        metadata = {"source": self.name, "options": json.dumps(case_values)}
         return _simulated_case(samples, self.files, metadata)
 
     def command(self, case: Case) -> None:

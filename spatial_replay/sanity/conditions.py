@@ -182,9 +182,11 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
     match measurement:
         case SignedDistance() | Misalignment():
             kind = "min"
-            pairs = product(*map(members, measurement.terms))
+            term_pairs = product(*map(members, measurement.terms))
             # both kinds are symmetric; a fixed order of terms makes equal measurements equal values
-            member_measurements = [measurement.with_terms(*sorted(pair, key=repr)) for pair in pairs]
+            member_measurements = [
+                measurement.with_terms(*sorted(term_pair, key=repr)) for term_pair in term_pairs
+            ]
         case Protrusion():
             # an outer union is not split: the inner term may lie partly in one member and partly in another
             kind, outer = "max", plain(measurement.outer)
@@ -198,7 +200,9 @@ def _split_measurement(measurement: Measurement, regions: Mapping[str, Outline])
             member_measurements = [CentroidProjection(term, axis, kind) for term in terms]
         case _:
             return Linear(((measurement, Fraction(1)),))
-    return _least_or_greatest(kind, tuple(_shift(part, regions) for part in member_measurements))
+    return _least_or_greatest(
+        kind, tuple(_shift(member_measurement, regions) for member_measurement in member_measurements)
+    )
 
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
@@ -223,11 +227,13 @@ def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Meas
     """Return the distances of disjoint regions, and the protrusions of regions from enclosing regions."""
     terms = (term for atom in atoms for term in terms_of(atom.expression))
     region_terms = dict.fromkeys(term for term in map(without_radius, terms) if isinstance(term, RegionName))
-    pairs = list(permutations(region_terms, 2))
+    region_pairs = list(permutations(region_terms, 2))
     measurements: list[Measurement] = [
-        SignedDistance(*pair) for pair in pairs if repr(pair[0]) < repr(pair[1])
+        SignedDistance(*region_pair)
+        for region_pair in region_pairs
+        if repr(region_pair[0]) < repr(region_pair[1])
     ]
-    measurements += [Protrusion(*pair) for pair in pairs]
+    measurements += [Protrusion(*region_pair) for region_pair in region_pairs]
     measurement_values = (
         zip(measurements, _numbers_of(measurements, regions), strict=True) if measurements else ()
     )

@@ -424,46 +424,63 @@ class _Examiner:
         ]
         subjects = {part.name: _subject(part.formula) for part in faultless_parts}
         pairs = [
-            (first, second)
-            for first, second in combinations(faultless_parts, 2)
-            if subjects[first.name] & subjects[second.name]
+            (first_spec, second_spec)
+            for first_spec, second_spec in combinations(faultless_parts, 2)
+            if subjects[first_spec.name] & subjects[second_spec.name]
         ]
         if len(pairs) > MAX_PAIRS:
             self._notes.append(f"of {len(pairs)} pairs of specs, {MAX_PAIRS} were compared")
-        for first, second in pairs[:MAX_PAIRS]:
-            satisfying = [self._reading(part).satisfying for part in (first, second)]
-            violating = [self._reading(part).violating for part in (first, second)]
-            joint_answer = self._compare(first, "contradicts", second, *satisfying)
+        for first_spec, second_spec in pairs[:MAX_PAIRS]:
+            satisfying = [self._reading(part).satisfying for part in (first_spec, second_spec)]
+            violating = [self._reading(part).violating for part in (first_spec, second_spec)]
+            joint_answer = self._compare(first_spec, "contradicts", second_spec, *satisfying)
             if joint_answer is not None and joint_answer.word is None:
-                message = f"no run satisfies both {first.name} and {second.name}"
+                message = f"no run satisfies both {first_spec.name} and {second_spec.name}"
                 self._add(
                     "contradiction",
-                    (first.name, second.name),
-                    second.span,
+                    (first_spec.name, second_spec.name),
+                    second_spec.span,
                     joint_answer,
                     message,
                     _CONTRADICTION,
                 )
                 continue
-            forward_answer = self._compare(first, "implies", second, satisfying[0], violating[1])
-            backward_answer = self._compare(second, "implies", first, satisfying[1], violating[0])
+            forward_answer = self._compare(first_spec, "implies", second_spec, satisfying[0], violating[1])
+            backward_answer = self._compare(second_spec, "implies", first_spec, satisfying[1], violating[0])
             is_second_implied = forward_answer is not None and forward_answer.word is None
             is_first_implied = backward_answer is not None and backward_answer.word is None
             if is_second_implied and is_first_implied:
-                message = f"{second.name} says the same as {first.name}"
+                message = f"{second_spec.name} says the same as {first_spec.name}"
                 merged_answer = joint(
                     [answer for answer in (forward_answer, backward_answer) if answer is not None]
                 )
-                self._add("implied", (second.name, first.name), second.span, merged_answer, message, _SAME)
-            elif is_second_implied:
-                message = f"{second.name} follows from {first.name}"
                 self._add(
-                    "implied", (second.name, first.name), second.span, forward_answer, message, _IMPLIED
+                    "implied",
+                    (second_spec.name, first_spec.name),
+                    second_spec.span,
+                    merged_answer,
+                    message,
+                    _SAME,
+                )
+            elif is_second_implied:
+                message = f"{second_spec.name} follows from {first_spec.name}"
+                self._add(
+                    "implied",
+                    (second_spec.name, first_spec.name),
+                    second_spec.span,
+                    forward_answer,
+                    message,
+                    _IMPLIED,
                 )
             elif is_first_implied:
-                message = f"{first.name} follows from {second.name}"
+                message = f"{first_spec.name} follows from {second_spec.name}"
                 self._add(
-                    "implied", (first.name, second.name), first.span, backward_answer, message, _IMPLIED
+                    "implied",
+                    (first_spec.name, second_spec.name),
+                    first_spec.span,
+                    backward_answer,
+                    message,
+                    _IMPLIED,
                 )
 
     def _compare(self, first: NamedSpec, verb: str, second: NamedSpec, *runs: Runs | None) -> Answer | None:

@@ -676,8 +676,12 @@ def _atoms(spec: NamedSpec) -> list[Atom]:
 
 def _turned_names(atoms: Iterable[Atom]) -> list[str]:
     """Return the objects whose orientations are compared."""
-    parts = (part for atom in atoms for part in iter_expressions(atom.expression))
-    measurements = (part for part in parts if isinstance(part, Measurement) and part.needs_orientation)
+    expressions = (expression for atom in atoms for expression in iter_expressions(atom.expression))
+    measurements = (
+        expression
+        for expression in expressions
+        if isinstance(expression, Measurement) and expression.needs_orientation
+    )
     bases = (base_of(term) for measurement in measurements for term in measurement.terms)
     return [base.name for base in bases if isinstance(base, TrackedName)]
 

@@ -120,7 +120,7 @@ class _Tableau:
     def keeps(self, inequality: Inequality) -> bool:
         """Return whether the current values keep an inequality that is not strict."""
         real_part, epsilon_part = self._sum(
-            {self._quantity(key): factor for key, factor in inequality.coefficients}
+            {self._quantity(quantity): factor for quantity, factor in inequality.coefficients}
         )
         return not self._below((inequality.bound, 0), (real_part, epsilon_part))
 

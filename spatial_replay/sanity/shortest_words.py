@@ -415,9 +415,9 @@ class WordSearch:
 
         A side that disagrees with the run of the chosen sides is added to them.
         """
-        pairs = combinations(sides, 2) if len(sides) > 2 else ()
-        for pair in islice(pairs, MAX_PAIRS):
-            if self._short([pair]) is None and (answer := self._decide(pair)).word is None:
+        side_pairs = combinations(sides, 2) if len(sides) > 2 else ()
+        for side_pair in islice(side_pairs, MAX_PAIRS):
+            if self._short([side_pair]) is None and (answer := self._decide(side_pair)).word is None:
                 return answer
         chosen_sides = list(sides[-1:])
         while True:
@@ -620,10 +620,10 @@ class WordSearch:
 
     def _impossible(self, cube: Cube) -> frozenset[int] | None:
         """Return facts of a cube that exclude each other by geometry; None if geometry allows the cube."""
-        key = frozenset(cube.items())
-        if key not in self._conflicts_by_cube:
-            self._conflicts_by_cube[key] = self._ask_geometry(cube)
-        return self._conflicts_by_cube[key]
+        cube_key = frozenset(cube.items())
+        if cube_key not in self._conflicts_by_cube:
+            self._conflicts_by_cube[cube_key] = self._ask_geometry(cube)
+        return self._conflicts_by_cube[cube_key]
 
     def _parts(self, cube: Cube) -> list[Cube]:
         """Split a cube into parts without common terms or signals, so that no law connects two parts."""
@@ -788,15 +788,15 @@ def conjuncts(formula: Formula) -> tuple[Formula, ...]:
     """Return formulas whose conjunction is equal to a formula: `G a` and `G b` for `G (a and b)`."""
     match formula:
         case Boolean(operator="and" | "spec"):
-            return tuple(part for operand in formula.operands for part in conjuncts(operand))
+            return tuple(conjunct for operand in formula.operands for conjunct in conjuncts(operand))
         case Temporal(operator="G"):
-            parts = conjuncts(formula.operands[0])
+            operand_conjuncts = conjuncts(formula.operands[0])
             return tuple(
                 # `G (G a)` is `G a`
-                part
-                if formula.bound is None and isinstance(part, Temporal) and _is_always(part)
-                else replace(formula, operands=(part,))
-                for part in parts
+                conjunct
+                if formula.bound is None and isinstance(conjunct, Temporal) and _is_always(conjunct)
+                else replace(formula, operands=(conjunct,))
+                for conjunct in operand_conjuncts
             )
     return (formula,)
 

@@ -407,8 +407,8 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
         names = names_by_signal[equality.signal.name]
         number_by_text = {text_number(name): number for name, number in names.items()}
         if equality.value not in number_by_text:
-            what = f"no number of {equality.signal.name} is called {atom.parameters[-1]}"
-            faults.add(atom.span, what, f"its names are {', '.join(map(quote_name, names))}")
+            fault_text = f"no number of {equality.signal.name} is called {atom.parameters[-1]}"
+            faults.add(atom.span, fault_text, f"its names are {', '.join(map(quote_name, names))}")
             return atom
         numeric_equality = replace(equality, value=number_by_text[equality.value])
         return replace(

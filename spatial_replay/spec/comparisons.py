@@ -388,9 +388,9 @@ class ComparisonBuilder:
         self.resolver.fault(span_of(token), scope, "two measured numbers are hardly ever equal", hint)
 
     def _report_constants(self, written: ComparisonSyntax, scope: Scope) -> None:
-        names = [operand for operand in written.operands if isinstance(operand, Name)]
-        if names:
-            self._signal(names[0], scope)
+        name_operands = [operand for operand in written.operands if isinstance(operand, Name)]
+        if name_operands:
+            self._signal(name_operands[0], scope)
         else:
             hint = "compare a signal, a distance or a rate"
             self.resolver.fault(written.span, scope, "two constants are compared", hint)

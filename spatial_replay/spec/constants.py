@@ -41,18 +41,20 @@ def value_of(
         return written.value
     if isinstance(written, Name):
         return named(written)
-    values = [value_of(operand, named, report) for operand in written.operands]
-    if any(value is None for value in values):
+    operand_values = [value_of(operand, named, report) for operand in written.operands]
+    if any(value is None for value in operand_values):
         return None
     try:
-        result = _compute(written, [value for value in values if value is not None])
+        result = _compute(written, [value for value in operand_values if value is not None])
     except _ImpossibleError as fault:
         report(written.span, str(fault), "durations are added to durations, and multiplied by numbers")
     except (OverflowError, ZeroDivisionError) as fault:
         message = "division by zero" if isinstance(fault, ZeroDivisionError) else "a result that is too large"
         report(written.span, message, "numbers reach up to about 1.7e308, durations up to 9e9s")
     else:
-        constants = [name for value in values if isinstance(value, NamedNumber) for name in value.constants]
+        constants = [
+            name for value in operand_values if isinstance(value, NamedNumber) for name in value.constants
+        ]
         return NamedNumber(result, tuple(constants)) if constants and isinstance(result, float) else result
     return None
 

@@ -609,8 +609,8 @@ def _expansion(operator: str, operands: tuple[Formula, ...], bound: Bound | None
         case "with":
             return Boolean("and", operands)
         case "xor":
-            first_alone, last_alone = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
-            return Boolean("or", (first_alone, last_alone))
+            only_first, only_last = Boolean("and", (first, _not(last))), Boolean("and", (_not(first), last))
+            return Boolean("or", (only_first, only_last))
         case "<->":
             forward, backward = Boolean("or", (_not(first), last)), Boolean("or", (_not(last), first))
             return Boolean("and", (forward, backward))

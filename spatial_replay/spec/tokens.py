@@ -563,11 +563,11 @@ def _numbers(tokens: Sequence[Token]) -> list[str]:
 
 def _argument(tokens: Sequence[Token], start: int) -> str:
     """Return the text of arguments in brackets; `start` is the position after the opening bracket."""
-    depth, end = 1, start
-    while end < len(tokens) and depth:
-        depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
-        end += 1
-    return f"({_source_text(tokens[start : end - (depth == 0)])})"
+    depth, end_position = 1, start
+    while end_position < len(tokens) and depth:
+        depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end_position].type, 0)
+        end_position += 1
+    return f"({_source_text(tokens[start : end_position - (depth == 0)])})"
 
 
 def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> str:

@@ -366,10 +366,10 @@ class FittedLimits:
             ]
             member_indices: set[int] = set()
             if any(party.is_class for party in quantity.parties):
-                pairs = product(*party_members)
+                party_pairs = product(*party_members)
                 member_indices = {
                     index
-                    for pair in pairs
+                    for pair in party_pairs
                     if (index := index_by_relation.get((quantity.relation, pair), -1)) >= 0
                 }
             all_members.append(tuple(sorted(member_indices)))

@@ -559,11 +559,11 @@ class Margins:
             advance(1)
 
     def _parsed_at(self, point: Point) -> Specification | None:
-        values = {
+        value_by_name = {
             constant.name: constant.value(number) for constant, number in zip(self.varied, point, strict=True)
         }
         try:
-            return self._parse(values)
+            return self._parse(value_by_name)
         except SpecificationError:
             # such as a window with reversed ends, if both ends are constants
             return None
@@ -732,8 +732,8 @@ class Margins:
         for instance, sample_slice in prepared.instances.get(name, ()):
             leaves = leaf_values(scene, result.order, instance.bindings)
             times_ns = scene.trace.times_ns[sample_slice]
-            low, high = result.formula.evaluate(leaves[:, :, sample_slice], times_ns).ends(0)
-            lower, upper = min(lower, float(low[0])), min(upper, float(high[0]))
+            lower_ends, upper_ends = result.formula.evaluate(leaves[:, :, sample_slice], times_ns).ends(0)
+            lower, upper = min(lower, float(lower_ends[0])), min(upper, float(upper_ends[0]))
         return Robustness(lower, upper)
 
 

@@ -112,9 +112,9 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
             f"classes with more than {MOST_MEMBERS} objects: {', '.join(crowded_classes)}"
         )
     class_pairs = list(_class_pairs(classes, members, names, common_names))
-    pairs = _nearest_first(traces[0], [*combinations(map(Party, names), 2)])
-    measured_pairs = [*class_pairs[:most_pairs], *pairs[: max(0, most_pairs - len(class_pairs))]]
-    if missing_count := len(class_pairs) + len(pairs) - len(measured_pairs):
+    object_pairs = _nearest_first(traces[0], [*combinations(map(Party, names), 2)])
+    measured_pairs = [*class_pairs[:most_pairs], *object_pairs[: max(0, most_pairs - len(class_pairs))]]
+    if missing_count := len(class_pairs) + len(object_pairs) - len(measured_pairs):
         left_out_phrases.append(
             f"{plural(missing_count, 'pair')} of objects that come less near than "
             f"{len(measured_pairs):,} others"
@@ -203,8 +203,8 @@ def _quantities(a: Party, b: Party, profile: str, taken_names: set[str]) -> Iter
         yield _quantity(relation, a, b, profile, taken_names)
     ordered_pairs = [(a, b)] if a == b else [*permutations((a, b))]
     for relation in _ONE_WAY:
-        for first, second in ordered_pairs:
-            yield _quantity(relation, first, second, profile, taken_names)
+        for first_party, second_party in ordered_pairs:
+            yield _quantity(relation, first_party, second_party, profile, taken_names)
 
 
 def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken_names: set[str]) -> Quantity:
@@ -291,19 +291,26 @@ class Observed:
         sample_indices = np.unique(np.linspace(0, len(trace) - 1, _SAMPLED_OF_A_RUN).astype(np.int64))
         blocks: list[tuple[Floats, ...]] = []
         for start in range(0, len(quantities), block_size):
-            values = measure_both_ways(scene, quantities[start : start + block_size])
-            nominal_values = np.where(np.isfinite(values[0]), values[0], np.nan).mean(axis=0)
+            block_values = measure_both_ways(scene, quantities[start : start + block_size])
+            nominal_values = np.where(np.isfinite(block_values[0]), block_values[0], np.nan).mean(axis=0)
             is_known = np.isfinite(nominal_values)
             block_travel = np.where(is_known, nominal_values, -np.inf).max(axis=1) - np.where(
                 is_known, nominal_values, np.inf
             ).min(axis=1)
-            block_ends = values.min(axis=3), values.max(axis=3), values[..., 0], values[..., -1]
-            blocks.append((*block_ends, values[:, 0][..., sample_indices], np.maximum(block_travel, 0.0)))
+            block_ends = (
+                block_values.min(axis=3),
+                block_values.max(axis=3),
+                block_values[..., 0],
+                block_values[..., -1],
+            )
+            blocks.append(
+                (*block_ends, block_values[:, 0][..., sample_indices], np.maximum(block_travel, 0.0))
+            )
         # the axis of the quantities in each array
         quantity_axes = (2, 2, 2, 2, 1, 0)
         least, greatest, first, last, sampled, travel = (
-            np.concatenate(parts, quantity_axis)
-            for parts, quantity_axis in zip(zip(*blocks, strict=True), quantity_axes, strict=True)
+            np.concatenate(quantity_blocks, quantity_axis)
+            for quantity_blocks, quantity_axis in zip(zip(*blocks, strict=True), quantity_axes, strict=True)
         )
         shifts = {name: _shift(trace, column) for column, name in enumerate(trace.names)}
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
@@ -315,8 +322,10 @@ class Observed:
             direction: 0 for the quantity, 1 for its negative.
             surely: whether the lower end is compared with the limit instead of the upper end.
         """
-        values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
-        is_reached = values >= limit if surely else values > limit
+        run_values = measure_both_ways(TraceScene(self.trace, {}), [quantity])[
+            direction, 0 if surely else 1, 0
+        ]
+        is_reached = run_values >= limit if surely else run_values > limit
         return int(is_reached.argmax()) if is_reached.any() else len(is_reached)
 
 
@@ -362,5 +371,7 @@ def robustness_of(formula: Formula, trace: Trace) -> tuple[float, float]:
     """Return the lower and upper end of a formula's robustness over a whole run, as in a replay."""
     leaf_formulas = new_leaves(formula, ())
     leaves = leaf_values(TraceScene(trace, {}), leaf_formulas, {})
-    low, high = OfflineFormula.of(formula, leaf_formulas).evaluate(leaves, trace.times_ns).ends(0)
-    return float(low[0]), float(high[0])
+    lower_ends, upper_ends = (
+        OfflineFormula.of(formula, leaf_formulas).evaluate(leaves, trace.times_ns).ends(0)
+    )
+    return float(lower_ends[0]), float(upper_ends[0])

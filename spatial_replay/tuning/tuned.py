@@ -437,16 +437,16 @@ class Search:
         margin = self._margins.margin
         good, bad = self._good, self._bad
         while first_looseness < last_looseness:
-            middle = (first_looseness + last_looseness) // 2
+            middle_looseness = (first_looseness + last_looseness) // 2
             least_good = min(margin(run, at(last_looseness)) for run in good) if good else np.inf
             least_bad = min(margin(run, at(first_looseness)) for run in bad)
             good = [run for run in good if margin(run, at(first_looseness)) <= least_good]
             bad = [run for run in bad if margin(run, at(last_looseness)) <= least_bad]
-            good_margin = min((margin(run, at(middle)) for run in good), default=np.inf)
-            if good_margin >= min(margin(run, at(middle)) for run in bad):
-                last_looseness = middle
+            good_margin = min((margin(run, at(middle_looseness)) for run in good), default=np.inf)
+            if good_margin >= min(margin(run, at(middle_looseness)) for run in bad):
+                last_looseness = middle_looseness
             else:
-                first_looseness = middle + 1
+                first_looseness = middle_looseness + 1
         return first_looseness
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
@@ -566,21 +566,24 @@ class Search:
             best_candidate = max(best_candidate, (least_margin, moved_point))
             return good_margin - bad_margin
 
-        low, high = 0, self._steps[axis]
-        low_excess, high_excess = excess(low), excess(high)
+        low_looseness, high_looseness = 0, self._steps[axis]
+        low_excess, high_excess = excess(low_looseness), excess(high_looseness)
         if low_excess >= 0.0 or high_excess < 0.0:
             return best_candidate
         for step in range(_SECANTS):
-            if high - low <= 1:
+            if high_looseness - low_looseness <= 1:
                 break
             # every third step is a bisection, because secants can leave one end in place for many steps
             fraction = 0.5 if step % 3 == 2 else low_excess / (low_excess - high_excess)
             # strictly between the ends, so that the interval always shrinks
-            middle = min(max(low + round(fraction * (high - low)), low + 1), high - 1)
-            if (middle_excess := excess(middle)) >= 0.0:
-                high, high_excess = middle, middle_excess
+            middle_looseness = min(
+                max(low_looseness + round(fraction * (high_looseness - low_looseness)), low_looseness + 1),
+                high_looseness - 1,
+            )
+            if (middle_excess := excess(middle_looseness)) >= 0.0:
+                high_looseness, high_excess = middle_looseness, middle_excess
             else:
-                low, low_excess = middle, middle_excess
+                low_looseness, low_excess = middle_looseness, middle_excess
         return best_candidate
 
     def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
@@ -951,10 +954,12 @@ def _undecided_constants(margins: Margins, search: Search, found: Found) -> dict
         return kept_numbers
     for axis, constant in enumerate(margins.varied):
         point = tuple(kept_numbers.get(other_axis, number) for other_axis, number in enumerate(found.point))
-        low, high = search.interval(point, axis)
-        is_free = {1: high == constant.steps, -1: low == 0}.get(margins.directions[axis] or 0, False)
-        if (low, high) == (0, constant.steps) or is_free:
-            kept_numbers[axis] = min(max(constant.start, low), high)
+        low_index, high_index = search.interval(point, axis)
+        is_free = {1: high_index == constant.steps, -1: low_index == 0}.get(
+            margins.directions[axis] or 0, False
+        )
+        if (low_index, high_index) == (0, constant.steps) or is_free:
+            kept_numbers[axis] = min(max(constant.start, low_index), high_index)
     return kept_numbers
 
 
@@ -982,9 +987,11 @@ def require_comparable(runs: Sequence[LabelledRun], remedy: str) -> None:
     """
     if len(runs) > MOST_RUNS:
         raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; {remedy} some of them")
-    samples = sum(len(run.trace) for run in runs)
-    if samples > MOST_SAMPLES:
-        raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; {remedy} some of them")
+    sample_count = sum(len(run.trace) for run in runs)
+    if sample_count > MOST_SAMPLES:
+        raise UsageError(
+            f"the runs have {sample_count} samples, more than {MOST_SAMPLES}; {remedy} some of them"
+        )
     for run in runs[1:]:
         require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
 
@@ -1005,15 +1012,17 @@ def _tuning(
     tuned_constants = []
     for axis, constant in enumerate(margins.varied):
         value_index = found.point[axis]
-        low, high = search.interval(found.point, axis) if found.is_held else (value_index, value_index)
+        low_index, high_index = (
+            search.interval(found.point, axis) if found.is_held else (value_index, value_index)
+        )
         duration_ns = constant.written.duration_ns
         tuned_constants.append(
             TunedConstant(
                 constant.name,
                 constant.value(value_index),
                 constant.written.value if duration_ns is None else text_of_constant(constant.written),
-                constant.value(low),
-                constant.value(high),
+                constant.value(low_index),
+                constant.value(high_index),
                 (constant.value(0), constant.value(constant.steps)),
                 _number(constant.step, duration_ns),
                 margins.directions[axis],
