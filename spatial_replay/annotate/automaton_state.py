@@ -93,7 +93,7 @@ class AutomatonRun:
         self._is_possible[automaton.initial] = True
         self._are_all_nodes = all(self._is_proposition_node)
         self._state: int | None = automaton.initial
-        # whether `_state` is newer than `_is_possible`, because `step` updates only `_state`
+        # whether `_state` is newer than `_is_possible`; `step` updates only `_state`
         self._is_behind = False
         self._cached_template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         state_sets = (automaton.accepting, automaton.can_accept, automaton.can_reject)

@@ -54,7 +54,9 @@ from spatial_replay.spec.walks import (
 def unify_regions(
     formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
 ) -> tuple[list[Formula], dict[str, Outline]]:
-    """Rename regions of formulas that have another shape in `others`. The formulas' texts do not change.
+    """Rename regions in formulas if `others` has another shape of the same name.
+
+    The formulas' texts do not change.
 
     Returns:
         The formulas, and the regions of both sides by name.

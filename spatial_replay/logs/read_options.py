@@ -188,7 +188,7 @@ _MORE = re.compile(r"… and (\d+) more faults? of")
 
 
 def count_of(faults: Sequence[str]) -> int:
-    """Count faults, including the later faults that the last line counts."""
+    """Return the number of faults; the last line may stand for several further faults."""
     more_match = _MORE.match(faults[-1]) if faults else None
     return len(faults) + (int(more_match[1]) - 1 if more_match else 0)
 

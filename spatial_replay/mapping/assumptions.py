@@ -504,8 +504,8 @@ def _covariances(evidence: TopicEvidence, log: Log) -> str | None:
 
 def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
     arrivals, extractor, layout = evidence.arrivals, evidence.reader.extractor, evidence.planned.layout
-    # few returns are no evidence, because each file of a bag has its own channels, and a publisher may be
-    # replaced
+    # a few changes back to an earlier channel do not show two publishers: each file of a bag has its own
+    # channels, and a publisher may be replaced
     if arrivals.returns < max(_FEW, _IN_TURN * arrivals.messages):
         return None
     shares_names = extractor is None or extractor.namer.is_constant or evidence.motions.returns > 0

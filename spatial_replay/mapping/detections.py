@@ -466,8 +466,8 @@ def detections_from_chunks(
     """Join the chunks of a batch into columns.
 
     Args:
-        good: (N,) whether each message of the batch was read. Message indices of the result count good
-            messages.
+        good: (N,) whether each message of the batch was read. A message index of the result is a position
+            among the good messages.
     """
     good_number = np.cumsum(good) - 1
     deletions = [

@@ -376,7 +376,10 @@ _MOST_AVERAGED: Final = 30
 _MOST_NAMED: Final = 8
 
 _LATE: Final = 8
-"""Number of frames whose largest misfit counts, because one frame has only four degrees of freedom."""
+"""Number of latest frames whose largest misfit is used.
+
+The misfit of a single frame is uncertain, because it has only four degrees of freedom.
+"""
 
 _SHARED: Final = 1.2
 """Ratio of a pose's error to its misfit; a codec moves blocks of pixels, so corners share errors.

@@ -427,7 +427,8 @@ class VideoFile:
         last_ns = previous_ns = -1
         first_stamp_ns, frame_count, longest_gap_ns = None, 0, 0
         untrue = Untrue()
-        # a frame that is not true waits for the next frame, because the last frame of a cut file is dropped
+        # a frame that depends on a missing or damaged frame waits for the next frame, because the last frame
+        # of a cut file is dropped
         waiting_frame: Frame | None = None
         try:
             length_ns = self._length_ns()

@@ -218,7 +218,7 @@ def _transitive(
                 yield _law((first_step, -1), (second_step, -1))
             # heights matter between a and c, but not in steps over a region b without a height
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
-            # a chain that leads to no measured protrusion of a adds no information
+            # a chain adds no information if it leads to no measured protrusion of `a`
             is_nested = isinstance(b, RegionName) and isinstance(c, RegionName)
             is_useful = (
                 is_nested

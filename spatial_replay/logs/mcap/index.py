@@ -69,7 +69,7 @@ class ChunkPlace(NamedTuple):
         start_ns, end_ns: log times of the first and the last message.
         compressed: whether the place is a chunk; False for messages outside chunks.
         channels: channels of the messages, from the index; None if the index lists no channels.
-        has_checksum: whether the chunk must have a checksum, as in our own logs.
+        has_checksum: whether a chunk without a checksum is damaged, as in our own logs.
         size: decompressed size of a chunk, from the index or its head, bytes; 0 outside chunks.
     """
 

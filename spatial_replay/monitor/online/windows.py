@@ -753,7 +753,7 @@ def run_windows(
 def _reach(
     rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last_sample: int
 ) -> bool:
-    """Find the positions of each node that the root needs at its positions root_low … root_high.
+    """Find, for each node, the first and the last position that the root needs at root_low … root_high.
 
     The positions are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before boundaries and states are included.
 
