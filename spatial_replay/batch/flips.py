@@ -101,8 +101,8 @@ class RunDiff:
             if changes:
                 yield f"{kind}:"
             for change in changes[: _LISTED[kind]]:
-                result = change.difference
-                yield f"  {result.log}: {result_name(result.spec, result.object)}: {change.text}"
+                difference = change.difference
+                yield f"  {difference.log}: {result_name(difference.spec, difference.object)}: {change.text}"
                 if change.reason and kind in ("flipped", "less"):
                     yield f"      {change.reason}"
             if len(changes) > _LISTED[kind]:

@@ -19,11 +19,11 @@ _LONG_PAUSE: Final = 2.0
 
 def evidence_lines(overview: Overview) -> Iterator[str]:
     """Yield lines for each mapped topic of a log; topics that contradict an assumption come first."""
-    first_ns, unit = overview.start_ns or 0, overview.axes.units.get("", "")
+    log_start_ns, unit = overview.start_ns or 0, overview.axes.units.get("", "")
     contradictions = {facts.topic: list(_contradictions(overview, facts.topic)) for facts in overview.facts}
     for facts in sorted(overview.facts, key=lambda facts: not contradictions[facts.topic]):
-        yield escape_text(f"{facts.topic}: {_arrivals(facts, first_ns)}")
-        for label, text in (*contradictions[facts.topic], *_rows(facts, unit, first_ns)):
+        yield escape_text(f"{facts.topic}: {_arrivals(facts, log_start_ns)}")
+        for label, text in (*contradictions[facts.topic], *_rows(facts, unit, log_start_ns)):
             if text:
                 yield escape_text(f"  {label:<12}{text}")
 
@@ -40,18 +40,18 @@ def _contradictions(overview: Overview, topic: str) -> Iterator[tuple[str, str]]
             yield "REMARK", remark.removeprefix(prefix)
 
 
-def _arrivals(facts: TopicFacts, first_ns: int) -> str:
+def _arrivals(facts: TopicFacts, log_start_ns: int) -> str:
     messages_text, period_s = plural(facts.messages, "message"), facts.period_s
     if facts.first_ns is None or facts.last_ns is None or period_s is None:
         return messages_text
-    span_text = f"from {time_text(facts.first_ns, first_ns)} to {time_text(facts.last_ns, first_ns)}"
+    span_text = f"from {time_text(facts.first_ns, log_start_ns)} to {time_text(facts.last_ns, log_start_ns)}"
     is_pause = period_s.greatest > _LONG_PAUSE * period_s.median and period_s.greatest_ns is not None
-    pause_end = f", until {time_text(period_s.greatest_ns or 0, first_ns)}" if is_pause else ""
+    pause_end = f", until {time_text(period_s.greatest_ns or 0, log_start_ns)}" if is_pause else ""
     longest_text = f"at most {number_text(period_s.greatest)} s apart{pause_end}"
     return f"{messages_text} {span_text}, every {number_text(period_s.median)} s, {longest_text}"
 
 
-def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, str]]:
+def _rows(facts: TopicFacts, unit: str, log_start_ns: int) -> Iterator[tuple[str, str]]:
     """Yield a label and a text for each kind of facts. The text of a missing kind is ""."""
     if facts.lateness_s is not None:
         yield "lateness", f"{_range(facts.lateness_s, 's')} after the stamps"
@@ -73,11 +73,11 @@ def _rows(facts: TopicFacts, unit: str, first_ns: int) -> Iterator[tuple[str, st
         ", ".join(f"{axis} {number_text(low)} to {number_text(high)}" for axis, low, high in axis_ranges),
     )
     if facts.speed is not None:
-        yield "speed", _motion(facts.speed, f"{unit}/s" if unit else "a second", first_ns)
+        yield "speed", _motion(facts.speed, f"{unit}/s" if unit else "a second", log_start_ns)
     if facts.turn_rate is not None:
         least, median, greatest = map(math.degrees, facts.turn_rate[:3])
         turn_rate = facts.turn_rate._replace(least=least, median=median, greatest=greatest)
-        yield "turning", _motion(turn_rate, "deg/s", first_ns)
+        yield "turning", _motion(turn_rate, "deg/s", log_start_ns)
     if facts.bottom is not None and facts.top is not None:
         yield "heights", f"{number_text(facts.bottom.least)} to {with_unit(facts.top.greatest, unit)}"
     if facts.uncertainty is not None:
@@ -91,6 +91,6 @@ def _range(numbers: Distribution, unit: str) -> str:
     return f"{least_text} to {greatest_text} (median {number_text(numbers.median)})"
 
 
-def _motion(numbers: Distribution, unit: str, first_ns: int) -> str:
-    at_text = "" if numbers.greatest_ns is None else f" at {time_text(numbers.greatest_ns, first_ns)}"
+def _motion(numbers: Distribution, unit: str, log_start_ns: int) -> str:
+    at_text = "" if numbers.greatest_ns is None else f" at {time_text(numbers.greatest_ns, log_start_ns)}"
     return f"median {with_unit(numbers.median, unit)}, at most {with_unit(numbers.greatest, unit)}{at_text}"

@@ -660,19 +660,19 @@ class _Silences:
         if self._fallback_begin_ns is None:
             begin_ns = min(int(pending.times_ns.min(initial=LATEST_NS)) for pending in self._fallback_pending)
             self._fallback_begin_ns = begin_ns if begin_ns <= upto_ns else None
-        is_filled = self._silences(times_ns, known_ns, is_last=is_last)
+        is_silence_filled = self._silences(times_ns, known_ns, is_last=is_last)
         if is_last:
-            if len(times_ns) and not is_filled[-2] and times_ns[-1] < self._window_ns[1]:
+            if len(times_ns) and not is_silence_filled[-2] and times_ns[-1] < self._window_ns[1]:
                 # reading ended after the longest limit, so this silence is too long if the log goes on
-                is_filled[-2] = self.goes_on()
+                is_silence_filled[-2] = self.goes_on()
         elif len(times_ns):
             # until the silence after the last message is decided, samples end at that message
             last_ns = int(times_ns[-1])
-            upto_ns = upto_ns if last_ns > upto_ns or is_filled[-2] else last_ns
-        elif self._fallback_begin_ns is not None and not is_filled[-1]:
+            upto_ns = upto_ns if last_ns > upto_ns or is_silence_filled[-2] else last_ns
+        elif self._fallback_begin_ns is not None and not is_silence_filled[-1]:
             # it is not yet decided whether samples begin at fallback topics
             upto_ns = min(upto_ns, self._fallback_begin_ns - 1)
-        self._times_ns, self._is_filled = times_ns, is_filled
+        self._times_ns, self._is_filled = times_ns, is_silence_filled
         # past messages stay past, even if this request ends before an earlier request
         past_ns = max(upto_ns, int(self._past_ns.max(initial=-1)))
         self._past_ns = times_ns[times_ns <= past_ns][-2:]

@@ -197,14 +197,14 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
 def last_sample_warnings(specification: Specification) -> Iterator[Diagnostic]:
     """Yield a warning for each `F G p` and `G F p`: over a finite log both mean p at the last sample."""
     source = SourceText.of(specification.source, specification.filename)
-    warned: set[Span] = set()
+    warned_spans: set[Span] = set()
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):
             operand = operands_of(formula)[0] if _is_unbounded(formula) else formula
             operators = f"{operator_of(formula)} {operator_of(operand)}"
-            if operators not in ("F G", "G F") or not _is_unbounded(operand) or formula.span in warned:
+            if operators not in ("F G", "G F") or not _is_unbounded(operand) or formula.span in warned_spans:
                 continue
-            warned.add(formula.span)
+            warned_spans.add(formula.span)
             message = f"`{operators} p` asks for the last sample of a log alone"
             yield source.diagnostic("warning", formula.span, message, _LASTING[operators])
 

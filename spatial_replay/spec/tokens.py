@@ -376,8 +376,8 @@ def foreign_token_advice(
         return message, f"a flag is a number: {earlier.value} {previous.value} {int(token.value == 'true')}"
     if token.value == "dist" and _is_quoted(token):
         return message, f"a relation stands without quotes: {previous.value} dist {following.value or 'b'}"
-    if token.type == "NUMBER" and (operator := _AT_TIMES.get(previous.value.lower())):
-        return message, f"a window stands behind its operator: {operator.format(token.value)} (...)"
+    if token.type == "NUMBER" and (template := _AT_TIMES.get(previous.value.lower())):
+        return message, f"a window stands behind its operator: {template.format(token.value)} (...)"
     if previous.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
         return f"{token.value!r} is {kind}, so no name for a {previous.value}", "give it another name"
@@ -389,8 +389,10 @@ def foreign_token_advice(
     if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
         return _meant_definition(tokens, position)
     if previous.type == "NUMBER" and token.type == "NAME":
-        per = tokens[position + 2].value if following.type == "SLASH" and position + 2 < len(tokens) else ""
-        hint = unit_hint(previous.value, token.value, per)
+        time_unit = (
+            tokens[position + 2].value if following.type == "SLASH" and position + 2 < len(tokens) else ""
+        )
+        hint = unit_hint(previous.value, token.value, time_unit)
         return f"{token.value!r} is no unit here", hint or f"only s and ms are units: leave out {token.value}"
     if (
         token.type == "COMMA"

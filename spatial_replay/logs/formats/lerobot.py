@@ -276,13 +276,13 @@ def _episode_rows(path: Path) -> Iterator[Mapping[str, Any]]:
     # repair tools add tables with other names
     files = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
     if files:
-        library = arrow()
+        pyarrow = arrow()
         for file in files:
             try:
-                column_names = library.parquet.read_schema(file).names
+                column_names = pyarrow.parquet.read_schema(file).names
                 columns = [name for name in column_names if name in _EPISODE_COLUMNS]
-                yield from library.parquet.read_table(file, columns=columns).to_pylist()
-            except library.ArrowException as error:
+                yield from pyarrow.parquet.read_table(file, columns=columns).to_pylist()
+            except pyarrow.ArrowException as error:
                 raise LogError(f"{file.relative_to(path)} cannot be read: {error}") from None
         return
     for number, line in enumerate(read_head(path / "meta" / "episodes.jsonl").splitlines(), 1):
@@ -301,15 +301,15 @@ def _read_columns(file: Path, names: AbstractSet[str]) -> dict[str, Floats]:
     Raises:
         LogError: the file cannot be read, or is too large.
     """
-    library = arrow()
+    pyarrow = arrow()
     try:
-        with library.parquet.ParquetFile(file) as parquet:
+        with pyarrow.parquet.ParquetFile(file) as parquet:
             schema, row_count = parquet.schema_arrow, parquet.metadata.num_rows
             present_names = [name for name in schema.names if name in names]
             if 8 * row_count * max(1, len(present_names)) > MOST_BYTES:
                 raise LogError(f"{file.name} has {row_count:,} rows; split it into smaller files")
             table = parquet.read(columns=present_names)
-    except (OSError, library.ArrowException) as error:
+    except (OSError, pyarrow.ArrowException) as error:
         raise LogError(
             f"{file.name} cannot be read: {str(error).splitlines()[0].rstrip('.')}; download it again"
         ) from None

@@ -192,37 +192,37 @@ class _Tables(_Minari):
 
     def _columns(self, episode: Episode) -> dict[str, Any]:
         """Return the columns of an episode; each field of a struct is a separate column."""
-        library, folder = arrow(), self.home / episode.key
+        pyarrow, folder = arrow(), self.home / episode.key
         files = sorted([*folder.glob("*.arrow"), *folder.glob("*.parquet")])
         if not files:
             raise LogError(f"{self.name}#{episode.number}: {folder.name} has no data; download it again")
         try:
-            table = library.concat_tables([_table(file, library) for file in files])
+            table = pyarrow.concat_tables([_table(file, pyarrow) for file in files])
             # a damaged file can have offsets outside its buffers
             table.validate(full=True)
-            return dict(_leaves(table, library))
-        except (OSError, ValueError, library.ArrowException) as error:
+            return dict(_leaves(table, pyarrow))
+        except (OSError, ValueError, pyarrow.ArrowException) as error:
             reason = str(error).splitlines()[0]
             place = f"{self.name}#{episode.number}"
             raise LogError(f"{place} cannot be read: {reason}; download it again") from None
 
 
-def _leaves(table: Any, library: Any) -> Iterator[tuple[str, Any]]:
+def _leaves(table: Any, pyarrow: Any) -> Iterator[tuple[str, Any]]:
     pending_columns = [(name, table.column(name)) for name in reversed(table.column_names)]
     while pending_columns:
         name, column = pending_columns.pop()
-        if not library.types.is_struct(column.type):
+        if not pyarrow.types.is_struct(column.type):
             yield name, column
             continue
         field_names = [column.type.field(index).name for index in range(column.type.num_fields)]
         pending_columns += [
-            (f"{name}/{field_name}", library.compute.struct_field(column, [index]))
+            (f"{name}/{field_name}", pyarrow.compute.struct_field(column, [index]))
             for index, field_name in reversed(list(enumerate(field_names)))
         ]
 
 
-def _table(file: Path, library: Any) -> Any:
+def _table(file: Path, pyarrow: Any) -> Any:
     if file.suffix == ".parquet":
-        return library.parquet.read_table(file)
-    with library.OSFile(str(file)) as stream, library.ipc.open_file(stream) as reader:
+        return pyarrow.parquet.read_table(file)
+    with pyarrow.OSFile(str(file)) as stream, pyarrow.ipc.open_file(stream) as reader:
         return reader.read_all()

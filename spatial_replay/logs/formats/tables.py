@@ -56,18 +56,18 @@ def arrow() -> Any:
 
 def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     """Return a column as (T,) or (T, W) float64, null as NaN; None for texts, or lists of several lengths."""
-    library = arrow()
-    types = library.types
+    pyarrow = arrow()
+    types = pyarrow.types
     array, list_widths = column.combine_chunks(), list[int]()
-    if isinstance(array, library.ChunkedArray):
-        array = array.chunk(0) if array.num_chunks else library.array([], column.type)
+    if isinstance(array, pyarrow.ChunkedArray):
+        array = array.chunk(0) if array.num_chunks else pyarrow.array([], column.type)
     row_count, is_null = len(array), np.zeros(0, np.bool_)
     while (
         types.is_list(array.type) or types.is_large_list(array.type) or types.is_fixed_size_list(array.type)
     ):
         if array.null_count and not list_widths:
             is_null = array.is_null().to_numpy(zero_copy_only=False)
-        lengths = np.unique(library.compute.list_value_length(array).drop_null().to_numpy())
+        lengths = np.unique(pyarrow.compute.list_value_length(array).drop_null().to_numpy())
         if len(lengths) > 1:
             return None
         list_widths.append(int(lengths[0]) if len(lengths) else 0)
@@ -75,9 +75,9 @@ def numbers_from_column(column: pa.ChunkedArray) -> Floats | None:
     if not (types.is_floating(array.type) or types.is_integer(array.type) or types.is_boolean(array.type)):
         return None
     if types.is_boolean(array.type):
-        array = array.cast(library.uint8())
+        array = array.cast(pyarrow.uint8())
     if array.null_count or not types.is_float64(array.type):
-        array = array.cast(library.float64(), safe=False)
+        array = array.cast(pyarrow.float64(), safe=False)
     numbers = array.to_numpy(zero_copy_only=False)
     if not list_widths:
         return cast("Floats", numbers)
