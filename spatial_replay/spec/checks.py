@@ -300,7 +300,7 @@ def signal_names(specification: Specification) -> tuple[str, ...]:
 
 
 def _atoms(specification: Specification) -> Iterable[Atom]:
-    # a spec that names another shares its formula, so one atom can be in several specs
+    # a spec that uses another spec shares its formula, so one atom can be in several specs
     visited_ids: set[int] = set()
     for spec in specification.results:
         for formula in iter_formulas(spec.formula):

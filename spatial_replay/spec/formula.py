@@ -57,7 +57,7 @@ class TrackedName:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """Variable for an object: of an open quantifier, or the parameter of a template."""
+    """Variable for an object: the variable of an open quantifier, or the parameter of a template."""
 
     name: str
 

@@ -696,7 +696,7 @@ class TunedConstant:
     Attributes:
         value, written: tuned value and value in the text: numbers, or durations as texts.
         low, high: ends of the interval around the tuned value that fits every run, with the tuned values of
-            the other constants. A value one step outside does not fit some run, or is not in the tried range.
+            the other constants. One step outside the interval, a run does not fit or the tried range ends.
         tried: tried range.
         step: least difference of two values; seconds for a duration.
         direction: 1 if greater values are looser, -1 if they are tighter, None if unknown.
