@@ -91,7 +91,7 @@ class FinalStanding(NamedTuple):
     Attributes:
         standing: number of `Standing`: satisfied, violated or unknown.
         by: magnitude of the interval's deciding end; NaN if unknown.
-        at: time of the interval's least upper end.
+        at: time at which the interval's upper end was least.
         unit: unit of the robustness.
     """
 

@@ -239,7 +239,8 @@ class Violations(NamedTuple):
         robustness: (S,), robustness of the requirement or of the settling atom, at most 0, in the unit of the
             log: a division by `scale` is undone.
         holds: (S,), whether the atom holds but must not.
-        moment_ns: (S,) int64, time of the earlier sample that has the number; -1 for a number of this sample.
+        moment_ns: (S,) int64, time of the sample of `robustness`, if an earlier sample settled the violation;
+            -1 for this sample.
         atom: (S,) int64, index in `atoms` of the atom that decides a quantifier; else -1.
         atoms: atoms of quantifiers with their bound objects.
     """

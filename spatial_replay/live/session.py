@@ -229,8 +229,9 @@ LATE_S: Final = 1.0
 """Longest wait of a sample for evaluation, seconds; then the sample is dropped if a newer sample waits."""
 
 _OFFER_S: Final = 5.0
+"""Longest wait for the needed topics after a connection, seconds."""
 _SETTLE_S: Final = 0.3
-"""Longest wait for the topics of the mapping, then for further topics such as transforms, seconds."""
+"""Wait for transforms and optional topics once the needed topics are offered, seconds."""
 
 _STAMPING_SERVERS: Final = frozenset({"foxglove_bridge"})
 """Servers that stamp each message with the time of sending."""

@@ -130,6 +130,7 @@ def _slide(
 def _run_boolean(
     row: Integers, columns: Floats, channel: int, mirror_channel: int, target: Floats, begin: int, end: int
 ) -> None:
+    """Compute the row of a Boolean operator in one channel; a negation reads `mirror_channel`."""
     code, first_column, second_column = row[0], row[1], row[2]
     first_operand, second_operand = columns[channel, first_column], columns[channel, second_column]
     if code == codes.CONSTANT:

@@ -560,7 +560,7 @@ def scan_until_by_pairs(
 _TILE = 256
 """Number of samples per call of the kernel."""
 _FIRST_ROOM = 1024
-"""Initial capacity of the columns in samples."""
+"""Initial capacity of the columns, as a number of samples."""
 MAX_PAIRS = 1 << 26
 """Limit on pairs of samples for which untils store a number: about 11,600 samples, 0.6 GB."""
 

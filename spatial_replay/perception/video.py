@@ -322,7 +322,7 @@ def load_av() -> Any:
 # ----------------------------------------------------------------------------------------- files and encoding
 
 _KEY_FRAMES: Final = 30
-"""Interval of key frames in our videos, frames; a viewer seeks to the key frame before its cursor."""
+"""Number of frames from one key frame to the next in our videos. A viewer seeks to a key frame first."""
 
 _NS: Final = Fraction(1, 10**9)
 _TICK: Final = Fraction(1, 90_000)

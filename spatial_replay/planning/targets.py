@@ -494,9 +494,9 @@ def refine_target(
 ) -> Target:
     """Return the most robust target near a target, or the target itself.
 
-    This is a compass search: each step takes the best of 5 x 5 places around the newest place, in up to three
-    turns. If no place is better, the spacing is halved. Only free places are allowed. If the target has the
-    preferred room, only places with the preferred room are allowed.
+    This is a compass search: each step takes the best of 5 x 5 places around the newest place, with up to
+    three orientations each. If no place is better, the spacing is halved. Only free places are allowed. If
+    the target has the preferred room, only places with the preferred room are allowed.
 
     Args:
         tracked: object before the motion.

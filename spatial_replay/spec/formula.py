@@ -676,8 +676,8 @@ def judged_operator(formula: Temporal) -> Temporal:
 def rate_conditions(formula: Formula) -> list[Formula]:
     """Return one condition for each rate in a formula: the rate has a value in the sample that is read.
 
-    A rate inside an operator that already skips samples has no condition. Conditions hold before the first
-    and after the last sample, where there is no sample to skip.
+    A rate inside an operator that already skips samples has no condition. If an operator reads before the
+    first or after the last sample, the condition holds, because no sample is skipped there.
     """
     match formula:
         case Atom():

@@ -239,8 +239,8 @@ class DrawnViolation(NamedTuple):
         node: id of the violated requirement, or of the atom that settled the violation.
         robustness: robustness of the requirement or of the settling atom, times its sign.
         leaf: index of the deciding leaf in the result's program.
-        moment_ns: time of the earlier sample that settled the violation and has the number; None for a number
-            of this sample.
+        moment_ns: time of the sample of `robustness`, if an earlier sample settled the violation; None for
+            this sample.
         holds: whether the atom holds but must not.
         atom: deciding atom of a quantifier with its objects; "" for other leaves.
         dashes: outlines at an earlier sample, see `CauseText`.
