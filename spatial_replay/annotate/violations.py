@@ -522,9 +522,11 @@ def _locate(
         pair = result.leaf_pairs.pairs[leaf_index]
         if pair is not None:
             _point_at(scene, pair, leaf_positions, positions[leaf_positions], violations)
-        for body, members in _iter_deciding(result, result.leaf_pairs, leaf_index, scene, leaf_positions):
+        for body, deciding_indices in _iter_deciding(
+            result, result.leaf_pairs, leaf_index, scene, leaf_positions
+        ):
             body_pair = pair_of(body)
-            deciding_positions = leaf_positions[members]
+            deciding_positions = leaf_positions[deciding_indices]
             if body_pair is not None and len(deciding_positions):
                 violations.atom[positions[deciding_positions]] = len(violations.atoms)
                 violations.atoms.append(BoundAtom(result.leaf_pairs.text_of(body), body_pair))

@@ -224,7 +224,7 @@ class Judgement:
                 )
         fewest_runs = min(map(len, outcomes_by_start.values()), default=0)
         return {
-            k: fmean(pass_hat_k(sum(runs), len(runs), k) for runs in outcomes_by_start.values())
+            k: fmean(pass_hat_k(sum(outcomes), len(outcomes), k) for outcomes in outcomes_by_start.values())
             for k in range(2, min(fewest_runs, _MOST_RUNS) + 1)
         }
 
@@ -475,12 +475,12 @@ def prepare_judgement(
     """
     (case,) = prepare(suite, progress)
     mapping = case.case.conditions.mapping
-    reading = AS_STORED if mapping is None else load_mapping(mapping).episodes
+    episode_reading = AS_STORED if mapping is None else load_mapping(mapping).episodes
     return PreparedJudgement(
         _name_of(case),
         case,
         _judging_spec(case, result, int(has_failures)),
-        read_labels(case.logs, labels, reading),
+        read_labels(case.logs, labels, episode_reading),
         case.files[0].name if has_failures else "",
     )
 

@@ -90,11 +90,11 @@ def more_pairs(won: int, lost: int, pairs: int) -> int | None:
     return max(high - pairs, 0)
 
 
-def _power(pair_count: int, won: int, lost: int, pairs: int) -> float:
+def _power(pair_count: int, won: int, lost: int, observed_pairs: int) -> float:
     """Return the probability of a decision by the exact test of `pair_count` pairs."""
     binom = _scipy().binom
     differing_pairs = np.arange(pair_count + 1)
-    weights = binom.pmf(differing_pairs, pair_count, (won + lost) / pairs)
+    weights = binom.pmf(differing_pairs, pair_count, (won + lost) / observed_pairs)
     # weights far from the mean do not change the sum of doubles
     differing_pairs, weights = differing_pairs[weights > 1e-17], weights[weights > 1e-17]
     limits = _critical(differing_pairs)

@@ -546,9 +546,9 @@ class _Search:
         return self._evidence.columns(formulas)[:, :, : len(self._times_ns)]
 
     def _verdict_with(
-        self, formula: Formula, added_leaves: Sequence[Atom | Quantified], columns: Floats
+        self, formula: Formula, added_leaves: Sequence[Atom | Quantified], added_columns: Floats
     ) -> Verdict:
-        all_leaves = joined_channels([self._leaves, columns], axis=1)
+        all_leaves = joined_channels([self._leaves, added_columns], axis=1)
         nodes = self._evaluate(formula, (*self._leaf_order, *added_leaves), all_leaves, self._times_ns)
         return self._verdict_of(*nodes.interval(self._node))
 
