@@ -29,22 +29,22 @@ class _TruthEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumType
     TRUTH_FALSE: _Truth.ValueType  # 1
     TRUTH_TRUE: _Truth.ValueType  # 2
     TRUTH_UNKNOWN: _Truth.ValueType  # 3
-    """Something was not seen, and leaves it open."""
+    """The value is open, because an observation is missing or too uncertain."""
 
 class Truth(_Truth, metaclass=_TruthEnumTypeWrapper):
-    """What is known of a statement."""
+    """Truth value of a proposition, or of a property of a run."""
 
 TRUTH_UNSPECIFIED: Truth.ValueType  # 0
 TRUTH_FALSE: Truth.ValueType  # 1
 TRUTH_TRUE: Truth.ValueType  # 2
 TRUTH_UNKNOWN: Truth.ValueType  # 3
-"""Something was not seen, and leaves it open."""
+"""The value is open, because an observation is missing or too uncertain."""
 global___Truth = Truth
 
 @typing.final
 class AutomatonState(google.protobuf.message.Message):
-    """Where the automaton of one specification is after one sample, on the topic /spatial/automaton. The automaton
-    itself is in the log's attachments.
+    """State of one specification's automaton after one sample, on the topic /spatial/automaton. The log's attachments
+    contain the automaton.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -60,29 +60,31 @@ class AutomatonState(google.protobuf.message.Message):
     CAN_ACCEPT_FIELD_NUMBER: builtins.int
     CAN_REJECT_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time of the sample in nanoseconds; equal to the log time of the message."""
+    """Time of the sample, ns; equal to the log time of the message."""
     specification: builtins.str
     """Name of the specification."""
     object: builtins.str
-    """The object for which a template stands here; empty for a specification that is none."""
+    """Object of a template's instance; empty for a specification that is no template."""
     source: builtins.int
-    """The state before the sample, if that is known."""
+    """State before the sample; absent if several states were possible."""
     guard: builtins.str
-    """What let the run leave that state, in words; empty if it stays, or a state is not known."""
+    """Guard of the transition from `source`, in words. Empty if the state stays the same, or if `source` or the new
+    state is unknown.
+    """
     accepting: global___Truth.ValueType
-    """Whether the run would be accepted if it ended here."""
+    """Whether a run that ends with this sample is accepted."""
     can_accept: global___Truth.ValueType
-    """Whether it can still come to be accepted, now or later."""
+    """Whether the run can be accepted, now or after later samples."""
     can_reject: global___Truth.ValueType
-    """Whether it can still come to be rejected, now or later."""
+    """Whether the run can be rejected, now or after later samples."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """The state that the run is in; the states that it may be in, if what was not seen leaves several."""
+        """State of the automaton after the sample. Unknown propositions can leave several possible states."""
 
     @property
     def propositions(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[global___Truth.ValueType]:
-        """Of each proposition, whether its robustness in the sample is at least 0. SpecificationResult.propositions
-        says which nodes they are.
+        """Truth value of each proposition: true if its robustness in the sample is at least 0. The field
+        SpecificationResult.propositions has the nodes of the propositions.
         """
 
     def __init__(

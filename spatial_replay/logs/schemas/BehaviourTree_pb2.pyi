@@ -21,8 +21,8 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
 @typing.final
 class BehaviourTree(google.protobuf.message.Message):
-    """A behaviour tree of the robot, on the topic /plan/behaviour_tree: after each tick that changed the status of
-    a node.
+    """Behaviour tree of the robot, on the topic /plan/behaviour_tree. Each tick that changes the status of a node has
+    one message.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -34,14 +34,14 @@ class BehaviourTree(google.protobuf.message.Message):
     class _StatusEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[BehaviourTree._Status.ValueType], builtins.type):
         DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
         STATUS_INVALID: BehaviourTree._Status.ValueType  # 0
-        """Not ticked since the tree began or was reset."""
+        """The node was not ticked since the start or reset of the tree."""
         STATUS_RUNNING: BehaviourTree._Status.ValueType  # 1
         STATUS_SUCCESS: BehaviourTree._Status.ValueType  # 2
         STATUS_FAILURE: BehaviourTree._Status.ValueType  # 3
 
     class Status(_Status, metaclass=_StatusEnumTypeWrapper): ...
     STATUS_INVALID: BehaviourTree.Status.ValueType  # 0
-    """Not ticked since the tree began or was reset."""
+    """The node was not ticked since the start or reset of the tree."""
     STATUS_RUNNING: BehaviourTree.Status.ValueType  # 1
     STATUS_SUCCESS: BehaviourTree.Status.ValueType  # 2
     STATUS_FAILURE: BehaviourTree.Status.ValueType  # 3
@@ -56,9 +56,9 @@ class BehaviourTree(google.protobuf.message.Message):
         STATUS_FIELD_NUMBER: builtins.int
         name: builtins.str
         type: builtins.str
-        """Such as Sequence, Selector, Retry, or Action for a leaf."""
+        """Type of the node, such as Sequence, Selector or Retry. A leaf has the type Action, a node of Nav2 none."""
         parent: builtins.int
-        """Index of the node above among the nodes; absent for the root."""
+        """Index of the parent in `nodes`; absent for the root, and for the nodes of a single Nav2 tree."""
         status: global___BehaviourTree.Status.ValueType
         def __init__(
             self,
@@ -76,12 +76,14 @@ class BehaviourTree(google.protobuf.message.Message):
     TICK_FIELD_NUMBER: builtins.int
     NODES_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time of the tick in nanoseconds, on the clock of the samples."""
+    """Time of the tick on the clock of the samples, ns."""
     tick: builtins.int
-    """How many ticks of this tree came before."""
+    """Number of earlier ticks of the tree; absent for Nav2."""
     @property
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___BehaviourTree.Node]:
-        """Depth first, children in order."""
+        """Nodes of the tree, depth first, with children in order. Older versions of Nav2 log nodes in the order of their
+        first status changes. Each of several Nav2 trees gets a root with the name of its topic and the type Tree.
+        """
 
     def __init__(
         self,

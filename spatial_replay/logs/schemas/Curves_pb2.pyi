@@ -14,8 +14,8 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
 @typing.final
 class Curves(google.protobuf.message.Message):
-    """The robustness of whole specifications over a whole log, on the topic /spatial/curves of a live server: sent
-    again whenever a constant has changed, and to each new subscriber. No log has it.
+    """Robustness of all specifications over a whole log, on the topic /spatial/curves of a live server. The server
+    repeats the message after each change of a constant, and for each new subscriber. No log has this topic.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -24,16 +24,16 @@ class Curves(google.protobuf.message.Message):
     SPECIFICATIONS_FIELD_NUMBER: builtins.int
     SUMMARY_FIELD_NUMBER: builtins.int
     summary: builtins.str
-    """What each comes to, the worst first, and the constants that differ from the text."""
+    """All results in words, the worst first, and the constants whose values differ from the text."""
     @property
     def time(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Times that every curve has numbers for, in seconds after the log's first sample. A long log is thinned to
-        stretches of equally many samples, two times for each: its first and its last sample.
+        """Times of the points of every curve, in seconds after the log's zero. A long log is divided into stretches with
+        about equally many samples. Each stretch has two points: the times of its first and its last sample.
         """
 
     @property
     def specifications(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___SpecificationCurves]:
-        """In the order in which they are reported."""
+        """Specifications in the order of the results."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ global___Curves = Curves
 
 @typing.final
 class SpecificationCurves(google.protobuf.message.Message):
-    """The curves of one specification, and what it comes to."""
+    """Curves and result of one specification."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -60,14 +60,14 @@ class SpecificationCurves(google.protobuf.message.Message):
     name: builtins.str
     """Name of the specification."""
     object: builtins.str
-    """The object for which a template stands here; empty for a specification that is none."""
+    """Object of a template's instance; empty for a specification that is no template."""
     verdict: builtins.str
-    """Of the finished log: satisfied, violated or unknown."""
+    """Verdict on the finished log: satisfied, violated or unknown."""
     robustness: builtins.float
-    """Robustness on the whole log, in the specification's unit; NaN where it is not determined."""
+    """Robustness on the whole log, in the specification's unit; NaN if undetermined."""
     @property
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeCurves]:
-        """The root, and every node that has a name of its own."""
+        """Curves of the root, and of every node with a unique name."""
 
     def __init__(
         self,
@@ -86,8 +86,8 @@ global___SpecificationCurves = SpecificationCurves
 
 @typing.final
 class NodeCurves(google.protobuf.message.Message):
-    """The curves of one node, in the node's unit. Of a thinned log a stretch has its least and its greatest number,
-    the one first that is nearer to how the stretch begins; NaN where nothing is determined.
+    """Curves of one node, in the node's unit; NaN where the robustness is undetermined. In a long log, a stretch has its
+    least and its greatest number. The greatest number is first if the curve falls over the stretch.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -97,16 +97,16 @@ class NodeCurves(google.protobuf.message.Message):
     VALUE_FIELD_NUMBER: builtins.int
     NOW_FIELD_NUMBER: builtins.int
     id: builtins.int
-    """Number of the node, from the root, 0, in the order of the text."""
+    """Id of the node: its number in the order of the text, from 0 for the root."""
     name: builtins.str
-    """The name that the specification gives to the node, or empty."""
+    """Name of the node in the specification; empty without a name."""
     @property
     def value(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Robustness at the first sample, of the samples up to each time."""
+        """Robustness at the first sample, computed from the samples up to each time."""
 
     @property
     def now(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Robustness at the sample of each time; left out for a node that looks ahead."""
+        """Robustness at the sample of each time; empty for a node that looks ahead."""
 
     def __init__(
         self,

@@ -14,8 +14,8 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
 @typing.final
 class ObjectStates(google.protobuf.message.Message):
-    """Every object and signal known at one time. The topic /spatial/objects holds one such message for each
-    sample; it is what a replay reads.
+    """All objects and signals of one sample, on the topic /spatial/objects. The topic has one message for each sample,
+    and a replay reads only this topic.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -24,14 +24,14 @@ class ObjectStates(google.protobuf.message.Message):
     OBJECTS_FIELD_NUMBER: builtins.int
     SIGNALS_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time of the sample in nanoseconds, 0 to 2^63 - 1; equal to the log time of the message."""
+    """Time of the sample, ns, from 0 to 2^63 - 1; equal to the log time of the message."""
     @property
     def objects(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___ObjectState]:
-        """The objects, each name once, in order of code points."""
+        """Observed objects. Names are unique and sorted by code points."""
 
     @property
     def signals(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Signal]:
-        """The signals whose value is known, each name once, in order of code points."""
+        """Signals with a known value. Names are unique and sorted by code points."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ global___ObjectStates = ObjectStates
 
 @typing.final
 class ObjectState(google.protobuf.message.Message):
-    """One object. A number that is NaN or infinite makes the object unknown at this time."""
+    """One object. A number that is NaN or infinite makes the object's place unknown in this sample."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -62,22 +62,22 @@ class ObjectState(google.protobuf.message.Message):
     LASTING_FIELD_NUMBER: builtins.int
     name: builtins.str
     class_name: builtins.str
-    """What the object is; absent if unknown."""
+    """Class of the object; absent if unknown."""
     yaw: builtins.float
-    """Orientation in radians, counter-clockwise from the x axis; absent for an object without one."""
+    """Orientation in radians, counter-clockwise from the x axis; absent for an object without orientation."""
     uncertainty: builtins.float
-    """Radius in footprint units within which the true outline may differ, at least 0."""
+    """Greatest possible distance between the true outline and this outline, in footprint units, at least 0."""
     reported_ns: builtins.int
-    """Time of the report in nanoseconds, at most that of the sample; absent where it is the sample's own."""
+    """Time of the report, ns, at most the time of the sample. Absent if the report has the time of the sample."""
     lasting: builtins.bool
-    """The object stands where it is until it is reported again, such as a latched map."""
+    """Whether the object keeps its place until its next report, such as a latched map."""
     @property
     def parts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___ConvexPart]:
-        """The footprint: the union of these parts."""
+        """Convex parts of the footprint, which is their union."""
 
     @property
     def height(self) -> global___HeightInterval:
-        """Vertical extent; absent for an object of the plane."""
+        """Vertical extent; absent for an object without height."""
 
     def __init__(
         self,
@@ -108,18 +108,18 @@ global___ObjectState = ObjectState
 
 @typing.final
 class ConvexPart(google.protobuf.message.Message):
-    """A convex polygon rounded by a disc."""
+    """A convex polygon, enlarged by a disc."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     COORDINATES_FIELD_NUMBER: builtins.int
     RADIUS_FIELD_NUMBER: builtins.int
     radius: builtins.float
-    """Rounding radius in footprint units, at least 0."""
+    """Radius of the disc in footprint units, at least 0."""
     @property
     def coordinates(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Corners x, y, x, y … in footprint units, counter-clockwise. One corner is a point or, rounded, a
-        disc; two are a segment or a capsule.
+        """Corners x, y, x, y … in footprint units, counter-clockwise. One corner is a point or, with a radius, a disc. Two
+        corners are a segment or, with a radius, a capsule.
         """
 
     def __init__(
@@ -136,7 +136,7 @@ global___ConvexPart = ConvexPart
 
 @typing.final
 class HeightInterval(google.protobuf.message.Message):
-    """A closed interval along the vertical axis, in footprint units."""
+    """A closed interval on the vertical axis, in footprint units."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -171,11 +171,11 @@ class Signal(google.protobuf.message.Message):
     REPORTED_NS_FIELD_NUMBER: builtins.int
     name: builtins.str
     value: builtins.float
-    """In the unit given."""
+    """Value of the signal, in `unit`."""
     unit: builtins.str
-    """Empty where the source of the log names none."""
+    """Unit of the value; empty if unknown. Our logs have the units in the metadata `spatial_replay` instead."""
     reported_ns: builtins.int
-    """Time of the report in nanoseconds, at most that of the sample; absent where it is the sample's own."""
+    """Time of the report, ns, at most the time of the sample. Absent if the report has the time of the sample."""
     def __init__(
         self,
         *,

@@ -21,8 +21,8 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
 @typing.final
 class PlanDecision(google.protobuf.message.Message):
-    """A decision of the planner, on the topic /plan/decision: once when it is made and, if something was to be
-    moved or waited for, once more, with its outcome, when that is done.
+    """Decision of the planner, on the topic /plan/decision. A decision to move or to wait is repeated with its outcome,
+    after the end of the motion or the wait.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -37,24 +37,24 @@ class PlanDecision(google.protobuf.message.Message):
         KIND_EXECUTE: PlanDecision._Kind.ValueType  # 1
         """Move an object to the target."""
         KIND_HOLD: PlanDecision._Kind.ValueType  # 2
-        """Nothing: the specification is satisfied."""
+        """Stay at rest, because the specification is satisfied."""
         KIND_WAIT: PlanDecision._Kind.ValueType  # 3
-        """Nothing yet: the state of the automaton is uncertain, or time has to pass."""
+        """Wait, because the automaton's state is uncertain, time has to pass, or moving objects are in the way."""
         KIND_NO_PATH: PlanDecision._Kind.ValueType  # 4
-        """Nothing any more: no way to satisfy the specification is left."""
+        """Stop, because no path to acceptance is left."""
 
     class Kind(_Kind, metaclass=_KindEnumTypeWrapper):
-        """What is to be done."""
+        """Action of the decision."""
 
     KIND_UNSPECIFIED: PlanDecision.Kind.ValueType  # 0
     KIND_EXECUTE: PlanDecision.Kind.ValueType  # 1
     """Move an object to the target."""
     KIND_HOLD: PlanDecision.Kind.ValueType  # 2
-    """Nothing: the specification is satisfied."""
+    """Stay at rest, because the specification is satisfied."""
     KIND_WAIT: PlanDecision.Kind.ValueType  # 3
-    """Nothing yet: the state of the automaton is uncertain, or time has to pass."""
+    """Wait, because the automaton's state is uncertain, time has to pass, or moving objects are in the way."""
     KIND_NO_PATH: PlanDecision.Kind.ValueType  # 4
-    """Nothing any more: no way to satisfy the specification is left."""
+    """Stop, because no path to acceptance is left."""
 
     TIME_NS_FIELD_NUMBER: builtins.int
     NUMBER_FIELD_NUMBER: builtins.int
@@ -70,43 +70,43 @@ class PlanDecision(google.protobuf.message.Message):
     MARGIN_FIELD_NUMBER: builtins.int
     SEARCH_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time in nanoseconds of the sample that it was made on."""
+    """Time of the sample on which the decision was made, ns."""
     number: builtins.int
-    """How many decisions came before."""
+    """Number of earlier decisions."""
     specification: builtins.str
     """Name of the specification."""
     kind: global___PlanDecision.Kind.ValueType
     reason: builtins.str
-    """The decision in words."""
+    """Sentence on the decision."""
     margin: builtins.float
-    """Robustness that a target needs at least, by the settings."""
+    """Least robustness of the progress set at a target, from the settings."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """States of the automaton; several if its state is uncertain."""
+        """Possible states of the automaton; several if propositions are unknown."""
 
     @property
     def considered(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanEdge]:
-        """The edges of the automaton that were looked into, in order; the last one is aimed at unless it was given
-        up.
-        """
+        """Edges of the automaton that the planner considered, in order. The last edge is the aim, unless it was pruned."""
 
     @property
-    def target(self) -> global___PlanTarget: ...
+    def target(self) -> global___PlanTarget:
+        """Object to move, and its target pose; absent without a motion."""
+
     @property
     def pruned(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PrunedEdge]:
-        """All edges given up so far."""
+        """All edges that were pruned so far."""
 
     @property
     def outcome(self) -> global___PlanOutcome:
-        """How it went; absent when the decision is made."""
+        """Outcome of the motion or the wait; absent in the first message of the decision."""
 
     @property
     def lost(self) -> global___PlanLoss:
-        """When and by what acceptance was lost; absent while the specification can be satisfied."""
+        """Time and cause of the loss of acceptance; absent while the specification can be satisfied."""
 
     @property
     def search(self) -> global___PlanSearch:
-        """How much was searched for it."""
+        """Search effort of the decision."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ global___PlanDecision = PlanDecision
 
 @typing.final
 class PlanSearch(google.protobuf.message.Message):
-    """How much was searched for a decision."""
+    """Search effort of a decision."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -146,11 +146,11 @@ class PlanSearch(google.protobuf.message.Message):
     ARRANGEMENTS_FIELD_NUMBER: builtins.int
     PARKING_PLACES_FIELD_NUMBER: builtins.int
     maps: builtins.float
-    """The maps of which a decision computes a limited number; a look at one sample counts as a quarter of a map."""
+    """Number of computed maps, which is limited per decision. The evaluation of one sample counts as a quarter of a map."""
     arrangements: builtins.int
-    """The arrangements of several objects of which an order of motions was looked for."""
+    """Number of arrangements of several objects for which an order of motions was searched."""
     parking_places: builtins.int
-    """The places that were tried for objects in the way of others."""
+    """Number of parking places tried for objects in the way of other objects."""
     def __init__(
         self,
         *,
@@ -171,16 +171,16 @@ global___PlanSearch = PlanSearch
 
 @typing.final
 class PlanLoss(google.protobuf.message.Message):
-    """The sample after which the specification could not be satisfied any more."""
+    """First sample from which the specification cannot be satisfied."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     TIME_NS_FIELD_NUMBER: builtins.int
     TEXT_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Its time in nanoseconds."""
+    """Time of the sample, ns."""
     text: builtins.str
-    """What it had that the specification forbids, in words."""
+    """Forbidden condition that held in the sample, in words; empty if unknown propositions hide the condition."""
     def __init__(
         self,
         *,
@@ -195,7 +195,7 @@ global___PlanLoss = PlanLoss
 
 @typing.final
 class PlanEdge(google.protobuf.message.Message):
-    """An edge that was looked into."""
+    """An edge of the automaton that the planner considered."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -213,46 +213,48 @@ class PlanEdge(google.protobuf.message.Message):
     WANTED_FIELD_NUMBER: builtins.int
     RULES_FIELD_NUMBER: builtins.int
     source: builtins.int
+    """Source state of the edge."""
     target: builtins.int
+    """Target state of the edge."""
     pruned: builtins.str
-    """Why it was given up, or empty."""
+    """Reason why the edge was pruned; empty if it was not pruned."""
     joint: builtins.bool
-    """Whether several objects are moved together for this edge. The map of the chosen one then has the others where
-    their motions bring them.
+    """Whether several objects are moved for the edge. In the chosen object's map, the other objects are then at the
+    targets of their motions.
     """
     failed: builtins.int
-    """How many motions for it have failed before, of those that count as attempts."""
+    """Number of earlier failed motions for the edge that count as attempts."""
     order: builtins.str
-    """Why it comes before edges on paths that are as short, or empty."""
+    """Reason why the edge precedes edges on equally short paths; empty without such edges."""
     @property
     def path(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """The states of the shortest path to acceptance that begins with it."""
+        """States of the shortest path to acceptance that begins with the edge."""
 
     @property
     def progress(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanGuard]:
-        """One of these has to hold for the edge to be taken."""
+        """Progress set: alternative guards of the edge. One guard must hold to take the edge."""
 
     @property
     def constraints(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanGuard]:
-        """None of these may hold on the way: they lead elsewhere."""
+        """Constraint set: guards of edges to other states. No guard may hold before the edge is taken."""
 
     @property
     def candidates(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanCandidate]:
-        """The objects looked at."""
+        """Objects that the planner considered for the edge."""
 
     @property
     def motions(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanTarget]:
-        """The motions planned from here to acceptance, the first of which is that of the decision; empty if the planner
-        does not look ahead.
+        """Planned motions from this sample to acceptance, beginning with the decision's motion. Empty if the planner does
+        not look ahead.
         """
 
     @property
     def wanted(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
-        """The progress set in words, one sentence for each alternative; formulas stand between backquotes."""
+        """Progress set in words, one sentence for each alternative. Formulas are between backquotes."""
 
     @property
     def rules(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
-        """The constraint set in words: what to keep and to avoid on the way; formulas stand between backquotes."""
+        """Constraint set in words: conditions to keep and to avoid during the motion. Formulas are between backquotes."""
 
     def __init__(
         self,
@@ -284,7 +286,7 @@ global___PlanEdge = PlanEdge
 
 @typing.final
 class PlanGuard(google.protobuf.message.Message):
-    """Propositions that all hold, or do not hold."""
+    """A guard: a conjunction of propositions and negated propositions."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -292,13 +294,15 @@ class PlanGuard(google.protobuf.message.Message):
     PROPOSITIONS_FIELD_NUMBER: builtins.int
     VALUES_FIELD_NUMBER: builtins.int
     text: builtins.str
-    """In words."""
+    """Guard in words."""
     @property
     def propositions(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """The automaton's propositions by number, and whether each is to be true."""
+        """Numbers of the guard's propositions in the automaton."""
 
     @property
-    def values(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.bool]: ...
+    def values(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.bool]:
+        """Required truth value of each proposition, in the order of `propositions`."""
+
     def __init__(
         self,
         *,
@@ -330,41 +334,48 @@ class PlanCandidate(google.protobuf.message.Message):
     LEAST_WAY_FIELD_NUMBER: builtins.int
     LEAST_ROOM_FIELD_NUMBER: builtins.int
     object: builtins.str
+    """Name of the object."""
     best: builtins.float
-    """Greatest robustness of the progress set at a cell that is not blocked; -infinity if all are."""
+    """Greatest robustness of the progress set at a free cell; -infinity if all cells are blocked."""
     map_sha256: builtins.bytes
-    """SHA-256 of its gradient map: little-endian float64 by turn, row and column, NaN where blocked."""
+    """SHA-256 of the object's gradient map: little-endian float64 by turn, row and column; NaN in blocked cells."""
     rejected: builtins.str
-    """Why it was rejected, or empty."""
+    """Reason of the rejection; empty if the object was not rejected."""
     chosen: builtins.bool
-    """Whether it is the one to be moved."""
+    """Whether the planner moves this object."""
     rule: builtins.str
-    """How its target is chosen among places that will do; empty without a target."""
+    """Rule that chooses the target among suitable places; empty without a target."""
     least_way: builtins.float
-    """Of a push: the length of the shortest way over cells to a place that will do. The field `way` of the map has
-    the length of the way to each cell.
+    """Length of the shortest way over cells to a suitable place, in footprint units; only for the chosen object of a
+    push. The map's field `way` has the length of the way to each cell.
     """
     least_room: builtins.float
-    """Of a placement: the least room around a place that is taken; absent if no place has the preferred room."""
+    """Least room around the target of a placement, in footprint units. Absent without a preferred room, or if no place
+    has this room.
+    """
     @property
     def target(self) -> global___PlanTarget:
-        """Where it would go; absent if it was rejected."""
+        """Target of the object; absent for a rejected object."""
 
     @property
     def maps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanMap]:
-        """Where its gradient map is to be found, by the ways in which it may be turned."""
+        """Messages with the object's gradient map, one for each turn."""
 
     @property
     def conjuncts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanConjunct]:
-        """What the progress set is made of. A cell of the map names by number, from 1, the one that limits it."""
+        """Conjuncts of the progress set. The map's field `limited_by` has the number of the conjunct that limits a cell,
+        from 1; 0 for no conjunct.
+        """
 
     @property
     def causes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanCause]:
-        """What keeps the object out of cells. A blocked cell of the map names it by number, from 1."""
+        """Causes that block cells. The map's field `blocked_by` has the number of a cell's cause, from 1; 0 for a free
+        cell.
+        """
 
     @property
     def room(self) -> global___PlanRoom:
-        """What the room around its target costs; absent if it costs nothing."""
+        """Cost of the room around the target, in robustness; absent without a cost."""
 
     def __init__(
         self,
@@ -396,7 +407,7 @@ global___PlanCandidate = PlanCandidate
 
 @typing.final
 class PlanConjunct(google.protobuf.message.Message):
-    """A part of the progress set that is not made of others: a relation of the specification, or its negation."""
+    """A conjunct of the progress set: a relation of the specification, or its negation."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -405,13 +416,15 @@ class PlanConjunct(google.protobuf.message.Message):
     AT_TARGET_FIELD_NUMBER: builtins.int
     WORDS_FIELD_NUMBER: builtins.int
     text: builtins.str
-    """In words; the field of the map with its robustness is named like this, behind its number."""
+    """Formula of the conjunct. The map's field with the conjunct's robustness is named by number and formula, such as
+    "1: cup leftof plate".
+    """
     limits: builtins.int
-    """How many free cells, over all turns, it limits: the progress set has just its robustness there."""
+    """Number of free cells, over all turns, in which the progress set's robustness equals this conjunct's robustness."""
     at_target: builtins.float
-    """Its robustness in the target's cell; absent without a target."""
+    """Robustness of the conjunct in the target's cell; absent without a target."""
     words: builtins.str
-    """The demand: what to reach, to keep or to avoid; formulas stand between backquotes."""
+    """Demand of the conjunct: a condition to reach, to keep or to avoid. Formulas are between backquotes."""
     def __init__(
         self,
         *,
@@ -431,7 +444,7 @@ global___PlanConjunct = PlanConjunct
 
 @typing.final
 class PlanCause(google.protobuf.message.Message):
-    """What keeps an object out of cells."""
+    """A cause that blocks cells for an object."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -443,32 +456,32 @@ class PlanCause(google.protobuf.message.Message):
         DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
         KIND_UNSPECIFIED: PlanCause._Kind.ValueType  # 0
         KIND_CONSTRAINT: PlanCause._Kind.ValueType  # 1
-        """Something of the constraint set would hold."""
+        """A guard of the constraint set would hold."""
         KIND_OBJECT: PlanCause._Kind.ValueType  # 2
-        """An object stands there."""
+        """Another object occupies the place."""
         KIND_OBSTACLE: PlanCause._Kind.ValueType  # 3
-        """An obstacle of the workspace stands there."""
+        """An obstacle of the workspace occupies the place."""
         KIND_REACH: PlanCause._Kind.ValueType  # 4
-        """It is out of the robot's reach."""
+        """The place is out of the robot's reach."""
         KIND_UNKNOWN: PlanCause._Kind.ValueType  # 5
-        """Something of the progress set is not known."""
+        """A relation of the progress set is unknown."""
         KIND_FAILED: PlanCause._Kind.ValueType  # 6
-        """A motion to a place near it has failed."""
+        """A motion to a nearby place has failed."""
 
     class Kind(_Kind, metaclass=_KindEnumTypeWrapper): ...
     KIND_UNSPECIFIED: PlanCause.Kind.ValueType  # 0
     KIND_CONSTRAINT: PlanCause.Kind.ValueType  # 1
-    """Something of the constraint set would hold."""
+    """A guard of the constraint set would hold."""
     KIND_OBJECT: PlanCause.Kind.ValueType  # 2
-    """An object stands there."""
+    """Another object occupies the place."""
     KIND_OBSTACLE: PlanCause.Kind.ValueType  # 3
-    """An obstacle of the workspace stands there."""
+    """An obstacle of the workspace occupies the place."""
     KIND_REACH: PlanCause.Kind.ValueType  # 4
-    """It is out of the robot's reach."""
+    """The place is out of the robot's reach."""
     KIND_UNKNOWN: PlanCause.Kind.ValueType  # 5
-    """Something of the progress set is not known."""
+    """A relation of the progress set is unknown."""
     KIND_FAILED: PlanCause.Kind.ValueType  # 6
-    """A motion to a place near it has failed."""
+    """A motion to a nearby place has failed."""
 
     KIND_FIELD_NUMBER: builtins.int
     TEXT_FIELD_NUMBER: builtins.int
@@ -476,11 +489,11 @@ class PlanCause(google.protobuf.message.Message):
     WORDS_FIELD_NUMBER: builtins.int
     kind: global___PlanCause.Kind.ValueType
     text: builtins.str
-    """What would hold, or the object; else empty."""
+    """Guard that would hold, or name of the object; empty for other kinds."""
     cells: builtins.int
-    """How many cells, over all turns."""
+    """Number of blocked cells, over all turns."""
     words: builtins.str
-    """The cause as a sentence; formulas stand between backquotes."""
+    """Sentence on the cause. Formulas are between backquotes."""
     def __init__(
         self,
         *,
@@ -497,7 +510,7 @@ global___PlanCause = PlanCause
 
 @typing.final
 class PlanRoom(google.protobuf.message.Message):
-    """A target that leaves room around the object, where more robustness was possible with less."""
+    """Cost of the room around a target: another place has greater robustness, but less room."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -505,10 +518,11 @@ class PlanRoom(google.protobuf.message.Message):
     POSSIBLE_FIELD_NUMBER: builtins.int
     CLEARANCE_FIELD_NUMBER: builtins.int
     wanted: builtins.float
-    """The room that the settings ask for, in footprint units."""
+    """Preferred room of the settings, in footprint units."""
     possible: builtins.float
-    """The greatest robustness possible, and the room there."""
+    """Robustness at the most robust place with less room."""
     clearance: builtins.float
+    """Room at the most robust place, in footprint units."""
     def __init__(
         self,
         *,
@@ -529,16 +543,16 @@ global___PlanRoom = PlanRoom
 
 @typing.final
 class PlanMap(google.protobuf.message.Message):
-    """A gradient map on the topic /plan/gradient_map: of one object, turned in one way."""
+    """A gradient map on the topic /plan/gradient_map, for one object and one turn."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     NUMBER_FIELD_NUMBER: builtins.int
     TURN_FIELD_NUMBER: builtins.int
     number: builtins.int
-    """How many messages of that topic come before it; also its sequence number."""
+    """Number of earlier messages on the topic; equal to the sequence number of the map's message."""
     turn: builtins.float
-    """By how much the object is turned, in radians."""
+    """Angle by which the object is turned, in radians."""
     def __init__(
         self,
         *,
@@ -556,7 +570,7 @@ global___PlanMap = PlanMap
 
 @typing.final
 class PlanTarget(google.protobuf.message.Message):
-    """Where an object is to go, in footprint units."""
+    """Target pose of an object."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -568,18 +582,21 @@ class PlanTarget(google.protobuf.message.Message):
     WAYPOINTS_FIELD_NUMBER: builtins.int
     ROBUSTNESS_FIELD_NUMBER: builtins.int
     object: builtins.str
+    """Name of the object."""
     x: builtins.float
-    """Of its centre."""
+    """Coordinates of the object's centre at the target, in footprint units."""
     y: builtins.float
     turn: builtins.float
-    """By how much it is to be turned, in radians."""
+    """Angle by which the object is turned, in radians."""
     yaw: builtins.float
-    """Its orientation then, in radians; absent if it has none."""
+    """Orientation of the object at the target, in radians; absent for an object without orientation."""
     robustness: builtins.float
-    """Robustness of the progress set there."""
+    """Robustness of the progress set with the object at the target."""
     @property
     def waypoints(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Points on the way, x and y in turn, from where it is to the target."""
+        """Points x, y, x, y … of the path from the object's place to the target, in footprint units. Only start and end are
+        given if the robot may choose the path.
+        """
 
     def __init__(
         self,
@@ -609,7 +626,7 @@ global___PlanTarget = PlanTarget
 
 @typing.final
 class PrunedEdge(google.protobuf.message.Message):
-    """An edge that was given up."""
+    """An edge that the planner pruned."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -617,8 +634,11 @@ class PrunedEdge(google.protobuf.message.Message):
     TARGET_FIELD_NUMBER: builtins.int
     REASON_FIELD_NUMBER: builtins.int
     source: builtins.int
+    """Source state of the edge."""
     target: builtins.int
+    """Target state of the edge."""
     reason: builtins.str
+    """Reason why the edge was pruned."""
     def __init__(
         self,
         *,
@@ -637,7 +657,7 @@ global___PrunedEdge = PrunedEdge
 
 @typing.final
 class PlanOutcome(google.protobuf.message.Message):
-    """How the execution of a step went, or a wait."""
+    """Outcome of a motion or a wait."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -648,22 +668,22 @@ class PlanOutcome(google.protobuf.message.Message):
     TRAVELLED_FIELD_NUMBER: builtins.int
     AT_FIELD_NUMBER: builtins.int
     end_ns: builtins.int
-    """Time in nanoseconds of the last sample before its end."""
+    """Time of the last sample of the motion or the wait, ns."""
     succeeded: builtins.bool
-    """Whether the object is where it was to be, as far as its controller knows; whether a wait went on to its
-    end.
+    """Whether the object is at its target, according to the controller. A wait succeeds unless the automaton reaches an
+    unexpected state.
     """
     reason: builtins.str
-    """What happened, in words."""
+    """Sentence on the outcome."""
     at: builtins.str
-    """The stage at which a motion failed: pick, way or place; empty if it is not known."""
+    """Stage at which a motion failed: pick, way or place; empty if unknown."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """Where the automaton is then."""
+        """Possible states of the automaton at the end."""
 
     @property
     def travelled(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.float]:
-        """Where the object's centre was, x and y in turn, in samples from the decision to the end."""
+        """Centres x, y, x, y … of the moved object in the samples from the decision to the end, in footprint units."""
 
     def __init__(
         self,

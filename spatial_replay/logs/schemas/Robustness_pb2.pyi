@@ -28,38 +28,38 @@ class _StandingEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumT
     DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
     STANDING_UNSPECIFIED: _Standing.ValueType  # 0
     SATISFIED: _Standing.ValueType  # 28
-    """Satisfied, whatever follows."""
+    """Satisfied permanently."""
     HOLDS_SO_FAR: _Standing.ValueType  # 32
-    """The value is at least 0, and the samples that may follow can still decide either way."""
+    """The value is at least 0, and later samples can still decide either way."""
     PENDING: _Standing.ValueType  # 33
-    """The value is below 0, and the samples that may follow can still decide either way."""
+    """The value is below 0, and later samples can still decide either way."""
     VIOLATED: _Standing.ValueType  # 29
-    """Violated, whatever follows."""
+    """Violated permanently."""
     UNKNOWN: _Standing.ValueType  # 47
-    """The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
+    """The value is undetermined, and nothing is decided. In a final message, unknown observations leave the verdict open."""
 
 class Standing(_Standing, metaclass=_StandingEnumTypeWrapper):
-    """How a result or a node stands. Viewers colour a state by its number modulo 28: satisfied and holding are blue
-    and light blue there, violated is vermillion, and pending and unknown are the palest colours that they have,
-    which has no grey.
+    """Standing of a result or a node. Lichtblick colours a state by its number modulo 28. There, satisfied is blue,
+    holding is light blue, and violated is vermillion. Pending and unknown have the palest colours, because Lichtblick
+    has no grey.
     """
 
 STANDING_UNSPECIFIED: Standing.ValueType  # 0
 SATISFIED: Standing.ValueType  # 28
-"""Satisfied, whatever follows."""
+"""Satisfied permanently."""
 HOLDS_SO_FAR: Standing.ValueType  # 32
-"""The value is at least 0, and the samples that may follow can still decide either way."""
+"""The value is at least 0, and later samples can still decide either way."""
 PENDING: Standing.ValueType  # 33
-"""The value is below 0, and the samples that may follow can still decide either way."""
+"""The value is below 0, and later samples can still decide either way."""
 VIOLATED: Standing.ValueType  # 29
-"""Violated, whatever follows."""
+"""Violated permanently."""
 UNKNOWN: Standing.ValueType  # 47
-"""The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
+"""The value is undetermined, and nothing is decided. In a final message, unknown observations leave the verdict open."""
 global___Standing = Standing
 
 @typing.final
 class Robustness(google.protobuf.message.Message):
-    """The robustness of every node of one specification after one sample, on the topic /spatial/robustness."""
+    """Robustness of every node of one specification after one sample, on the topic /spatial/robustness."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -69,18 +69,20 @@ class Robustness(google.protobuf.message.Message):
     NODES_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time of the sample in nanoseconds; equal to the log time of the message."""
+    """Time of the sample, ns; equal to the log time of the message. A final message has the time of the last sample,
+    and its log time is the end of the log.
+    """
     specification: builtins.str
     """Name of the specification."""
     object: builtins.str
-    """The object for which a template stands here; empty for a specification that is none."""
+    """Object of a template's instance; empty for a specification that is no template."""
     final: builtins.bool
-    """Whether this is about the finished log: lower and upper end and standing are those without any continuation.
-    Each specification has one such message, its last, besides that of its last sample.
+    """Whether the message describes the finished log. Then `lower`, `upper` and `standing` assume that no sample
+    follows. Each specification has one final message, after the message of the last sample.
     """
     @property
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeRobustness]:
-        """In the order of their ids."""
+        """Nodes of the specification in the order of their ids."""
 
     def __init__(
         self,
@@ -99,7 +101,7 @@ global___Robustness = Robustness
 
 @typing.final
 class NodeRobustness(google.protobuf.message.Message):
-    """Numbers of one node, in the node's unit; see Specification."""
+    """Robustness of one node, in the node's unit (Node.unit)."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -111,16 +113,16 @@ class NodeRobustness(google.protobuf.message.Message):
     UPPER_FIELD_NUMBER: builtins.int
     STANDING_FIELD_NUMBER: builtins.int
     id: builtins.int
-    """Number of the node, from the root, 0, in the order of the text."""
+    """Id of the node: its number in the order of the text, from 0 for the root."""
     name: builtins.str
-    """The name that the specification gives to the node, or empty."""
+    """Name of the node in the specification; empty without a name."""
     value: builtins.float
-    """Robustness at the first sample, of the samples seen so far; NaN where it is not determined."""
+    """Robustness at the first sample, computed from the samples so far; NaN if undetermined."""
     now: builtins.float
-    """Robustness at the newest sample, of the samples seen so far; NaN where it is not determined."""
+    """Robustness at the newest sample, computed from the samples so far; NaN if undetermined."""
     lower: builtins.float
-    """Least and greatest value over everything that may follow and everything unknown. Under the paper's
-    semantics both are the value.
+    """Least and greatest possible value, over all later samples and all unknown observations. Under the paper's
+    semantics, both equal the value.
     """
     upper: builtins.float
     standing: global___Standing.ValueType
@@ -152,8 +154,8 @@ global___NodeRobustness = NodeRobustness
 
 @typing.final
 class StandingUpdate(google.protobuf.message.Message):
-    """How all results stand after one sample, on the topic /spatial/standing: at most 50 times a second, and once more
-    when the log has ended.
+    """Standing of all results after one sample, on the topic /spatial/standing. The topic has at most 50 messages per
+    second, and one more after the end of the log.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -165,24 +167,26 @@ class StandingUpdate(google.protobuf.message.Message):
     VIOLATED_FIELD_NUMBER: builtins.int
     HEADER_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
-    """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
+    """Time of the sample, ns; equal to the log time of the message. A final message has the time of the last sample,
+    and its log time is the end of the log.
+    """
     worst: builtins.str
-    """Name of the worst result: of those violated, the one that was so for certain first."""
+    """Name of the worst result. Among violated results, the result with the earliest certain violation is the worst."""
     final: builtins.bool
-    """Whether this is about the finished log."""
+    """Whether the message describes the finished log."""
     @property
     def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___ResultStanding]:
-        """Every result, then the named specs that the results are made of, as far as a name is clear."""
+        """Standing of every result, then of the named specs within the results. A spec without a unique name is left out."""
 
     @property
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
-        """The permanently violated results, the first one first. While there is none, one entry without numbers says
-        so: viewers draw no table without rows.
+        """Permanently violated results, the earliest violation first. Without a violation, one entry without numbers says
+        so, because viewers draw no table without rows.
         """
 
     @property
     def header(self) -> global___Header:
-        """The time of the sample, for strips of a live source: after a seek, earlier messages come at the new time."""
+        """Time of the sample, for plots of a live source. After a seek, earlier messages come at the new time."""
 
     def __init__(
         self,
@@ -202,7 +206,7 @@ global___StandingUpdate = StandingUpdate
 
 @typing.final
 class Violation(google.protobuf.message.Message):
-    """A violated result, for tables: numbers are rounded to four digits."""
+    """A violated result, as a row of a table."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -213,17 +217,17 @@ class Violation(google.protobuf.message.Message):
     OVER_FIELD_NUMBER: builtins.int
     AT_FIELD_NUMBER: builtins.int
     name: builtins.str
-    """As in `results`."""
+    """Name of the result, as in `results`."""
     since: builtins.float
-    """Since when that is certain: seconds after the log's zero."""
+    """Start of the certain violation, in seconds after the log's zero, rounded to 1 ms."""
     by: builtins.float
-    """By how much: what the value over all samples falls short of 0 at least."""
+    """Least amount by which the value of the result is below 0, rounded to four digits; NaN if infinite."""
     unit: builtins.str
-    """Unit of `by`; empty for footprint units."""
+    """Unit of `by`, as in Node.unit."""
     over: builtins.str
-    """What decided it: the atom, or the response that was missing. Empty if that is not known."""
+    """Deciding atom, or missing response; empty if unknown."""
     at: builtins.float
-    """When the value over all samples was first so low: seconds after the log's zero."""
+    """First time at which `by` had this amount, in seconds after the log's zero, rounded to 1 ms."""
     def __init__(
         self,
         *,
@@ -247,7 +251,7 @@ global___Violation = Violation
 
 @typing.final
 class Header(google.protobuf.message.Message):
-    """A time as viewers read it in the header of a message."""
+    """A time in the form in which viewers read it from a message's header."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -266,7 +270,7 @@ global___Header = Header
 
 @typing.final
 class Stamp(google.protobuf.message.Message):
-    """Seconds since 1970 and nanoseconds, both whole: doubles have one length."""
+    """Whole seconds since 1970, and whole nanoseconds. Both are doubles, because doubles have a fixed length."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -291,7 +295,9 @@ global___Stamp = Stamp
 
 @typing.final
 class RecentEvents(google.protobuf.message.Message):
-    """The newest events, so that a viewer that seeks in a file, or joins a run late, can list them."""
+    """The newest events, at most 20, on the topic /spatial/recent_events. A viewer that seeks in a file, or joins a run
+    late, reads the list of events from this message.
+    """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -299,11 +305,11 @@ class RecentEvents(google.protobuf.message.Message):
     FACTS_FIELD_NUMBER: builtins.int
     @property
     def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___RecentEvent]:
-        """The newest first."""
+        """Events, the newest first."""
 
     @property
     def facts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___EventFacts]:
-        """The facts of the same events, in the same order."""
+        """Facts of the events, in the order of `events`."""
 
     def __init__(
         self,
@@ -317,7 +323,7 @@ global___RecentEvents = RecentEvents
 
 @typing.final
 class EventFacts(google.protobuf.message.Message):
-    """Facts of an event on /spatial/events, as far as a list of events needs them."""
+    """Times and metadata of an event on /spatial/events, limited to the keys that a list of events needs."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -362,16 +368,16 @@ global___EventFact = EventFact
 
 @typing.final
 class RecentEvent(google.protobuf.message.Message):
-    """One of them, for tables."""
+    """An event, as a row of a table."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     AT_FIELD_NUMBER: builtins.int
     EVENT_FIELD_NUMBER: builtins.int
     at: builtins.float
-    """When it was confirmed: seconds after the log's zero."""
+    """Time of the sample that confirms the event, in seconds after the log's zero."""
     event: builtins.str
-    """The sentence of /spatial/log."""
+    """Sentence on the event, as on /spatial/log."""
     def __init__(
         self,
         *,
@@ -384,7 +390,7 @@ global___RecentEvent = RecentEvent
 
 @typing.final
 class ResultStanding(google.protobuf.message.Message):
-    """How one result stands."""
+    """Standing of one result, or of a named spec within a result."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -394,16 +400,16 @@ class ResultStanding(google.protobuf.message.Message):
     UNIT_FIELD_NUMBER: builtins.int
     AUTOMATON_FIELD_NUMBER: builtins.int
     name: builtins.str
-    """What a reader knows it by: "table_set", "calm(bike)", "laid in table_set". No two are equal."""
+    """Unique name for readers, such as "table_set", "calm(bike)" or "laid in table_set"."""
     standing: global___Standing.ValueType
     robustness: builtins.float
-    """Its robustness: the value of a result and of a spec that looks ahead, of others the present one; in its
-    unit, NaN where it is not determined.
+    """Robustness in `unit`; NaN if undetermined or infinite. It is the robustness at the first sample for results and
+    for specs that look ahead, and at the newest sample for other specs.
     """
     unit: builtins.str
-    """Unit of the robustness; empty for footprint units."""
+    """Unit of the robustness, as in Node.unit."""
     automaton: builtins.str
-    """Of a result with an automaton, its state in words."""
+    """State of the result's automaton, in words; empty without an automaton."""
     def __init__(
         self,
         *,

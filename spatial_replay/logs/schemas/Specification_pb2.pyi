@@ -14,8 +14,8 @@ DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
 @typing.final
 class Specification(google.protobuf.message.Message):
-    """What a log is evaluated against, on the topic /spatial/specification, once, at the time of the first
-    sample.
+    """Specifications of an evaluation, on the topic /spatial/specification. The topic has one message, at the time of
+    the first sample.
     """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -24,16 +24,16 @@ class Specification(google.protobuf.message.Message):
     RESULTS_FIELD_NUMBER: builtins.int
     START_NS_FIELD_NUMBER: builtins.int
     start_ns: builtins.int
-    """The time that seconds in texts count from, in nanoseconds: the log's first sample. A part of a log keeps the
-    zero of the whole.
+    """Zero of seconds in texts, ns: the time of the log's first sample. A part of a log keeps the zero of the whole
+    log.
     """
     @property
     def files(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___SpecificationFile]:
-        """The files, in the order in which they were given."""
+        """Specification files in the order of the evaluation."""
 
     @property
     def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___SpecificationResult]:
-        """The specifications, one for each object where one is a template."""
+        """Specifications of all files. A template has one result for each object."""
 
     def __init__(
         self,
@@ -57,11 +57,11 @@ class SpecificationFile(google.protobuf.message.Message):
     CANONICAL_FIELD_NUMBER: builtins.int
     PROFILE_FIELD_NUMBER: builtins.int
     name: builtins.str
-    """Base name of the file; empty for text that came from none."""
+    """Base name of the file. A text without a file has the name text.spatial."""
     source: builtins.str
-    """The text as it was given."""
+    """Text of the file, with the constants that were set for the evaluation."""
     canonical: builtins.str
-    """The text as the formatter writes it."""
+    """Text of the file in canonical form."""
     profile: builtins.str
     """Name of the relation profile."""
     def __init__(
@@ -78,7 +78,7 @@ global___SpecificationFile = SpecificationFile
 
 @typing.final
 class SpecificationResult(google.protobuf.message.Message):
-    """One specification as a tree of nodes; /spatial/robustness carries its numbers."""
+    """One specification as a tree of nodes. The topic /spatial/robustness has the robustness of the nodes."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -91,22 +91,22 @@ class SpecificationResult(google.protobuf.message.Message):
     name: builtins.str
     """Name of the specification."""
     object: builtins.str
-    """The object for which a template stands here; empty for a specification that is none."""
+    """Object of a template's instance; empty for a specification that is no template."""
     file: builtins.int
-    """Index into files."""
+    """Index of the specification's file in `files`."""
     @property
     def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Node]:
-        """In the order of their ids."""
+        """Nodes of the tree in the order of their ids."""
 
     @property
     def propositions(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
-        """The nodes that are propositions of the automaton, in the order in which AutomatonState has them; none if
-        there is no automaton.
+        """Ids of the nodes that are the automaton's propositions, in the order of AutomatonState.propositions. Empty
+        without an automaton.
         """
 
     @property
     def automaton(self) -> global___AutomatonDrawing:
-        """Its automaton; absent if it has none."""
+        """Automaton of the specification; absent without an automaton."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ global___SpecificationResult = SpecificationResult
 
 @typing.final
 class AutomatonDrawing(google.protobuf.message.Message):
-    """An automaton as it is drawn: of a large one, the states nearest to the start."""
+    """Drawing of an automaton. A large automaton is cut to the states nearest to the start."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -136,16 +136,16 @@ class AutomatonDrawing(google.protobuf.message.Message):
     LEFT_OUT_FIELD_NUMBER: builtins.int
     LEGEND_FIELD_NUMBER: builtins.int
     summary: builtins.str
-    """Its size, in words."""
+    """Size of the automaton, in words."""
     left_out: builtins.int
-    """How many states are not drawn."""
+    """Number of states that are not drawn."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonNode]: ...
     @property
     def moves(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___AutomatonMove]: ...
     @property
     def legend(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
-        """What the short names in labels stand for: "p0: cup leftof plate"."""
+        """Propositions of the short names in labels, such as "p0: cup leftof plate"."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ global___AutomatonDrawing = AutomatonDrawing
 
 @typing.final
 class AutomatonNode(google.protobuf.message.Message):
-    """A state of an automaton."""
+    """State of an automaton."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -175,16 +175,16 @@ class AutomatonNode(google.protobuf.message.Message):
     DISTANCE_FIELD_NUMBER: builtins.int
     number: builtins.int
     about: builtins.str
-    """The verdict of a run that ends there, and whether it can change, in words."""
+    """Verdict of a run that ends in the state, in words. The text also says whether the verdict can change."""
     column: builtins.float
-    """Its place in a drawing, in columns and rows: columns follow the moves, rows lie around 0."""
+    """Column and row of the state in a drawing. Columns follow the transitions, and rows are centred on 0."""
     row: builtins.float
     accepting: builtins.bool
-    """Whether a run that ends there is accepted."""
+    """Whether a run that ends in the state is accepted."""
     can_reject: builtins.bool
-    """Whether a run that came there can still be rejected."""
+    """Whether a run in the state can still be rejected."""
     distance: builtins.int
-    """How many samples it takes at least to come to be accepted; absent if that is lost."""
+    """Least number of samples from the state to acceptance; absent if acceptance is unreachable."""
     def __init__(
         self,
         *,
@@ -211,7 +211,7 @@ global___AutomatonNode = AutomatonNode
 
 @typing.final
 class AutomatonMove(google.protobuf.message.Message):
-    """A move of an automaton from a state to another one, or to itself."""
+    """Transition of an automaton from a state to another state, or to the same state."""
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -222,9 +222,9 @@ class AutomatonMove(google.protobuf.message.Message):
     source: builtins.int
     target: builtins.int
     guard: builtins.str
-    """The condition, in words."""
+    """Guard of the transition, in words."""
     label: builtins.str
-    """The condition as it is written on the arrow, with short names for long propositions."""
+    """Guard of the transition for a label at an arrow, with short names for long propositions."""
     def __init__(
         self,
         *,
@@ -258,23 +258,25 @@ class Node(google.protobuf.message.Message):
     UNIT_FIELD_NUMBER: builtins.int
     WRITTEN_FIELD_NUMBER: builtins.int
     id: builtins.int
-    """Number of the node, from the root, 0, in the order of the text."""
+    """Id of the node: its number in the order of the text, from 0 for the root."""
     parent: builtins.int
-    """Id of the node above; absent for the root."""
+    """Id of the parent; absent for the root."""
     operator: builtins.str
-    """The operator or relation, as the language writes it."""
+    """Operator or relation, as written in the language."""
     name: builtins.str
-    """The name that the specification gives to the node, or empty."""
+    """Name of the node in the specification; empty without a name."""
     text: builtins.str
-    """The subformula in canonical form."""
+    """Subformula in canonical form."""
     span_start: builtins.int
-    """Where the subformula stands in the file's source: code points from start up to end."""
+    """Position of the subformula in the file's `source`, in code points: from `span_start` up to `span_end`."""
     span_end: builtins.int
     unit: builtins.str
-    """Unit of the node's robustness; empty for footprint units."""
+    """Unit of the node's robustness. It is empty for footprint units of undeclared size, "1" for numbers without unit,
+    and "mixed" for atoms of several units.
+    """
     written: builtins.str
-    """The subformula as the file writes it, with the object in place of a template's parameter; what a `def`
-    stands for, in canonical form.
+    """Subformula as written in the file, with the object instead of a template's parameter. The body of a `def`, and
+    of a quantifier, has canonical form.
     """
     def __init__(
         self,
