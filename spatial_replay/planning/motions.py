@@ -515,7 +515,10 @@ class Ordered(NamedTuple):
                 "all motions work is taken"
             )
         if not self.arrangement:
-            return "the places that an earlier decision planned are kept, because they still work"
+            return (
+                "the places that an earlier decision planned still work and are kept; the target may be a "
+                "more robust place within 2 cells of its planned place"
+            )
         return (
             f"the first arrangement of objects that works is taken, here number {self.arrangement}; few "
             "objects and robust places are tried first, and better arrangements are not sought"

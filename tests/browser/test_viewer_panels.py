@@ -302,6 +302,9 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
     conjuncts = next(each for each in edge.candidates if each.chosen).conjuncts
     expect(answer.locator("tbody tr")).to_have_count(len(conjuncts) + 1)
     expect(answer).to_contain_text("red above blue: met by")
+    # a cell next to the target, nearer to the end of the shortest way
+    made.press("ArrowRight")
+    expect(answer).to_contain_text("The target is a more robust place near its end.")
     # a live source has neither numbers of maps nor, before it is played, the outcome
     live = open_panel("push", "decisions", "live")
     live.evaluate("viewer.play({sec: -1, nsec: 0}, {sec: 1, nsec: 0})")

@@ -203,10 +203,11 @@ function whyNotHere(run, map, {place, value, target, centre}) {
   if (map.way) {
     const way = run.numbers(map.way)[place];
     if (Number.isNaN(way)) return "No free way over cells leads there.";
-    if (way > map.least_way * (1 + 1e-6)) {
+    const [row, column] = cellAt(map, map.target.at), targetWay = run.numbers(map.way)[row * map.columns + column] || 0;
+    if (way > Math.max(map.least_way, targetWay) * (1 + 1e-6)) {
       return `The way there over cells is ${length(way)}, and the shortest to a place that will do is ${length(map.least_way)}.`;
     }
-    return `No place that will do has a shorter way over cells, ${length(way)}. The target is a more robust place near the end of such a way.`;
+    return `The shortest way over cells to a place that will do is ${length(map.least_way)}. The target is a more robust place near its end.`;
   }
   const room = map.room && run.numbers(map.room)[place];
   if (room !== undefined && room < map.least_room) {
