@@ -225,7 +225,7 @@ features:
         ("features: {b: {name: c}}", "features.b: the key 'position' is missing"),
         ("features: {b: {position: [0]}}", "features.b.position: expected"),
         ("features: {b: {position: [0, 1], frame: map}}", "features.b.frame: unknown key"),
-        ("fps: 0", "fps: expected frames a second"),
+        ("fps: 0", "fps: expected frames per second"),
     ],
 )
 def test_keys_of_topics_and_of_features_never_meet(text: str, fault: str) -> None:

@@ -154,7 +154,7 @@ def test_settings_come_from_a_file_and_options_have_precedence(tidied, tmp_path)
         (("--set", "room=-1"), "--set room: expected a number of 0 or more; got -1"),
         (("--set", "attempts=0"), "--set attempts: expected a whole number of at least 1; got 0"),
         (("--set", "yaws=0,3x"), "3x"),
-        (("--set", "skill=throw"), "--set skill: expected push (the path matters)"),
+        (("--set", "skill=throw"), "--set skill: expected push (slide along a path)"),
         (("push",), "--redo takes no scenario"),
         (("--seed", "0"), "--seed is for a run; leave it out with --redo"),
     ],
