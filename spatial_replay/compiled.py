@@ -60,7 +60,7 @@ class Compiler:
             )
         self.interprets = True
         self.spent_s = 0.0
-        # tasks that a child process compiles, and trial runs that load the compiled code
+        # pairs of a task, which a child process compiles, and a trial run, which loads the compiled code
         self.trials: list[tuple[str, Callable[[], object]]] = []
         self.loader: threading.Thread | None = None
         self._loading = set[int]()
@@ -146,7 +146,7 @@ class Compiler:
     @contextmanager
     def loading(self) -> Iterator[None]:
         """Let this thread load machine code, while other threads interpret."""
-        # a child process may have written files
+        # the cached list of files is dropped, because a child process may have written files
         self.__dict__.pop("_cached", None)
         previous_interval, thread_id = sys.getswitchinterval(), threading.get_ident()
         sys.setswitchinterval(_SLICE_S)
@@ -279,7 +279,7 @@ def start(task: str, trial: Callable[[], object], *, wait: bool = False) -> None
         task: name of the `spatial-replay warmup` task that compiles all kernels of the trial.
         wait: whether to compile in this process, and return when all kernels are compiled.
     """
-    # only at the first start: the garbage of a program with many monitors must be collected
+    # garbage collection is off only at the first start, because later starts collect earlier monitors
     collections = _no_collection() if _process.interprets else nullcontext()
     compile_ahead()
     if _process.only is not None or wait or _is_compiled(task):
@@ -351,7 +351,7 @@ def _load_code(folder: Path) -> None:
         while not _process.finish(trial_index):
             task, trial = _process.trials[trial_index]
             note_file = _note_of(task, folder)
-            # waits for children of other processes; the child inherits the lock, and keeps it until its end
+            # `turn` waits for children of other processes; the child keeps the inherited lock until its end
             with turn(folder, "warmup") as lock:
                 status = 0 if note_file.exists() else _compile_in_child(task, folder, lock)
             if not note_file.exists():
@@ -476,9 +476,9 @@ class _Kernel(Generic[_Arguments, _Result]):
             self._ready = compiled
             return result
         run = cast(Callable[..., _Result], self.interpreted_form())
-        # processor time of this thread, without waiting for other threads
+        # the processor time of this thread excludes its waits for other threads
         begin_s = time.thread_time()
-        # like machine code, without an error or a warning for a division by zero or an overflow
+        # machine code reports no division by zero and no overflow, so interpreted code must not either
         with np.errstate(all="ignore"):
             result = run(*(map(_view, arguments) if self._is_elementwise else arguments), **named)
         took_s = time.thread_time() - begin_s
@@ -628,13 +628,13 @@ def cache_folder() -> Path | None:
         try:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # in a folder of several users, the lock of another user cannot be opened
+            # this test fails if the folder belongs to another user, whose lock cannot be opened
             os.close(_opened_lock(folder))
             with tempfile.TemporaryFile(dir=folder):
                 if shutil.disk_usage(folder).free < _ROOM_BYTES:
                     raise OSError(errno.ENOSPC, "no space left")
         except OSError:
-            # the folder may have code of a container image, and be read-only or on a full disk
+            # a folder on a read-only or full disk may still hold the code of a container image
             packaged_folder = packaged_folder or (folder if any(folder.rglob("*.nbi")) else None)
             continue
         if is_new:
@@ -663,7 +663,7 @@ def remove_damaged_files(folder: Path) -> None:
             is_damaged = not _is_sealed(path) or _seal_of(path).read_bytes() != _digest_of(path)
             if is_damaged and (is_alone or _is_sealed(path)):
                 path.unlink()
-    # this process has a shared lock until it ends
+    # the shared lock shows other processes that this process uses the folder until it ends
     fcntl.flock(descriptor, fcntl.LOCK_SH)
 
 

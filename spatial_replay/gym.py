@@ -185,7 +185,7 @@ class VectorJudge(_VectorWrapper):
             episodes, info = self._episodes[env_index], _info_of(infos, env_index)
             final_values = info.pop("final_obs", None), info.pop("final_info", None)
             if is_reset[env_index]:
-                # in this mode, the step after the end is the reset, and its action is ignored
+                # in the mode NEXT_STEP, the step after an episode's end is a reset, whose action is ignored
                 judgement = episodes.begin(observation, info)
             elif self._mode is AutoresetMode.SAME_STEP and self._has_ended[env_index]:
                 judgement = episodes.extend(*_last_of(final_values), ended=True)
@@ -237,7 +237,7 @@ class _Episodes:
         self._stages = _stages(self._specification, rate_hz, is_needed=reward == "progress")
         self._objects, self._signals, self._log = objects, signals, log
         self._until, self._reward = until, reward
-        # exact for the written decimal: 29.97 is no binary fraction
+        # the fraction equals the written decimal; a double only approximates 29.97
         period_ns = Fraction(10**9) / Fraction(repr(float(rate_hz)))
         # a product of integers takes a tenth of the time of a product with a Fraction
         self._period_ns = int(period_ns) if period_ns.denominator == 1 else period_ns

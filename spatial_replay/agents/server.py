@@ -169,7 +169,7 @@ class Tools:
                 return _failure(outcomes.reason or self._error(outcomes.outcomes[0].err, files))
             outcome = outcomes.outcomes[0]
             mapping_text = "\n".join(escape_text(line, "\t") for line in outcome.out.splitlines())
-            # the lines have the whole mapping, too; only the text can be an argument of other tools
+            # the answer repeats the mapping as one text, which other tools take as an argument
             document = {"mapping": mapping_text if len(mapping_text.encode()) < _MAPPING else None}
             lines = mapping_text.split("\n")
             return _answer("suggest_mapping", 0, lines, _lines(outcome.err), {}, next, extra=document)
@@ -398,7 +398,7 @@ class Tools:
         (outcome,) = outcomes.outcomes
         answer_values = outcome.document or files.json(command)
         if answer_values is None:
-            # errors in the text are an answer of `check`; `answer_schema` describes the codes
+            # errors of a specification are an answer of `check`; `answer_schema` describes the exit codes
             is_answer = outcome.code in (0, 1, 4) or (outcome.code == 3 and outcome.out)
             if not is_answer and not (tool == "check" and _CARET.search(outcome.err)):
                 return _failure(self._error(outcome.err, files))

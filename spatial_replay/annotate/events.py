@@ -351,7 +351,7 @@ _LISTED: Final = frozenset({"specification", "object", "node", "verdict", "sign"
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
     """Encode an external event, such as a lost connection."""
-    # changes of verdicts that the event causes are reported with the samples
+    # the event has no verdict of its own; the next samples report the verdicts that it changes
     facts = {"occurrence": what, "verdict": str(Verdict.UNKNOWN), "message": sentence}
     stamp = _stamp(time_ns)
     event = Event(start_time=stamp, end_time=stamp)

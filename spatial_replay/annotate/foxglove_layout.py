@@ -565,8 +565,7 @@ def _layout(
     if curves:
         plots, tab_panels = _tabs("Tab!curves", [(_tab_title(plot), plot) for plot in curves])
         panels += [*tab_panels, states]
-        # curves have at least 140 pixels on a screen of 1280 × 720
-        # a strip has about 50 pixels
+        # on a screen of 1280 × 720, these heights give curves at least 140 pixels, and each strip about 50
         right_parts += [(plots, 4.5), (states.identifier, min(len(states.config["paths"]), 2) + 1.0)]
     if details:
         tabs, tab_panels = _tabs("Tab!details", details)

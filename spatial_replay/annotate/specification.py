@@ -194,7 +194,7 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     if len(declared_units) > 1:
         return MIXED
     if not declared_units and any(iter_atoms(formula)):
-        return DIMENSIONLESS  # the formula only compares modes, whose robustness is infinite
+        return DIMENSIONLESS  # all atoms compare modes: their robustness is infinite
     return declared_units.pop() if declared_units else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
@@ -309,7 +309,7 @@ def _logged_copy(same: _Same) -> Specification:
         try:
             text = text_of(file)
             if set(file.plugins) - set(used_modules(text)):
-                # the text of a log must name a plug-in that only the command line names
+                # the text in a log must name every plug-in; this text lacks a plug-in of the command line
                 continue
             read_back = parse_specification(text, filename=file.filename)
         except SpecificationError:

@@ -47,7 +47,7 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     """
     ranks = _RANKS[codes]
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
-    # minus 1 puts the worst rank before other ranks, also without a violation
+    # minus 1 puts results of the worst rank before the other results, which get `LATEST_NS`
     priorities = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
     return np.asarray(priorities.argmin(axis=0), np.int64)
 

@@ -76,7 +76,7 @@ class Shade:
         """
         if not self.requirement.is_invariant or not self.least_bound:
             return part
-        # only failing samples have numbers: an object without a number never failed, and held by at least 0
+        # only failing samples have numbers, so an object without a number held by at least 0
         number = self.least_bound.get(name, 0.0)
         return np.where(part < 0.0, number, part)
 
@@ -463,7 +463,7 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
             )
             earliest_ns[is_first] = since_ns[requirement_index]
         if result.settled is not None and result.settled.shown is not None:
-            # a goal after its deadline may have settled the violation
+            # the violation may have been settled earlier, for example by the missed deadline of a goal
             is_first = _shows_settling_leaf(result, times_ns) & (result.settled.time_ns < earliest_ns)
             result_indices[is_first], robustness[is_first] = index, -abs(result.settled.shown.number)
             earliest_ns[is_first] = result.settled.time_ns

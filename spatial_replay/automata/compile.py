@@ -257,7 +257,7 @@ def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
     if not false_cubes or not true_cubes:
         raise NoAutomatonError(f"it printed moves that leave {symbol!r} open")
     when_false = _node(diagrams, false_cubes, variable + 1)
-    # without this, a variable that is free in every cube would double the work
+    # equal lists of cubes share a node; otherwise each free variable would double the work
     when_true = when_false if false_cubes == true_cubes else _node(diagrams, true_cubes, variable + 1)
     return diagrams.decide(variable, when_false, when_true)
 
@@ -307,7 +307,7 @@ class Obligations:
         chain, member_index = self._chain_places[obligation]
         node = YES
         for bit in range(chain.bits):
-            # a member holds iff only earlier members fail: iff at most `member_index` members fail
+            # failing members come first in a chain, so a member holds iff at most `member_index` members fail
             branches = (YES, node) if member_index >> bit & 1 else (node, NO)
             node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
         return node
@@ -780,7 +780,7 @@ def automaton(
         raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, above 0")
     spec = chosen_spec(specification, name)
     if counts_seconds(spec.formula):
-        # a file does not say at which rate it was compiled
+        # a stored automaton does not name the rate that turned its seconds into samples, so it is not used
         stored = ()
     source = SourceText.of(specification.source, specification.filename) if specification.source else None
     propositions = Propositions(spec.formula)
@@ -833,7 +833,7 @@ class _Shape:
     root: int
     chains: frozenset[tuple[tuple[int, bool], int]]
     propositions: int
-    # the input of the compiler, which the other fields determine
+    # comparisons leave out the skeleton, because the other fields determine it
     skeleton: Skeleton = field(compare=False, repr=False)
 
     @classmethod

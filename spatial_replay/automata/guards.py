@@ -211,7 +211,7 @@ class Propositions:
     def _add(self, formula: Formula) -> None:
         shape = self._shapes.of(formula)
         if shape in (YES, NO):
-            # a tautology or contradiction, except where a relation and its opposite are both 0
+            # its text identifies the formula: it is no constant where a relation and its opposite are both 0
             shape = self._shapes.of_text(formula)
         negated_shape = self._shapes.negate(shape)
         if negated_shape in self._numbers:
@@ -260,7 +260,7 @@ class Shapes:
             try:
                 node = self._of(expand(formula))
             except (NoAutomatonError, RecursionError):
-                # too large for a comparison by meaning: only equal texts are recognized as equivalent
+                # a formula that is too large for a comparison by meaning is compared by its text
                 node = self.of_text(formula)
             # the stored formula stays in memory, so no other formula gets its id
             self._nodes[id(formula)] = formula, node

@@ -80,7 +80,7 @@ def least(machine: Machine) -> Machine:
     # compilers differ in their unreachable states, so these are dropped
     start_states = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
     if len(start_states):
-        # argmin prefers False: a state that does not accept
+        # argmin finds a state that does not accept, if there is one
         start_state = int(start_states[np.argmin(machine.accepting[start_states])])
     else:
         start_state = len(machine.moves)

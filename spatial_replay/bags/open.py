@@ -360,7 +360,7 @@ class BagFolder(MessageReader):
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         if self._metadata is None:
-            # the reader of each file compares the counts of the file
+            # without metadata of the bag, the reader of each file compares the counts of its file
             return columns
         name = name or f"{self.name}/{BAG_METADATA}"
         for topic in self._topics:

@@ -126,7 +126,7 @@ def decompress_chunk(compression: bytes, data: bytes, size: int) -> bytes:
 def record_table(content: bytes) -> tuple[RecordTable, bool]:
     """Return the records in a chunk's content, and whether the last record breaks off."""
     view = np.frombuffer(content, np.uint8)
-    # an empty table, to count the records first
+    # the first walk only counts the records, so its table is empty
     record_count, _ = _walk(view, np.empty((6, 0), np.int64))
     table = np.empty((6, record_count), np.int64)
     _, end_offset = _walk(view, table)

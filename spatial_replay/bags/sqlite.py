@@ -307,7 +307,7 @@ class SqliteBag(MessageReader):
         bag_copy, _ = (copy_beginning(file, file.stat().st_size, folder) for file in (self._path, log_file))
         most_bytes = bag_copy.stat().st_size + log_file.stat().st_size
         try:
-            # in a separate folder, so that only the copies are read and written
+            # the copies are in a separate folder, so that SQLite never opens the original files
             with closing(sqlite3.connect(bag_copy, isolation_level=None)) as database:
                 database.execute("PRAGMA trusted_schema=OFF")
                 # the checkpoint copies the pages of the write-ahead log into the copy of the file

@@ -72,7 +72,7 @@ def repository_path(file: str | Path) -> str:
         (folder for folder in (current, *current.parents) if (folder / ".git").exists()), current
     )
     for base in (Path(job_folder) if job_folder else repository, repository):
-        # the path before its links are resolved, because a link in the repository may lead outside
+        # the unresolved path is tried first, because a link in the repository may lead outside
         for candidate, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
             if candidate.is_relative_to(root):
                 return candidate.relative_to(root).as_posix()

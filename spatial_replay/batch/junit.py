@@ -54,7 +54,7 @@ def write_junit(
         UsageError, OutputError: the file cannot be written.
     """
     text = ""
-    # the full report, then with short texts, then without passing test cases
+    # a report above the size limit first gets short texts, and then loses its passing test cases
     for text_limit, is_full in ((None, True), (_SHORT, True), (_SHORT, False)):
         text = "".join(_lines(table, name, reports or {}, text_limit, is_full))
         if len(text.encode()) <= largest:
@@ -114,7 +114,7 @@ def _lines(
         for key, value in entries:
             yield f"<property name={_quote(key)} value={_quote(value)}/>\n"
         yield "</properties>\n"
-        # with the stem of the file, because two files may have a spec of the same name
+        # the class name has the stem of the file, because two files may have a spec of the same name
         class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
         for row in listed_rows:
             yield from _case(row, class_name, reports, limit)

@@ -315,7 +315,7 @@ def _cell(row: Values | None) -> Html:
             "td", f"{verdict}{note}", title=row["failure"] or "", **{"class": classes, "data-value": "-1e400"}
         )
     words = verdict if robustness is None or verdict in ("untested", "doubtful") else f"{robustness:.4g}"
-    # finite, so that errors sort before all numbers, and empty cells after them
+    # the sort value is finite, so that errors sort before all numbers, and empty cells after all numbers
     sort_value = "0" if robustness is None else f"{max(-1e300, min(1e300, robustness)):.17g}"
     failure_text = f": {row['failure'].rstrip('.')}" if fails else ""
     tooltip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{failure_text}."

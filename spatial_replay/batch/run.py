@@ -218,7 +218,7 @@ def _logs_of(text: str, folder: Path) -> Iterator[FoundLog]:
         if path.is_dir():
             yield from _logs_in(path, folder)
         elif path.exists():
-            # the row of another kind of file reports the error
+            # a file of another kind becomes a log, and its row reports the error
             yield from _episodes_in(path, folder) or [_log_at(path, folder)]
         elif (address := data_set_address(path)) is not None:
             data_set = open_data_set(address[0])

@@ -602,7 +602,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
         if difference.change == "gone":
             gone_results.append(difference)
         elif difference.fails:
-            # all objects of a template share one row with an error
+            # an error gives one row for all objects of a template
             key = difference.key if difference.key in present_keys else (*difference.key[:-1], None)
             beginning = EDITED_SINCE if difference.is_edited else WORSE_THAN
             worse_texts[key].append(f"{beginning}: {difference.failure}")
@@ -677,10 +677,10 @@ def _differences(
 ) -> Iterator[Difference]:
     spec_keys = {key[:-1] for key in current_results}
     for key, (old_verdict, old_number) in earlier_results.items():
-        # all objects of a template share one row with an error
+        # an error gives one row for all objects of a template
         current_result = current_results.get(key) or current_results.get((*key[:-1], None))
         if current_result is None and old_verdict is None and key[:-1] in spec_keys:
-            # an error that all objects shared in the baseline; the objects have results now
+            # the baseline has one error row for all objects, which have results of their own now
             continue
         if current_result is None:
             yield Difference(
@@ -705,7 +705,7 @@ def _differences(
                 robustness=new_number,
             )
     for key, (new_verdict, new_number) in current_results.items():
-        # an error that all objects of a template share is no new result
+        # an error row for all objects of a template is no new result
         if key not in earlier_results and not (new_verdict is None and key[-1] is None):
             yield Difference(
                 "new", *key, before=None, now=new_verdict, before_robustness=None, robustness=new_number

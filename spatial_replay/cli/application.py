@@ -180,7 +180,7 @@ def _end_waiting_threads(exit_code: int) -> None:
     """End the process if a thread still waits, for example for data of a pipe."""
     deadline_s = time.monotonic() + _PATIENCE_S
     main_thread = threading.main_thread()
-    # an interruption may precede the start of a new thread, and such a thread cannot be joined
+    # a thread that was interrupted before its start has no `ident`, and cannot be joined
     threads = [
         thread
         for thread in threading.enumerate()

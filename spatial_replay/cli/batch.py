@@ -82,7 +82,7 @@ def print_totals(table: pa.Table, by: By) -> None:
         line: list[str | Coloured] = [f"  {title:<{width}}"]
         for name, counts in counts_by_heading.items():
             count = counts[index]
-            # only satisfied results are coloured if all verdicts are as expected
+            # without failures, the violated and unknown results were expected, and get no colour
             colour = _COLOURS.get(name) if total.failures or name == "satisfied" else None
             cell = f"{count:>9,}" if count else f"{'-':>9}"
             line += ["  ", Coloured(cell, colour) if count and colour else cell]

@@ -332,7 +332,7 @@ class _CutResults:
     def add(self, trace: Trace) -> None:
         """Evaluate the next samples."""
         for blocks, block in zip(self._blocks_by_instance, self._stream.extend(trace), strict=True):
-            # only leaves are needed, and a view without a copy would keep the whole series in memory
+            # only leaves are needed; an empty view instead of a copy would keep the whole series in memory
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
     def warnings(self, source: Source, ends: RunEnds, zero_ns: int) -> Iterator[Diagnostic]:

@@ -358,7 +358,7 @@ class RecordGroup(click.Group):
         if not ctx.args:
             return click.Command.invoke(self, ctx)
         name, *arguments = ctx.args
-        # a sibling of this context, because the usage of a child would name SCENARIO, too
+        # the new context is a sibling of this context, because the usage of a child would name SCENARIO, too
         path = f"{ctx.info_name} {name}"
         with self.commands[name].make_context(path, arguments, parent=ctx.parent) as context:
             return context.command.invoke(context)

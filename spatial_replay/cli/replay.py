@@ -196,7 +196,7 @@ def follow_saves(
                     report_error(error)
                     show("the evaluation before stays", err=True)
     except KeyboardInterrupt:
-        # the regular way to stop watching
+        # an interruption is the regular way to stop watching
         return ExitCode.INTERRUPTED
     return ExitCode.SATISFIED
 
@@ -287,7 +287,7 @@ def serve(
     try:
         return _serve(evaluation, files, serving, play)
     except KeyboardInterrupt:
-        # the regular way to stop the server
+        # an interruption is the regular way to stop the server
         return ExitCode.INTERRUPTED
 
 

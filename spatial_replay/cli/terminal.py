@@ -299,7 +299,7 @@ class _Bar:
             )
 
     def _appear(self) -> None:
-        # None inside other work, which already has a bar
+        # `_start_bar` returns None inside other work, which already has a bar
         self._progress = _start_bar(self._description, self._total, self._step_count)
         # steps may have been done while the bar was made
         self._update()

@@ -651,7 +651,7 @@ def _spec_diff(
         elif sum(other_edit.change is None and other_edit.kind != "renamed" for other_edit in tree.edits) > 1:
             return None
         else:
-            # the only edit of the specs' text: the new text with all old declarations has just this edit
+            # the specs have no other edit, so the new text with all old declarations contains only this edit
             is_undone = not is_undone
         evaluation = by_version(
             frozenset(change_indices), new_result.name if is_undone else old_result.name, is_undone=is_undone
@@ -674,7 +674,7 @@ def _spec_diff(
 
     cause_edits = [(edit, unit) for unit in cause_units for edit in tree.units[unit]]
     if len(cause_units) == 1 and len(cause_edits) > 1:
-        # of several edits that share a node, one may be enough
+        # one of the edits that share a node may be sufficient by itself
         cause_edits = next(
             ([edit_with_unit] for edit_with_unit in cause_edits if suffices(edit_with_unit[0])), cause_edits
         )

@@ -977,7 +977,7 @@ class _Search:
         while len(runs) < budget and barren_rounds < _BARREN and not first_run.is_violated:
             points: Sequence[Any] = descents.ask() if descents is not None else [()] * _DRAWN
             draws = [
-                # the seeds with the least cost so far, or new seeds
+                # a case gets the seeds with the least cost so far, or new seeds, with equal probability
                 best_draw[1] if best_draw is not None and generator.random() < 0.5 else space.draw(generator)
                 for _ in points
             ]

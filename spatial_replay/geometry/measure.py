@@ -259,8 +259,7 @@ def closest_rows(
                 member_order[slot] = member_order[slot - 1]
                 slot -= 1
             member_order[slot] = moved_member
-        # enlargement and uncertainty make distances less than gaps of boxes. 1e-9 covers rounding of
-        # distances and gaps.
+        # enlargement and uncertainty reduce distances below the gaps of boxes; 1e-9 covers rounding
         slack = enlargement + 2.0 * widest_uncertainty + 1e-9 * greatest_coordinate
         least_distance, least_low, least_high = np.inf, np.inf, np.inf
         for position in range(present_count):

@@ -24,9 +24,9 @@ MOST_CORNERS = 2_000
 MOST_CONVEX_CORNERS = 10_000
 """Corner limit of convex polygons, because each sample measures all corners for every pair of objects."""
 
-# A vertex within a tolerance of a line counts as on the line. Factors of the tolerance: for the outline's
-# extent, and for its greatest coordinate (4 units in the last place). The floor keeps the squared tolerance
-# above zero.
+# A vertex counts as on a line if it is within a tolerance. The tolerance is `_FLATNESS` times the outline's
+# extent, or `_ROUNDING` (4 units in the last place) times the greatest coordinate, if that is more.
+# `_SMALLEST` keeps the squared tolerance above zero.
 _FLATNESS = 1e-9
 _ROUNDING = 4 * 2.0**-52
 _SMALLEST = 1e-100

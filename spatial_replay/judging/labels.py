@@ -117,7 +117,7 @@ def _stored_label(data_set: DataSet, number: int, reading: EpisodeReading) -> Su
         return unlabelled
     if success is None or not success.size:
         return unlabelled
-    # a label in an earlier frame describes a stored state
+    # a label before the last frame describes a state that is stored
     is_last = success.ndim == 1 and not success[:-1].any()
     is_own = field is None or (label is not None and label.field == field)
     is_about_next = label is not None and label.is_about_next if is_own else str(field).startswith("next.")

@@ -48,7 +48,7 @@ def episode_stages(
     stages: dict[str, Stages] = {}
     with progress("stages", len(judgement.rows)) as advance:
         for row in judgement.rows:
-            # the row of a log already reports its errors
+            # a row without a verdict already reports the error of its log
             if row.verdict is not None:
                 with suppress(GeometryError, LogError, TraceError):
                     task = Task(row.log, (texts[file_index],), conditions)

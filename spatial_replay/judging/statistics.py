@@ -95,7 +95,7 @@ def _power(pair_count: int, won: int, lost: int, observed_pairs: int) -> float:
     binom = _scipy().binom
     differing_pairs = np.arange(pair_count + 1)
     weights = binom.pmf(differing_pairs, pair_count, (won + lost) / observed_pairs)
-    # weights far from the mean do not change the sum of doubles
+    # numbers of pairs far from the mean have weights too small to change the sum
     differing_pairs, weights = differing_pairs[weights > 1e-17], weights[weights > 1e-17]
     limits = _critical(differing_pairs)
     win_share = won / (won + lost)

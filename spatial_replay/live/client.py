@@ -103,7 +103,7 @@ class Inbox:
             ):
                 self._drop()
         if isinstance(arrival, Offered):
-            # channels are a live view, so an unread item already has all channels that are offered now
+            # the channels are a live view: an unread item with the same view already shows the new channels
             if self._latest_offer is not None and self._latest_offer.channels is arrival.channels:
                 return
             self._latest_offer = arrival

@@ -446,7 +446,7 @@ class LiveSession:
             with suppress(asyncio.CancelledError, Exception):
                 await client_task
 
-    # ------------------------------------------------------------------------------ what comes
+    # ------------------------------------------------------------------------------ arrivals
 
     def _wants(self, topic: str) -> bool:
         return self._is_evaluated(topic) or self._is_copied(topic)
@@ -546,7 +546,7 @@ class LiveSession:
                         # the run begins after the pause, so that no value is held during the pause
                         self._early_inbox = Inbox()
                     else:
-                        # after a lost connection, no sample waits for a topic
+                        # pending samples are evaluated now, because a lost connection delivers no topic
                         trace = self._assembler.flush()
                         async for update in self._evaluate(trace, at_s, self._ends.release):
                             yield update
@@ -814,7 +814,7 @@ class LiveSession:
         now_s = time.monotonic()
         if self._assembler is not None:
             arrived_s = min(arrived_s, self._assembler.arrived_s(sample.time_ns))
-        # the arrival is infinite for a sample that no message completed
+        # the arrival time of a sample is infinite if no message completed the sample
         self._delay_s = max(0.0, now_s - min(arrived_s, now_s))
         for recorder in self._recorders:
             recorder.write(sample)
@@ -938,7 +938,7 @@ async def monitor(
             async for update in session.updates():
                 yield update
         finally:
-            # the log also gets the doubts if the caller left the loop
+            # closing adds the doubts to the log, even if the caller left the loop
             session.close()
         if session.failure is not None:
             raise session.failure

@@ -185,7 +185,7 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Concatenate streams of messages; channels are renumbered by their content."""
-    # by identity: a rank holds the whole schema, so the rank of a channel is computed only once
+    # channels are keyed by identity, so that a rank, which holds the whole schema, is not computed per stream
     channel_by_id = {id(channel): channel for stream in streams for channel in stream.channels.values()}
     channel_by_rank = {_rank(channel): channel for channel in channel_by_id.values()}
     number_by_rank = {rank: number for number, rank in enumerate(sorted(channel_by_rank))}

@@ -110,7 +110,7 @@ def layout_of(message: ObjectStates) -> SlotLayout:
     column_names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty", "reported")
     slots_by_column: dict[str, list[int]] = {name: [] for name in column_names}
     for state in message.objects:
-        # in the order in which protobuf encodes the fields
+        # slots are taken in the order in which protobuf encodes the fields
         for part in state.parts:
             slots_by_column["coordinates"] += (next(slots) for _ in part.coordinates)
             slots_by_column["radius"].append(slot(part.HasField("radius"), ZERO))
@@ -340,7 +340,7 @@ def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
 def _pad(words: Words) -> Floats:
     padded_words = np.empty((len(words), words.shape[1] + 2))
     padded_words[:, :-2] = words.view(np.float64)
-    # UNKNOWN and ZERO
+    # the extra columns are `UNKNOWN` and `ZERO`
     padded_words[:, -2:] = np.nan, 0.0
     return padded_words
 

@@ -162,7 +162,7 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     try:
         output.lstat()
     except (FileNotFoundError, NotADirectoryError, PermissionError):
-        # reported below, or when the file is opened
+        # these errors are reported below, or when the file is opened
         pass
     except (OSError, ValueError) as error:
         raise UsageError(

@@ -699,7 +699,7 @@ def _encoded_object(figure: DrawnObject, lift: float) -> bytes:
 # stamps have one length.
 _SECONDS, _NANOS = (1 << 34) - 1, (1 << 30) - 1
 _A_STAMP: Final = Timestamp(seconds=_SECONDS, nanos=_NANOS)
-# bytes of ones occur in no text, and all other numbers are slots or ordinary constants
+# no text has the bytes 0xff of this stamp, and all other numbers are slots or ordinary constants
 _STAMP_BYTES: Final = _A_STAMP.SerializeToString()
 _STAMP: Final = len(_STAMP_BYTES)
 _STAMP_WORDS: Final = (0, _STAMP - 8)

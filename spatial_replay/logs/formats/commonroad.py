@@ -284,7 +284,7 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     elements = iter_elements(path, faults, _OBSTACLES)
     step_s = _step_size(path, next(elements))
     obstacles = list(_iter_obstacles(path, faults, elements))
-    # a scenario of static obstacles only is one sample
+    # a scenario with only static obstacles has one sample, at time step 0
     time_steps = sorted({time_step for obstacle in obstacles for time_step in obstacle.moving_states}) or (
         [0] if obstacles else []
     )
@@ -325,7 +325,7 @@ def _step_size(path: Path, root: Element) -> Fraction:
     if not 1e-9 <= step_size_s <= 1e9:
         place = f"{path.name}:{root.line}"
         raise LogError(f"{place}: timeStepSize is {text[:60]!r}; give seconds from 1e-9 to 1e9")
-    # exactly as written: 0.1 s is 100 ms to the nanosecond
+    # the fraction equals the written decimal: 0.1 s is exactly 100 ms
     return Fraction(repr(step_size_s))
 
 

@@ -113,7 +113,7 @@ class _Demonstrations(InGroups):
         episodes_group = file.group(self.folder) or file
         keys = sorted((key for key in episodes_group.names if _NUMBERED.fullmatch(key)), key=natural_key)
         episode_numbers = [int(key.rpartition("_")[2]) for key in keys]
-        # groups of several prefixes may share a number
+        # groups with different prefixes may share a number
         episode_numbers = (
             episode_numbers if len(set(episode_numbers)) == len(keys) else list(range(len(keys)))
         )

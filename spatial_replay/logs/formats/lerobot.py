@@ -103,7 +103,7 @@ class _LeRobot(DataSet):
                 " of numbers; use the original"
             )
         self.remarks = tuple(remarks)
-        # the last file and its time, the names of requested columns, and the columns with these names
+        # cache of the last read: the file with its time, the names of requested columns, and these columns
         self._loaded: tuple[object, AbstractSet[str], Mapping[str, Floats]] = (None, frozenset(), {})
 
     def open_episode(self, episode: Episode) -> AbstractContextManager[list[_Rows]]:
@@ -333,7 +333,7 @@ def _remarks(
     if "timestamp" in columns:
         time_errors_s = np.abs(columns["timestamp"].reshape(-1) - frames / fps)
         row = int(np.nan_to_num(time_errors_s, nan=0.0).argmax()) if len(time_errors_s) else 0
-        # late times in float32 are less exact than the usual error
+        # float32 can store late times with an error above `_TIME_ERROR_S`
         if len(time_errors_s) and time_errors_s[row] > max(
             _TIME_ERROR_S, float(np.spacing(np.float32(frames[row] / fps)))
         ):

@@ -220,7 +220,7 @@ def footprints_of(geoms: Sequence[_Geom], positions: Floats, quaternions: Floats
     projections = FootprintBatch.concatenate(
         [_projection(geom, centres + rotations @ geom.position, rotations @ geom.rotation) for geom in geoms]
     )
-    # the rows, which are sorted by geom and state, are sorted by state and geom
+    # the order of the rows changes from (geom, state) to (state, geom)
     state_order = np.arange(len(geoms) * state_count).reshape(len(geoms), state_count).T.reshape(-1)
     sorted_projections = projections.select(state_order)
     merged = replace(

@@ -257,7 +257,7 @@ def _report(entry: Any) -> ObjectReport:
         if len(height) != 2:
             raise _NoSampleError(f"{object_text}: height has {len(height)} numbers; give [bottom, top]")
         report.bottom, report.top = (_number(value, f"{object_text}: height") for value in height)
-        # a height of two unknown numbers; NaN differs from itself
+        # a height is invalid if both numbers are NaN, which differs from itself
         report.invalid = report.bottom != report.bottom and report.top != report.top
     if entry.get("yaw") is not None:
         report.yaw = _number(entry["yaw"], f"{object_text}: yaw")

@@ -319,7 +319,7 @@ class _Scan:
     def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
         self._stream = stream
         self._file_bytes = size
-        # greater than the size while the scan is inside a chunk that breaks off
+        # `_end` exceeds the file's size while the scan is inside a chunk that breaks off
         self._end = size
         self._faults = faults
         self._name = name

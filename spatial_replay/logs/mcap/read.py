@@ -362,7 +362,7 @@ class McapSource(FileSource):
 
     @property
     def _given(self) -> Mapping[str, object]:
-        # the metadata of our logs have the read options of the recording
+        # the metadata of our logs already have the read options of the recording
         return {}
 
     @noting_pauses

@@ -478,7 +478,7 @@ class LogWriter:
         counts = sum(np.bincount(part.channels, minlength=len(self._channels) + 1) for part in lane.records)
         declarations = [self._declarations[number] for number in np.flatnonzero(counts).tolist()]
         due_declarations = [declaration for declaration in declarations if start_ns >= declaration.due_ns]
-        # repeated, so that other chunks keep their declarations when a chunk is broken
+        # declarations are repeated, so that a broken chunk does not take them from other chunks
         for declaration in due_declarations:
             declaration.count += 1
             declaration.due_ns = -FOREVER if declaration.count < 2 else start_ns + REPEAT_NS
