@@ -210,10 +210,10 @@ _Result = TypeVar("_Result")
 _PATIENCE_S: Final = 0.8
 """Time for which a process always interprets kernels, seconds: the time for loading numba and code."""
 _FIRST_S: Final = 1.5
-"""Limit instead of `_PATIENCE_S` for a new kernel, seconds. Most kernels take a tenth of the guess."""
+"""Replaces `_PATIENCE_S` while a kernel's time is a guess, seconds. Most take a tenth of the guess."""
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.03
-"""Further limits per kernel, seconds: without cached machine code (`_COLD_S`), or with it (`_WARM_S`)."""
+"""Limits of a kernel's interpreted time, seconds: `_COLD_S` without, `_WARM_S` with cached machine code."""
 _GUESS_S: Final = 2e-6
 """Guessed time of a new kernel, seconds per array element."""
 _LONG: Final = 3.0

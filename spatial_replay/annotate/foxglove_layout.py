@@ -608,7 +608,7 @@ def _tabs(identifier: str, titles_and_panels: Sequence[tuple[str, Panel]]) -> tu
 
 _Tree = str | dict[str, Any]
 _LIT_SHARE: Final = 9.0
-"""Ratio of two heights: the panels below the lights, and the row of lights."""
+"""Height of the panels below the row of lights, multiples of the row's height."""
 
 
 def _split(direction: str, parts: Sequence[tuple[_Tree, float]]) -> _Tree:

@@ -1,4 +1,4 @@
-"""Conditions of a run. The table of the run has them, for later explanations."""
+"""Conditions of a run, which its table stores for later explanations."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _PICTURES = (".png", ".svg", ".html")
 _MANY = frozenset({"--good", "--bad"})
 _MOST_LISTED = 20
-"""Runs that are listed, at most. JSON has all."""
+"""Maximum number of listed runs; JSON lists all."""
 
 
 class ManyLogs(JsonCommand):

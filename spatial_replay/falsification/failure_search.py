@@ -722,7 +722,7 @@ FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
-"""Maximum number of halvings of a group's distance from rest, if the failure needs a variation."""
+"""Maximum number of halvings of a group's distance from rest, if the run at rest does not fail."""
 _BARREN: Final = 50
 """Rounds without a new case after which the search ends."""
 _DRAWN: Final = 10

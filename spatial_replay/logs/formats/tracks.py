@@ -31,7 +31,7 @@ from spatial_replay.trace.trace import LATEST_NS, Trace, class_order, require_fe
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
-"""Longest line, bytes; a longer line is damage, or in a file of another kind."""
+"""Longest line, bytes; a longer line is damaged, or its file is of another kind."""
 
 MOST_BLANK_LINES = 10_000_000
 """Maximum number of blank lines in a file; further lines are not read."""
