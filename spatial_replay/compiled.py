@@ -69,7 +69,7 @@ class Compiler:
         # not read from `sys.modules`: another thread may still be importing the module
         self._compiler: Any = None
         self.lock = threading.RLock()
-        # held during the use of files that a forked process must not inherit
+        # a thread holds this lock while it uses files that a forked process must not inherit
         self.fork_lock = threading.Lock()
         self.turns = set[int]()
 

@@ -261,7 +261,7 @@ class LeafHistory:
         ]
         self._blocks: list[SeriesBlock] = []
         self._sample_count = 0
-        # always with four channels, so that uncertain leaves in a block do not change the limit
+        # the limit assumes four channels, so that uncertain leaves in a block do not change it
         self._sample_limit = MOST_NUMBERS // max(4 * len(order), 1)
 
     def extend(self, block: SeriesBlock) -> None:

@@ -316,7 +316,7 @@ class Skeleton:
     def _node(self, kind: Kind, first: int = 0, second: int = 0) -> int:
         node = Node(kind, first, second)
         if kind in ("U", "R") and self.nodes[second][:2] == (kind, first):
-            # G G a is G a: the text `G a and G b` parses as G (a and G b), which splits into G a and G G b
+            # `G G a` is `G a`; it arises because the text `G a and G b` parses as `G (a and G b)`
             return second
         if node not in self._numbers:
             if len(self.nodes) == MAX_NODES:

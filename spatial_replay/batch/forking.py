@@ -20,7 +20,7 @@ def forking_context(modules: Sequence[str]) -> ForkServerContext:
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*modules])
-    # before the signal is blocked, because `resource_tracker.ensure_running` unblocks SIGINT
+    # the resource tracker starts before SIGINT is blocked, because its start unblocks SIGINT
     resource_tracker.ensure_running()
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -55,7 +55,7 @@ def identify(
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
     """Return the identity of each log; None for an unreadable log."""
     if not any(map(is_address, paths)):
-        # a signal interrupts the reading of local files only in this thread
+        # this thread reads local files, because a signal does not interrupt reads in other threads
         files = _LogFiles()
         return {path: _identity(path, files) for path in paths}
     return dict(zip(paths, each_ahead(_identity, paths, _TOGETHER), strict=True))

@@ -513,7 +513,7 @@ def run_batch(
         identities_by_state = {
             states[path] or "": identity for path, identity in identities.items() if identity and states[path]
         }
-        # written before the evaluation: after a killed batch, the next batch does not hash the logs again
+        # identities are written before the evaluation, so that a killed batch does not lose them
         folder.write_identities(identities_by_state)
         storable_keys = {
             request.key for request in requests if request.key is not None and not request.file.has_plugins

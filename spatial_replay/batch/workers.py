@@ -271,7 +271,7 @@ class DaskCluster:
         with importing("clusters need Dask", extra="cluster"):
             import distributed
         client_type = cast(Any, distributed).Client
-        # created in two steps, to close a client without a connection here, and not when Python exits
+        # `__init__` is a separate step, so that a client that cannot connect is closed here
         client = client_type.__new__(client_type)
         try:
             client.__init__(self._address, timeout=_ANSWER_S, set_as_default=False)

@@ -232,7 +232,7 @@ def pressed_keys() -> Iterator[Callable[[], str]]:
     terminal_settings = termios.tcgetattr(terminal)
 
     def keys() -> str:
-        # read past Python's buffer, which `select` does not see
+        # `os.read` bypasses Python's buffer, which `select` does not see
         readable_files = select.select([terminal], [], [], 0.0)[0]
         return os.read(terminal, _MOST_KEYS).decode(errors="replace") if readable_files else ""
 

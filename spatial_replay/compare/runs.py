@@ -476,7 +476,7 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
     for property_a, property_b in property_pairs:
         # NaN on both sides is no difference
         is_moved |= (property_a != property_b) & ~(np.isnan(property_a) & np.isnan(property_b))
-    # relative to one vertex: far from the origin, the difference of two means would lose digits
+    # means are relative to one vertex: far from the origin, their difference would lose digits
     first_vertices = footprints_a.vertices[footprints_a.vertex_start[footprints_a.part_start[:-1]]]
     shift_x, shift_y = _mean_vertices(footprints_b, first_vertices) - _mean_vertices(
         footprints_a, first_vertices

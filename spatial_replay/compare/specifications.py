@@ -497,7 +497,7 @@ def diff_over_source(
     old_evaluation, new_evaluation = evaluate_version(old_specs, old), evaluate_version(new_specs, new)
     spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
-        # by id, because two results can have equal formulas
+        # the keys are ids, because two results can have equal formulas
         id(new_spec.formula): compare_trees(
             old_spec.formula,
             new_spec.formula,

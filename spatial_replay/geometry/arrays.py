@@ -153,7 +153,7 @@ def select(table: _Table, rows: Integers | slice) -> _Table:
     """
     if isinstance(rows, slice):
         return _map_columns(table, lambda name: getattr(table, name)[rows])
-    # converted once, and only if a column is not an array
+    # `cache` converts the rows at most once, for the first column that is not an array
     row_numbers = cache(rows.tolist)
 
     def selected_column(name: str) -> Any:

@@ -235,7 +235,7 @@ def _convex_protrusion(
 @reference_free
 def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) -> tuple[float, float, float]:
     """Return the area of a rounded part, and the centroid (x, y) of its unrounded polygon."""
-    # relative to the first vertex (x0, y0), so that products of coordinates far from the origin do not cancel
+    # coordinates are relative to the first vertex, so that products far from the origin do not cancel
     x0, y0 = vertices[start, 0], vertices[start, 1]
     doubled_area = sum_x = sum_y = mean_x = mean_y = perimeter = 0.0
     for vertex in range(start, stop):

@@ -42,7 +42,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
     partial_path = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
     try:
         with _writing(output):
-            # exclusive, so that two writers never share a partial file; 0o666 leaves the mode to the umask
+            # O_EXCL keeps two writers from sharing a partial file; 0o666 leaves the mode to the umask
             descriptor = os.open(partial_path, _CREATE | os.O_EXCL, 0o666)
         with _stream(descriptor, output) as stream:
             yield stream

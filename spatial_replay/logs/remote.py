@@ -672,7 +672,7 @@ def download_files(files: Sequence[RemoteFile], address: str, reason: str, below
     versions, limit_bytes = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     downloads_folder = user_cache_folder("downloads")
-    # a name with the version, so that each version has its own copy
+    # the folder's name depends on the version, so that each version has its own copy
     version_texts = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
     folder = downloads_folder / hashlib.sha256("\n".join(version_texts).encode()).hexdigest()[:32]
     # without a strong tag, a copy may be outdated, so the file is downloaded again

@@ -283,7 +283,7 @@ def round_numbers(numbers: Floats) -> Floats:
     usual = np.where(is_usual, numbers, 1.0)
     decimals = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
     powers = _POWERS[np.abs(decimals)]
-    # products and quotients of integers, so that the result is the double nearest to the decimal number
+    # a product or quotient of integers is the double nearest to the decimal number
     short_numbers = np.where(
         decimals < 0, np.round(usual / powers) * powers, np.round(usual * powers) / powers
     )

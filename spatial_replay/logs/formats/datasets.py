@@ -42,7 +42,7 @@ def data_set_address(text: str | PathLike[str]) -> tuple[str, int] | None:
     if match is None or "://" in match[1]:
         return None
     try:
-        # texts, because paths of pathlib would take most of the time
+        # the paths are texts, because paths of pathlib would take most of the time
         is_address = os.path.exists(match[1]) and not os.path.exists(match[0])  # noqa: PTH110
     except (OSError, ValueError):
         return None
@@ -82,7 +82,7 @@ _DESCRIBING: Final = (
 
 def _file_states(path: Path) -> tuple[object, ...]:
     """Return a cache key: identity, size and modification time of the files that describe a data set."""
-    # texts, because paths of pathlib would take most of the time
+    # the paths are texts, because paths of pathlib would take most of the time
     files = [*(f"{path}{name}" for name in _DESCRIBING), f"{path.with_suffix('.json')}"]
     states = []
     for file in files:

@@ -326,7 +326,7 @@ class LogWriter:
         payload_ends = np.cumsum(payloads.size)
         begin = 0
         while begin < len(messages):
-            # in parts, because the memory of a part is reused: new memory takes as long as filling it
+            # messages are laid out in parts, which reuse memory: new memory takes as long as filling it
             filled_bytes = int(payload_ends[begin]) - int(payloads.size[begin]) + _PART_BYTES
             end = max(begin + 1, int(np.searchsorted(payload_ends, filled_bytes)))
             part_messages = select(replace(messages, payloads=payloads), slice(begin, end))
@@ -370,7 +370,7 @@ class LogWriter:
                 lane.began_s = self._clock() if self._clock else 0.0
                 lane.first_ns = time_ns
             first_ns = min([time_ns, *(lane.first_ns for lane in self._lanes if lane.records)])
-            # all messages up to the end of the chunk at once; one by one, each message takes 2 µs
+            # all messages up to the end of the chunk are added at once; one by one, each takes 2 µs
             stop_index = begin + int(np.searchsorted(times_ns[begin:end], first_ns + self._chunk_ns))
             start_offset, last_index = int(starts[begin]), stop_index - 1
             added_bytes = int(starts[last_index] + part.sizes[last_index]) - start_offset
