@@ -1,7 +1,7 @@
 // The automaton of the chosen result: its states, the current one highlighted, and the transitions from there.
 
 const COLUMN = 128, ROW = 64, RADIUS = 17;
-// how far a move swings out at most, twice
+// twice the largest distance of a curve from its straight line, pixels
 const HIGHEST = 84;
 
 function makeAutomaton(clock) {
@@ -67,10 +67,10 @@ function drawAutomaton(automaton) {
   return {made, moves, states, set: null, label: isLarge ? (ahead) => labels.replaceChildren(...labelsOf(ahead, places)) : null};
 }
 
-// Of more moves than these, only the present ones are labelled: others would lie on each other.
+// Limit of labels. With more moves, only the moves from the current states have labels, because others would overlap.
 const MOST_LABELLED = 16;
 
-// A wide and clear copy of a move, which is easy to point at.
+// A wide and transparent copy of a move, which is easy to point at.
 function pointerArea({made, guard}) {
   return svg("path", {class: "area", d: made.getAttribute("d")}, svg("title", {}, guard));
 }
@@ -80,16 +80,15 @@ function tip(id) {
     markerHeight: 9, orient: "auto"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"}));
 }
 
-// fits between two states beside each other
+// characters that fit between two neighbouring states
 const LONGEST_LABEL = 16;
 
 // places along a curve at which a label may stand, the best first
 const SHARES = [0.5, 0.4, 0.6, 0.32, 0.68, 0.25, 0.75];
 const LETTER = 5.6, LINE = 12;
 
-// The guards of the moves, with short names for long propositions, beside their curves: each at the first place where
-// it covers no state, no other of these curves and no label before it. Without such a place, a move has its guard under
-// the pointer alone.
+// The guards of the moves beside their curves, with short names for long propositions. A label takes the first place
+// without a state, another curve or an earlier label. Without such a place, only the tooltip shows the guard.
 function labelsOf(moves, places) {
   const taken = [...places.values()].map(([x, y]) => [x - RADIUS, y - RADIUS, x + RADIUS, y + RADIUS]);
   const curves = moves.map(({source, target}) => pointsAlong(places.get(source), places.get(target)));
@@ -122,7 +121,7 @@ function pointsAlong(begin, end) {
   return Array.from({length: steps}, (_, step) => alongCurve(begin, end, (step + 0.5) / steps));
 }
 
-// From rim to rim; moves over several columns, back, or within a column go around what stands between.
+// A curve from rim to rim. Moves over several columns, back, or within a column bend around the states between.
 function curve([x0, y0], [x1, y1]) {
   const [cx, cy] = controlOf([x0, y0], [x1, y1]);
   const rim = (x, y, gap) => {

@@ -12,12 +12,12 @@ class Clock {
     this.time = this.opening;
     this.speed = 1;
     this.isPlaying = false;
-    // which results are listed: of a verdict, and with some letters in their titles
+    // filter of the listed results: their verdict, and a part of their titles
     this.filter = {verdict: "", words: ""};
     this.listeners = {time: [], view: [], result: [], play: [], filter: []};
   }
 
-  // Calls back now, and on every change of "time", "view", "result", "play" or "filter".
+  // Calls `callback` now, and on every change of "time", "view", "result", "play" or "filter".
   on(what, callback) {
     this.listeners[what].push(callback);
     callback(this);
@@ -31,7 +31,7 @@ class Clock {
     return indexAt(this.times, this.time);
   }
 
-  // The time that texts name: that of the numbers, where the page leaves samples out.
+  // The time in texts: the cursor, or the time of the shown sample if the page leaves samples out.
   get shownTime() {
     return this.run.is_thinned && this.times.length ? this.times[this.sample] : this.time;
   }
@@ -41,7 +41,7 @@ class Clock {
     return (!wanted || verdict === wanted) && title.toLowerCase().includes(words.toLowerCase());
   }
 
-  // The time at which the chosen result is first shown: where it went wrong, or the end.
+  // The time at which the chosen result is first shown: its fault, or the end of the run.
   get opening() {
     return this.run.results[this.result]?.fault ?? this.end;
   }
@@ -126,7 +126,7 @@ class Clock {
   }
 }
 
-// The first result of those that are violated or, without any, unknown; else the one that was planned for.
+// The first violated result, else the first unknown result, else the planner's result, else the first result.
 function worstOf({results, decisions}) {
   const places = [...["violated", "unknown"].map((verdict) => results.findIndex((result) => result.verdict === verdict)),
     results.findIndex(({name}) => name === decisions?.at(-1)?.specification)];
@@ -211,10 +211,10 @@ function makeTransport(clock, events) {
   });
 }
 
-// Half the width of the slider's thumb, by which its ends lie inside, in pixels.
+// Half the width of the slider's thumb, pixels: the ends of the scale lie this far inside the slider.
 const THUMB = 8;
 
-// A tick for each event below the slider; a press goes to the nearest one.
+// A tick for each event below the slider; a press goes to the nearest event.
 function eventTicks(clock, events) {
   if (!events.length || clock.end <= clock.start) return null;
   const place = (event, width) => THUMB + (event.time - clock.start) / (clock.end - clock.start) * (width - 2 * THUMB);

@@ -1,4 +1,4 @@
-// Two runs, or one run under two specifications, under one time cursor: that of run A.
+// Two runs, or one run under two specifications, with one time cursor, which shows the time of run A.
 
 function makeComparison([a, b, pairs]) {
   document.documentElement.dataset.read = "true";
@@ -34,7 +34,7 @@ function makeComparison([a, b, pairs]) {
   document.documentElement.dataset.ready = "true";
 }
 
-// The decision of a run that is not that of the other, with all its candidates and maps.
+// The decision of one run that differs from the other run's decision, with all its candidates and maps.
 function makeDecisionOf(clock, name, number) {
   const decision = clock.run.decisions[number];
   if (!decision) {
@@ -46,7 +46,7 @@ function makeDecisionOf(clock, name, number) {
   body(name).append(element("ol", {class: "cards"}, card));
 }
 
-// The time in one run that stands beside a time in the other; outside the knots both go equally fast.
+// The time in one run that corresponds to a time in the other run. Outside the knots, both times advance equally fast.
 function beside(knots, time, from, to) {
   const last = knots.length - 1;
   if (time <= knots[0][from]) return time - knots[0][from] + knots[0][to];

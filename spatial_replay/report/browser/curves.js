@@ -47,7 +47,7 @@ function makeCurves(clock) {
   followClock(clock, place, () => chart, build, showCursor);
 }
 
-// Keeps a chart, the current one, at the view and the time of the clock, and as wide as its place.
+// Keeps the chart that `current` returns at the view and the time of the clock, and as wide as its place.
 function followClock(clock, place, current, build, showCursor) {
   clock.on("view", () => current()?.setScale("x", {min: clock.view[0], max: clock.view[1]}));
   clock.on("view", showCursor);
@@ -67,7 +67,8 @@ function quantityChooser(choose) {
     choice("now", NOW, "the robustness at the sample itself", false));
 }
 
-// What is drawn: the root, and the parts that have a name (so far: those evaluated at the first sample).
+// The drawn curves: the root, the named parts, and the part that decided. The quantity `VALUE` needs parts that are
+// evaluated at the first sample.
 function curvesOf(run, result, quantity) {
   const named = result.nodes.filter(
     (node) => node.parent === null || (node.name && (quantity === NOW || node.initial)));
@@ -81,7 +82,7 @@ function curvesOf(run, result, quantity) {
   }));
   const decided = result.nodes[result.decided];
   if (decided && !named.includes(decided)) {
-    // an atom counts at each sample: its curve is that of the samples themselves
+    // an atom counts at each sample, so its curve has the numbers of the samples themselves
     found.push({node: decided, numbers: decided.series[NOW], name: shortened(decided.text, 40),
       decider: result.decided_text, isOpen: Boolean(result.left_open), at: atFault(result.fault), colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
   }
@@ -119,7 +120,7 @@ function options(clock, result, curves, shown, width) {
     labelFont: FONT};
   const root = result.nodes[0];
   const scales = scalesOf(curves, root, shown.hidden);
-  // a narrow screen has no room for more axes than that of the root
+  // a narrow screen has room for the axis of the root only
   const drawn = gutter() / scales.length < LEAST_AXIS ? scales.slice(0, 1) : scales;
   const axisSize = gutter() / drawn.length - AXIS_LABEL;
   return {
@@ -160,7 +161,7 @@ function unitText(unit) {
   return unit === "mixed" ? "robustness, several units" : `robustness in ${unit}`;
 }
 
-// A scale for each unit, that of the root first; zero is at one height for all, since it is where verdicts change.
+// A scale for each unit, the root's unit first. All scales have zero at one height, because verdicts change there.
 function scalesOf(curves, root, hidden) {
   const units = [...new Set([root.unit, ...curves.map((curve) => curve.node.unit ?? root.unit)])];
   const last = Math.min(units.length, MOST_AXES) - 1;
@@ -179,7 +180,7 @@ function scalesOf(curves, root, hidden) {
   return scales;
 }
 
-// The least and the greatest finite number of curves, and zero.
+// The least and the greatest finite number of curves; zero counts as one of their numbers.
 function endsOf(curves) {
   let low = 0, high = 0;
   for (const {numbers} of curves) {
@@ -210,7 +211,7 @@ function shadeSigns(chart) {
   context.restore();
 }
 
-// Blue above zero, vermillion below.
+// The colours of the root's curve: blue above zero, vermillion below.
 function signGradient(chart) {
   const {top, height} = chart.bbox;
   const share = Math.min(Math.max((zeroOf(chart) - top) / (height || 1), 0), 1);
@@ -220,7 +221,7 @@ function signGradient(chart) {
   return gradient;
 }
 
-// Between which numbers the value may still end, column by column of the screen.
+// Draws the interval of the final value, by columns of pixels.
 function drawBand(chart, result, node) {
   const {left, top, width, height} = chart.bbox, context = chart.ctx, {times} = result;
   const lower = node.series[LOWER], upper = node.series[UPPER];

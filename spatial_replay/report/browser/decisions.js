@@ -56,7 +56,7 @@ function makeDecision(clock, decision) {
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, decision, false)))) : null);
 }
 
-// What would have been decided otherwise, with its map beside the recorded one.
+// The decision of `plan --redo` if it differs, with its map beside the recorded map.
 function makeRedone(clock, decision) {
   if (!decision) return null;
   const meant = chosenMap(decision);
@@ -69,7 +69,7 @@ function reasonWords({reason}) {
   return minusWords(sentence(reason)).replace(/for the edge (\d+) -> (\d+)/, "to bring the automaton from state $1 to state $2");
 }
 
-// The map that a decision's target was found on, if the page has it.
+// The map on which the target of a decision was found, if the page has the map.
 function chosenMap({maps: drawn}) {
   return drawn.find((map) => map.chosen) ?? null;
 }
@@ -95,14 +95,14 @@ function sentence(text) {
   return text && !/[.!?…]$/.test(text) ? `${text}.` : text;
 }
 
-// What an edge wants, and what to keep and to avoid on the way.
+// The relations that an edge wants, and the rules for the way.
 function demandsOf({wanted, rules}) {
   const row = (head, sentences) => (sentences.length ? element("p", {class: "demands"}, element("b", {}, head), ...sentences.flatMap(
     (words, index) => [index ? "; " : " ", ...withCode(words)])) : null);
   return element("div", {}, row(wanted.length > 1 ? "Wanted, one of" : "Wanted", wanted), row("On the way", rules));
 }
 
-// The objects that cannot do what an edge wants, with their reasons.
+// The rejected objects of an edge, with the reasons.
 function rejectionsOf({candidates}) {
   const texts = candidates.filter(({status}) => status === "rejected").map(({object, rejected}) => `${object} (${minusWords(rejected)})`);
   const more = texts.length > MOST_REJECTIONS ? ` and ${texts.length - MOST_REJECTIONS} more` : "";

@@ -1,4 +1,4 @@
-// Elements of the page. All text goes in as text, never as HTML.
+// Elements of the page. Texts are inserted as text, never as HTML.
 
 const SVG = "http://www.w3.org/2000/svg";
 const FONT = "12px system-ui, sans-serif";
@@ -25,7 +25,7 @@ function body(name) {
   return document.getElementById(`${name}-body`);
 }
 
-// A sentence whose parts are text and code, in turn. Code keeps the sign that specifications have.
+// A sentence from parts that are text and code in turn. Code keeps the ASCII minus, as in specifications.
 function withCode(parts) {
   return parts.map((part, number) => number % 2 ? element("code", {}, part) : minusWords(part));
 }
@@ -43,12 +43,12 @@ function numberText(number) {
   return `${number < 0 ? "−" : ""}${text.replace("-", "−")}`;
 }
 
-// A text with the sign of numbers as `numberText` writes it; names such as run-1 keep theirs.
+// A text with the minus sign and ∞ of `numberText` in its numbers; names such as run-1 keep their hyphens.
 function minusWords(text) {
   return text.replace(/(?<![\p{L}\p{N}_.\]-])-(?=[\d.]|inf\b)/gu, "−").replace(/(?<![\p{L}\p{N}_.-])inf\b/gu, "∞");
 }
 
-// What grounds mean, each with its words, and how high and how strong it is.
+// A legend of grounds, each with its words, height and opacity.
 function key(entries) {
   return element("p", {class: "key"}, ...entries.map(({ground, words, height = 0.8, opacity = 1}) => {
     const block = element("i", {class: `block ${ground}`});
@@ -58,7 +58,7 @@ function key(entries) {
   }));
 }
 
-// In a viewer, colours are those of the panels.
+// The value of a colour by name; a viewer has the colours of the panels.
 function colour(name) {
   return getComputedStyle(document.querySelector(".spatial-replay") ?? document.documentElement).getPropertyValue(`--${name}`).trim();
 }

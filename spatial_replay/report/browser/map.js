@@ -1,18 +1,18 @@
 // A gradient map: its cells with the objects, the way and the target, axes and a scale with numbers, and a table
-// of the cell that is asked.
+// of the selected cell.
 
-// The colours of a map, as palette.py has them, and how much of them covers the scene.
+// The colours of a map, as in palette.py, and the opacity of a map under the scene.
 const MAP = ["#d55e00", "#f5f5f5", "#0072b2"], OPACITY = 0.6;
 const MAP_COLOURS = MAP.map(rgb);
-// Cells are as light in dark pages, and so are their ground and what is drawn on them.
+// Colours of drawings, ground and hatches on maps. They are fixed, because cells have the same colours in dark pages.
 const MAP_INK = "#24292f", MAP_GROUND = "#e4e4e4", MAP_HATCH = "#9a9a9a";
 const OBSTACLE_GREY = "rgb(110 110 110 / 0.6)", REGION_DASH = [6, 4];
-// Room in pixels for the axes, and for the scale and its numbers.
+// Space for the axes, and for the scale and its numbers, pixels.
 const FRAME = {left: 42, right: 72, top: 8, bottom: 22};
 const SCALE_WIDTH = 10;
 const NARROWEST = 300;
 
-// How a map in force is drawn: with the objects as they are when it is decided.
+// The figure of a map: the objects are drawn as they were at the decision.
 function makeMap(clock, map, decision, isTitled) {
   const {run} = clock;
   let layer = map, cell = null;
@@ -40,7 +40,7 @@ function makeMap(clock, map, decision, isTitled) {
     const step = {ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowDown: [-1, 0], ArrowUp: [1, 0]}[event.key];
     if (!step) return;
     event.preventDefault();
-    // elsewhere on the page they move the time
+    // elsewhere on the page, arrow keys move the time
     event.stopPropagation();
     ask(steppedCell(map, cell, step));
   });
@@ -57,7 +57,7 @@ function whyThere(run, map, {margin}) {
   const [inCell, target] = [values[row * map.columns + column], map.target.robustness];
   // a refined target may be better than the middle of its cell
   const best = Math.max(inCell, target);
-  // cells near failed motions have a value, too
+  // blocked cells near failed motions have a value, too
   const blocked = map.blocked && run.numbers(map.blocked);
   let enough = 0, higher = 0;
   values.forEach((value, place) => {
@@ -80,7 +80,7 @@ function rowsOf(map) {
   return map.values.length / map.columns;
 }
 
-// The row and the column at a pointer; null beside the map.
+// The row and the column at a pointer; null outside the map.
 function cellUnder(map, event, made) {
   const box = made.getBoundingClientRect();
   const at = figureProjection(map, box.width, box.height);
@@ -91,7 +91,7 @@ function cellUnder(map, event, made) {
   return row < 0 || row >= rows || column < 0 || column >= map.columns ? null : [row, column];
 }
 
-// The cell a step on; the first one asked is that of the target, or in the middle.
+// The cell one step further. The first selected cell is the target's cell, or the cell in the middle.
 function steppedCell(map, cell, [up, right]) {
   const rows = rowsOf(map);
   if (!cell) {
@@ -113,7 +113,7 @@ function centreOf(map, [row, column]) {
     map.low[1] + (row + 0.5) / rowsOf(map) * (map.high[1] - map.low[1])];
 }
 
-// Each demand in a cell and at the target, and in words what blocks or limits the cell.
+// The robustness of each demand in a cell and at the target, with words for what blocks or limits the cell.
 function answerOf(run, map, decision, cell) {
   const place = cell[0] * map.columns + cell[1];
   const number = (values) => (values ? run.numbers(values)[place] : 0);
@@ -127,19 +127,20 @@ function answerOf(run, map, decision, cell) {
   const heads = ["demand", `at (${centreOf(map, cell).map(numberText).join(", ")})${unit}`,
     ...(map.target ? [`at the target${unit}`] : [])];
   const words = element("p", {}, ...cellWords(run, map, decision, facts));
-  // what decides is in sight without scrolling
+  // limiting demands come first, so that they are visible without scrolling
   rows.sort((one, other) => rankOf(one) - rankOf(other));
   if (!rows.length) return [words];
   return [words, element("table", {}, element("thead", {}, element("tr", {},
     ...heads.map((head) => element("th", {scope: "col"}, head)))), element("tbody", {}, ...rows))];
 }
 
-// The row that limits, and that of all demands, come first.
+// The rank of a row: limiting demands come first, then the row of all demands.
 function rankOf(row) {
   return row.classList.contains("limits") ? 0 : row.classList.contains("all") ? 1 : 2;
 }
 
-// A row for each demand that depends on the cell or limits it or the target, and one for all where the cell is free.
+// A row for each demand that depends on the cell, or limits the cell or the target. A free cell also has a row for all
+// demands.
 function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target}) {
   const rows = [];
   const add = (title, limits, numbers) => rows.push(element("tr", {class: limits ? "limits" : null},
@@ -154,7 +155,7 @@ function demandRows(run, map, {place, value, cause, limit, limitAtTarget, target
     const atTarget = map.at_target?.[index] ?? null;
     const limits = isLimit && isLimitAtTarget ? "limits here and at the target" : isLimit ? "limits"
       : isLimitAtTarget ? "limits at the target" : null;
-    // without a layer, it is the same in all cells
+    // a demand without a layer has the same robustness in all cells
     add(withCode(words), limits, [here ?? (isLimit ? value : atTarget), atTarget]);
   });
   if (!cause) {
@@ -223,7 +224,7 @@ function spaced(unit) {
   return unit ? ` ${unit}` : "";
 }
 
-// A choice between the map and each relation that it is made of.
+// A choice between the whole map and the layer of each relation.
 function layerChoice(run, map, show) {
   const layers = map.layers.map((layer) => {
     const scale = run.numbers(layer.values).reduce((most, number) => Math.max(most, Math.abs(number) || 0), 0);
@@ -231,7 +232,7 @@ function layerChoice(run, map, show) {
   });
   const options = ["all that has to hold", ...map.layers.map((layer) => layer.title)];
   const choose = () => {
-    // a long relation does not fit
+    // a long relation does not fit, so the tooltip shows the whole text
     choice.title = options[choice.selectedIndex];
     show([map, ...layers][choice.selectedIndex]);
   };
@@ -281,7 +282,7 @@ function drawFigure(context, run, {map, layer, cell, decision}, width, height) {
   drawScale(context, layer.scale, decision.margin, [right + 8, top, bottom]);
 }
 
-// An obstacle of the workspace is grey.
+// Draws an obstacle of the workspace in grey.
 function drawObstacle(context, {rings}, at, ink) {
   context.save();
   context.fillStyle = OBSTACLE_GREY;
@@ -311,7 +312,7 @@ function drawOutline(context, {rings}, at, width, dash = []) {
   context.restore();
 }
 
-// The outline of an object at its target: turned about its centre, where its way begins.
+// The outline of an object at its target, turned about the object's centre, where the way begins.
 function movedOutline({rings}, {at: [x, y], turn, way}) {
   const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
   return {rings: rings.map((ring) => ring.map((_, i) => {
@@ -320,8 +321,8 @@ function movedOutline({rings}, {at: [x, y], turn, way}) {
   }))};
 }
 
-// Names of outlines, each at the first side where it covers neither an outline nor a name, else no name. One without
-// room is left out.
+// Draws names of outlines. A name takes the first side without outlines and names, else the first side without names.
+// A name without such a side is left out.
 function drawNames(context, outlines, at, frame) {
   context.textBaseline = "middle";
   context.textAlign = "center";
@@ -379,7 +380,7 @@ function overlapOf([left, top, right, bottom], [l, t, r, b]) {
   return Math.max(0, Math.min(right, r) - Math.max(left, l)) * Math.max(0, Math.min(bottom, b) - Math.max(top, t));
 }
 
-// A frame around a cell that shows, however small the cell is.
+// Draws a frame around a cell, at least 8 pixels wide, so that it is visible around a small cell.
 function drawCell(context, map, cell, at) {
   const [x, y] = centreOf(map, cell);
   const half = Math.max(at.scale * (map.high[0] - map.low[0]) / map.columns / 2, 4);
@@ -390,7 +391,7 @@ function drawCell(context, map, cell, at) {
   }
 }
 
-// The edges between cells that reach the margin and free ones that do not.
+// Draws the edges between cells that reach the margin and free cells that do not.
 function drawContour(context, run, map, margin, at) {
   const values = run.numbers(map.values), rows = rowsOf(map);
   const x = (column) => at.x(map.low[0] + column / map.columns * (map.high[0] - map.low[0]));
@@ -475,7 +476,7 @@ function drawScale(context, scale, margin, [left, top, bottom]) {
   }
 }
 
-// The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
+// The picture of a map: a pixel for each cell, the lowest row at the bottom, blocked cells transparent.
 function pictureOf(run, map) {
   map.picture ??= painted(run, map);
   return map.picture;
@@ -517,7 +518,7 @@ function rgb(text) {
   return [1, 3, 5].map((place) => parseInt(text.slice(place, place + 2), 16));
 }
 
-// How a part of the plane is shown in a rectangle of the screen, as large as fits, y upwards.
+// The projection of a part of the plane to a rectangle of the screen, as large as fits, with y upwards.
 function projection(low, high, width, height, margin) {
   const scale = Math.min((width - 2 * margin) / (high[0] - low[0]), (height - 2 * margin) / (high[1] - low[1]));
   const left = (width - scale * (high[0] - low[0])) / 2, bottom = (height + scale * (high[1] - low[1])) / 2;
@@ -528,7 +529,7 @@ function projection(low, high, width, height, margin) {
   };
 }
 
-// The map under the scene.
+// Draws a map under the scene.
 function drawMap(context, run, map, at) {
   const left = at.x(map.low[0]), top = at.y(map.high[1]);
   const width = at.x(map.high[0]) - left, height = at.y(map.low[1]) - top;
@@ -543,7 +544,7 @@ function drawMap(context, run, map, at) {
   context.restore();
 }
 
-// Oblique lines, which stay where a map is clear.
+// Draws oblique lines, which stay visible where a map is transparent.
 function hatch(context, left, top, width, height, ink) {
   context.save();
   context.beginPath();
@@ -560,7 +561,7 @@ function hatch(context, left, top, width, height, ink) {
   context.restore();
 }
 
-// Points x and y in turn, as a line.
+// Draws a line through points, given as x and y in turn.
 function drawWay(context, points, at, style) {
   if (points.length < 4) return;
   context.save();

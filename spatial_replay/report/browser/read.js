@@ -5,13 +5,13 @@ const ARRAYS = {
 };
 const VALUE = 0, NOW = 1, LOWER = 2, UPPER = 3;
 
-// A page of two runs has each under a name of its own: facts-a, numbers-a.
+// Reads one run. In a page of two runs, ids of elements end with the name of the run: facts-a, numbers-a.
 async function readRun(name = "") {
   const facts = JSON.parse(document.getElementById(`facts${name}`).textContent, (_, value) => printable(value));
   const buffer = await unpacked(document.getElementById(`numbers${name}`).textContent);
   const arrays = new Map();
   const numbers = (reference) => {
-    // an array without numbers has the place of the next one
+    // the key has the length, because an empty array has the offset of the next array
     const key = `${reference.offset} ${reference.length}`;
     if (!arrays.has(key)) arrays.set(key, unpackArray(reference, buffer));
     return arrays.get(key);
@@ -27,7 +27,7 @@ async function readRun(name = "") {
   return run;
 }
 
-// A text with spaces for control characters, such as those that turn the direction of what follows.
+// A text with spaces instead of control characters, such as characters that reverse the direction of the text.
 function printable(value) {
   return typeof value === "string" ? value.replace(/[\p{C}\p{Z}]/gu, " ") : value;
 }
@@ -42,7 +42,7 @@ async function unpacked(text) {
 
 const CODES = {1: Uint8Array, 2: Uint16Array, 4: Uint32Array, 8: Uint32Array};
 
-// An array as report/panels.py packs it: of the bits of all numbers the differences, the lowest bytes of all first.
+// Unpacks an array of `packed_bytes` in report/panels.py: differences of bits, the lowest bytes of all numbers first.
 function unpackArray({kind, offset, length}, buffer) {
   const size = ARRAYS[kind].BYTES_PER_ELEMENT;
   const bytes = new Uint8Array(buffer, offset, size * length);
@@ -87,13 +87,13 @@ function readResult(result, numbers, times) {
   return {...result, nodes, requirements, automaton, times: times.subarray(first, first + samples)};
 }
 
-// Where a sample of the page is among those of a result: null before its first, `result.samples` after its last.
+// The index of the page's sample in a result: null before the result's first sample, `result.samples` after its last.
 function placeIn(result, sample) {
   const place = sample - result.first;
   return place < 0 || !result.samples ? null : Math.min(place, result.samples);
 }
 
-// The last index whose time is not later; 0 before the first.
+// The last index whose time is not later than `time`; 0 before the first time.
 function indexAt(times, time) {
   let low = 0, high = times.length;
   while (low < high) {
@@ -104,7 +104,7 @@ function indexAt(times, time) {
   return Math.max(low - 1, 0);
 }
 
-// What is written in the page itself stays, where a browser cannot show the rest.
+// Reports an error. Verdicts and explanations stay visible, because they are in the page itself.
 function sayWhyNot(error) {
   const said = element("p", {class: "notice alert", role: "alert"},
     `This browser cannot show the run: ${error.message}. Verdicts and explanations are complete.`);

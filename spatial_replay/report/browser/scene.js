@@ -42,7 +42,7 @@ function makeScene(clock, name = "scene") {
   window.addEventListener("themechange", redraw);
 }
 
-// A page of a long run may have fewer frames of its scene than samples.
+// A note on the time of the drawn frame, because the page of a long run may have fewer frames than samples.
 function drawnAt(clock, scene, frame) {
   const time = scene.times[frame];
   if (scene.stride < 2 && !clock.run.is_thinned || Math.abs(time - clock.times[clock.sample]) < 1e-9) return [];
@@ -93,7 +93,7 @@ function readScene(run) {
   const outline = numbers(found.outline), name = numbers(found.name);
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
   const robustness = numbers(found.robustness), holds = numbers(found.holds);
-  // of each frame, those of its violated results
+  // arrows of violated results, by frame
   const violations = new Map();
   numbers(found.frames).forEach((frame, index) => {
     if (!violations.has(frame)) violations.set(frame, []);
@@ -105,7 +105,7 @@ function readScene(run) {
     });
   });
   const maps = run.decisions.flatMap((decision) => decision.maps);
-  // two runs side by side are drawn in one frame
+  // two runs side by side show the same part of the plane
   const shown = [...maps, ...(run.frame ? [run.frame] : [])];
   const least = (axis) => Math.min(scene.low[axis], ...shown.map((each) => each.low[axis]));
   const greatest = (axis) => Math.max(scene.high[axis], ...shown.map((each) => each.high[axis]));
@@ -180,18 +180,18 @@ function obstacleLabel(context, {name, rings}, at) {
   return {id: `obstacle/${name}`, text: name, box: boxOf({rings}, at), isRegion: true};
 }
 
-// The objects that the chosen result was violated by, from then on.
+// The objects that violated the chosen result, from the time of the violation on.
 function failedObjects({run, result, time}) {
   const {verdict, pointer} = run.results[result] ?? {};
   return verdict === "violated" && pointer && time >= pointer.time - 1e-9 ? pointer.objects : [];
 }
 
-// Whether an entity is in a frame, and not only its last outline.
+// Whether a frame has the entity itself, and not only its last outline.
 function isThere({form, last}, frame) {
   return form[frame] !== ABSENT && !last.includes(form[frame]);
 }
 
-// A missing object leaves its last outline.
+// Draws the last outline of a missing object.
 function drawLast(context, entity, frame, at, labels) {
   const box = [Infinity, Infinity, -Infinity, -Infinity];
   let place = entity.starts[frame];
@@ -212,7 +212,7 @@ function drawLast(context, entity, frame, at, labels) {
   labels.push({id: `object/${entity.name}`, text: `${entity.name}, last seen`, box, isRegion: false});
 }
 
-// The outlines of what an arrow with the number of an earlier sample joins, as they were then.
+// Draws the outlines at an arrow with the number of an earlier sample, as they were in that sample.
 function drawDashes(context, points, at) {
   context.strokeStyle = colour("quiet");
   context.lineWidth = 1.25;
@@ -228,10 +228,10 @@ function violationAt({result}, scene, frame) {
   return scene.violations.get(frame)?.find((each) => each.result === result);
 }
 
-// The colours of entities in a frame: of the requirements of the chosen result, where there are several.
+// The colours of entities in a frame. With several results, the chosen result's requirements decide the colours.
 function coloursOf(clock, scene, frame) {
   const {run, result} = clock;
-  // whether what is asked of them holds is not known
+  // objects at the arrow of an open verdict are grey, because it is unknown whether their requirements hold
   const open = run.results[result]?.left_open ? pointerAt(clock)?.objects ?? [] : [];
   return (entity) => {
     if (open.includes(entity.name)) return rgb(run.palette.neutral);
@@ -269,7 +269,7 @@ function drawEntity(context, entity, frame, at, labels, [red, green, blue], mark
   labels.push({id: `${entity.kind}/${entity.name}`, text: entity.name + mark, box, isRegion});
 }
 
-// Names of objects, then those of regions; one that would cover another is left out. Returns where they are.
+// Draws names of objects, then names of regions, without names that would cover another name. Returns their places.
 function drawLabels(context, labels, width) {
   const taken = [];
   for (const label of labels.toSorted((one, other) => one.isRegion - other.isRegion)) {
@@ -284,7 +284,7 @@ function drawLabels(context, labels, width) {
   return taken;
 }
 
-// Names of what an arrow is about, each at the first free side; like place_names of the annotated scene.
+// Draws the names at the ends of an arrow, each at the first free side, as `place_names` does in an annotated log.
 function drawDeciding(context, labels, [x0, y0, x1, y1], at, [width, height]) {
   const xs = [at.x(x0), at.x(x1)], ys = [at.y(y0), at.y(y1)];
   const blocked = labels.filter(({isRegion}) => !isRegion).map(({box}) => box);
@@ -306,12 +306,12 @@ function drawDeciding(context, labels, [x0, y0, x1, y1], at, [width, height]) {
   });
 }
 
-// Whether a text around a place would cover one that is there.
+// Whether a text around a place would cover an earlier text.
 function covers(taken, x, y, half) {
   return taken.some(([left, right, row]) => x - half < right && x + half > left && Math.abs(y - row) < 13);
 }
 
-// The middle of a name: within what is large enough for it, else above; a region's in its lower left corner.
+// The middle of a name: within an outline that is large enough, else above it, or in a region's lower left corner.
 function placeOfLabel({box: [left, top, right, bottom], isRegion}, half, width) {
   if (isRegion) return [left + 5 + half, bottom - 9];
   const fits = 2 * half < right - left - 6 && bottom - top > 16;
@@ -353,7 +353,7 @@ function drawViolation(context, {ends, label, text: atom}, at, [names, boxes], [
   const texts = atom ? [48, 32, 20, 12].map((most) => `${shortened(atom, most)}: ${number}`) : [];
   const text = [...texts, number].find((words) => 2 * halfOf(words) <= width) ?? number;
   const half = halfOf(text), x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
-  // above or below the part of the arrow there, as near to it as no name and no object is
+  // the text is above or below the arrow, in the nearest row without names and objects
   const along = [x - half, x + half].map((side) => Math.min(Math.max((side - x0) / (x1 - x0 || 1), 0), 1));
   const [low, high] = along.map((share) => y0 + share * (y1 - y0)).sort((one, other) => one - other);
   const rows = Array.from({length: 16}, (_, step) => [low - 13 - 14 * step, high + 15 + 14 * step]).flat()
@@ -370,7 +370,7 @@ function drawPlan(context, clock, {target, outcome, time}, at) {
   drawWay(context, target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
   drawTarget(context, target.at, at, colour("ink"));
   if (!outcome) return;
-  // a point for each sample, of which those up to now are shown
+  // `travelled` has a point for each sample, of which only the points up to the cursor are drawn
   const points = clock.run.numbers(outcome.travelled);
   const share = outcome.time > time ? Math.min((clock.time - time) / (outcome.time - time), 1) : 1;
   const travelled = points.subarray(0, 2 * Math.ceil(share * points.length / 2));
@@ -385,7 +385,7 @@ function decisionAt(run, time) {
   return found;
 }
 
-// The share of the run that trails reach back over.
+// Length of trails, as a share of the run.
 const REACH = 0.15;
 
 function drawTrails(context, scene, frame, at) {
@@ -400,7 +400,7 @@ function drawTrails(context, scene, frame, at) {
   context.restore();
 }
 
-// The objects that decide the chosen result, and the number of its deciding part in each frame; null without one.
+// The objects that decide the chosen result, and the number of its deciding part in each frame; null without objects.
 function tightnessOf(clock, scene) {
   const {run, result: chosen} = clock;
   const result = run.results[chosen];
@@ -417,7 +417,7 @@ function tightnessOf(clock, scene) {
 
 const TRAIL_SHADES = 16;
 
-// The whole trails of the deciding objects, in the colours of the number that decides: where it got tight.
+// Draws whole trails of the deciding objects, coloured by the deciding number, which show where the run was tight.
 function drawTightTrails(context, clock, scene, at, size) {
   const tightness = tightnessOf(clock, scene);
   if (!tightness) return;
@@ -452,7 +452,7 @@ function tightPaths(scene, {names, numbers, scale}, at) {
   return paths;
 }
 
-// The scale of those colours, in words and numbers.
+// The legend of the trails' colours, in words and numbers.
 function trailKey(clock, scene) {
   const tightness = tightnessOf(clock, scene);
   if (!tightness) return [];
@@ -498,7 +498,7 @@ function middlesOf(entity) {
   return middles;
 }
 
-// The arrow at what decided the chosen result, in the sample that did.
+// The arrow at the atom that decided the chosen result; null outside the deciding sample.
 function pointerAt({run, result, sample}) {
   const pointer = run.results[result]?.pointer;
   return pointer && indexAt(run.times, pointer.time) === sample ? pointer : null;
@@ -532,7 +532,7 @@ function wordsOf(clock, scene, frame) {
   const chosen = run.results.slice(clock.result, clock.result + 1);
   const open = requirementsAt(chosen, clock.sample);
   const inState = (state) => open.filter(({standing}) => standing === state);
-  // a condition holds, and what had to follow did not; what is not asked of every sample was asked before
+  // a condition of an implication is no failure; after the result is violated, only invariants still count
   const isLost = chosen.some((result) =>
     statusOf(run, result, result.nodes[0], placeIn(result, clock.sample)) === "violated");
   const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.isInvariant || !isLost));
@@ -543,7 +543,7 @@ function wordsOf(clock, scene, frame) {
   if (unknown.length) {
     return ["no violation is known now; ", ...partWords(unknown[0]), " is unknown", others(unknown)];
   }
-  // after the last sample nothing comes, and the condition of an implication need not
+  // nothing is pending after the last sample, and the condition of an implication need not come true
   const pending = clock.isAtEnd ? [] : inState(PENDING).filter((each) => !each.isCondition && each.isDue);
   if (pending.length) {
     return [`nothing is violated now${lostBefore(clock)}; `, ...partWords(pending[0]), " is still to come",
@@ -554,7 +554,7 @@ function wordsOf(clock, scene, frame) {
   return [`no ${more}requirements on the objects: ${coloursNow(clock, scene, frame)}${lostBefore(clock)}`];
 }
 
-// The colours of objects that nothing is asked of any more: what they have fulfilled stays blue.
+// Words for the colours of objects without further requirements: objects with fulfilled requirements stay blue.
 function coloursNow(clock, scene, frame) {
   const colourAt = coloursOf(clock, scene, frame);
   const isBlue = scene.entities.some((entity) => {
@@ -565,7 +565,7 @@ function coloursNow(clock, scene, frame) {
   return isBlue ? "blue ones have fulfilled theirs, grey ones had none" : "they are grey";
 }
 
-// What decided the chosen result, in the sample that did, where no arrow shows it.
+// Words for the part that decided the chosen result, in the deciding sample, where no arrow shows the part.
 function decidedAt({run, sample, result: chosen}) {
   const result = run.results[chosen];
   if (!result || result.fault === null || result.decided === null) return null;
@@ -581,14 +581,14 @@ function decidedAt({run, sample, result: chosen}) {
     ` ${signWords(number, declaredUnit(node))} now; no arrow shows it`];
 }
 
-// Whether the chosen result is violated by what was before.
+// Words for a chosen result that was violated before; "" if it was not.
 function lostBefore({run, sample, result: chosen}) {
   const lost = run.results.slice(chosen, chosen + 1).filter(
     (result) => statusOf(run, result, result.nodes[0], placeIn(result, sample)) === "violated");
   return lost.length ? `; ${lost[0].title} was before${others(lost)}` : "";
 }
 
-// What the arrow points at; of a requirement that the page leaves out, only the number.
+// Words for the arrow of a violation; only the number if the page leaves the requirement out.
 function violationWords(run, time, {result: which, node: index, label, atom, robustness, holds, moment}) {
   const number = holds ? -robustness : robustness;
   if (index < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
@@ -602,23 +602,24 @@ function violationWords(run, time, {result: which, node: index, label, atom, rob
     if (!atom) return failureWords({result, node, place});
     return [...partWords({result, node: {text: atom}}), ` ${signWords(number, run.lengths)} now`];
   }
-  // a page of a long run leaves samples out: the atom that decides is not known
+  // the deciding atom is unknown, because the page of a long run leaves samples out
   return [...partWords({result, node}), ` is violated by ${numberText(-robustness)}${spaced(run.lengths)} now`];
 }
 
 function failureWords(part) {
-  // in the unit of the log, as the number beside the arrow
+  // the number is in the unit of the log, as beside the arrow
   const node = atomOf(part), number = node.series[NOW][part.place] * node.divisor;
   return [...partWords({...part, node}), ` ${signWords(number, declaredUnit(node))} now`];
 }
 
-// An atom that decides a violation and holds is one that should not, or the condition of what failed.
+// Words for the number of a deciding atom. In a violation, an atom that holds must not hold, or is the condition of a
+// failed response.
 function signWords(number, unit, isPast = false) {
   const [fails, holds] = isPast ? ["failed", "held"] : ["fails", "must not hold, and holds"];
   return `${number < 0 ? fails : holds} by ${numberText(Math.abs(number))}${spaced(unit)}`;
 }
 
-// What the atom that an arrow points at is to the verdict.
+// The role of the arrow's atom in the verdict, in words.
 function roleWords(pointer) {
   return pointer?.is_response ? "what came nearest to what had to follow" : "what decided the verdict";
 }
@@ -631,10 +632,10 @@ function others({length}) {
   return length > 1 ? `, and ${length - 1} more` : "";
 }
 
-// How a requirement stands in a sample; see annotate/requirements.py.
+// Codes for the standing of a requirement in a sample, see annotate/requirements.py.
 const FULFILLED = 0, HOLDING = 1, VIOLATED = 2, PENDING = 3, UNKNOWN = 4;
 
-// The requirements of results at a sample that count there.
+// The requirements of results that count at a sample.
 function requirementsAt(results, sample) {
   return results.flatMap((result) => {
     const place = placeIn(result, sample);
@@ -642,7 +643,7 @@ function requirementsAt(results, sample) {
     return result.requirements
       .map(({node, standing, is_condition: isCondition, is_invariant: isInvariant, obligation}) => ({
         result, node: result.nodes[node], place, standing: standing[place], isCondition, isInvariant,
-        // so far its obligation is not met: of a response, its condition held
+        // the obligation is not met so far; for a response, its condition held
         isDue: obligation && obligation.sign * result.nodes[obligation.node].series[VALUE][place] < 0,
       }))
       .filter(({standing}) => standing !== FULFILLED);

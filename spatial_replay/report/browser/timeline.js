@@ -1,7 +1,7 @@
 // The timeline: a lane for each result and each named part of the chosen one, for the states of its
 // automaton, and for the decisions of a planner.
 
-// The width of names, and of the scale of curves, so that lanes and curves share one time axis.
+// Width of the lanes' names and of the curves' scale, pixels. It is equal, because both share one time axis.
 function gutter() {
   return window.matchMedia("(max-width: 640px)").matches ? 92 : 168;
 }
@@ -77,23 +77,23 @@ function makeLane(clock, result, node, number) {
   };
 }
 
-// How a node stands over time, within the view.
+// A strip with the status of a node over time, within the view.
 function nodeLane(clock, result, node, title = `How ${node.text} stands over time`) {
   let stretches = null;
   const strip = canvas(title, (context, width, height) => {
-    // a lane out of sight costs nothing
+    // the stretches of a lane that is never visible are never computed
     stretches ??= stretchesOf(clock.run, result, node);
     const fills = Object.fromEntries(["positive", "negative", "pending", "neutral"].map((name) => [name, colour(name)]));
     for (const stretch of stretches) drawStretch(context, clock, stretch, fills, width, height);
   });
   strip.made.className = "strip";
   scrub(strip.made, clock);
-  // within a heading it folds nothing
+  // a click on a strip within a summary must not fold the details
   strip.made.addEventListener("click", (event) => event.preventDefault());
   return strip;
 }
 
-// What fails is drawn higher than what holds, and that higher than what is unknown; what is final is full.
+// Failures are drawn highest, then parts that hold, then unknown parts. Final statuses are opaque.
 const HEIGHTS = {violated: 1, failing: 1, pending: 0.6, holding: 0.6, satisfied: 0.6, unknown: 0.3};
 const OPACITIES = {violated: 1, failing: 0.5, pending: 1, holding: 0.4, satisfied: 1, unknown: 0.6};
 

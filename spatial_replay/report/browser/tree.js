@@ -47,7 +47,7 @@ function declaredUnit({unit, divisor}) {
   return divisor !== 1 || unit === "1" || unit === "mixed" || unit.startsWith("units of") ? "" : unit;
 }
 
-// The unit in which all nodes are, for a heading; none where it is not declared, or too long.
+// The common unit of all nodes, for a heading; "" if there is none, or if it is too long.
 function commonUnit(nodes) {
   const [unit, ...others] = new Set(nodes.map(declaredUnit));
   return unit && !others.length && unit.length <= 4 ? ` [${unit}]` : "";
@@ -70,7 +70,7 @@ function lightPath(list, rows, {nodes, decided, fault, decided_text: decider}) {
   }
   const last = rows.find((row) => row.node.index === decided)?.parts[0];
   if (!last) return;
-  // of a quantifier, the objects that did
+  // the deciding atom of a quantifier names the deciding objects
   if (decider) last.append(` decided${atFault(fault)} by `, element("code", {}, decider));
   const box = last.getBoundingClientRect(), frame = list.getBoundingClientRect();
   if (box.bottom > frame.bottom) list.scrollTop += box.bottom - frame.bottom + frame.height / 3;
@@ -109,7 +109,7 @@ function makeRow(node) {
 
 function showRow(row, run, result, place, isLast) {
   const {node} = row;
-  // uncertainty left it open: its number alone would say that it holds, or fails
+  // uncertainty left the node open, although its number alone seems to hold or to fail
   const isLeftOpen = result.left_open && row.isOnPath && place === indexAt(result.times, result.fault);
   const status = isLeftOpen ? "unknown" : statusOf(run, result, node, place);
   if (status !== row.status) {
@@ -128,7 +128,7 @@ function showRow(row, run, result, place, isLast) {
   row.soFar.title = hasValue && isLast ? node.value : "";
 }
 
-// What is pending is no violation, whatever its sign.
+// Shows a number. A pending number has the colour of unknown numbers, because its sign is not final.
 function showNumber(made, number, isEmpty, isPending) {
   write(made, isEmpty ? "" : numberText(number));
   const sign = isPending || isEmpty || Number.isNaN(number) ? "unknown" : signOf(number);
@@ -137,7 +137,7 @@ function showNumber(made, number, isEmpty, isPending) {
   made.className = `number is-${sign}`;
 }
 
-// Only a text that changes costs the browser a layout.
+// Writes only a text that has changed, because each change costs the browser a layout.
 function write(made, text) {
   if (made.written === text) return;
   made.written = text;

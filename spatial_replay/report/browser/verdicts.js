@@ -12,7 +12,7 @@ const STATUSES = {
 };
 
 // A node above all temporal operators is evaluated at the first sample: its status is the sign of its value on the
-// samples so far and, at the last sample, its verdict. One below a temporal operator has the status of the sample.
+// samples so far and, at the last sample, its verdict. Other nodes have the status of the sample.
 function statusOf(run, result, node, place) {
   const last = result.samples - 1;
   if (place === null || (place > last && !node.initial)) return "absent";
@@ -21,7 +21,7 @@ function statusOf(run, result, node, place) {
   if (place >= last) return node.verdict;
   if (run.settles && lower[place] >= 0) return "satisfied";
   if (run.settles && upper[place] < 0) return "violated";
-  // later samples may still fulfil it: no violation
+  // later samples may still fulfil the node, so it is not violated
   return run.settles && value[place] < 0 ? "pending" : signOf(value[place]);
 }
 
@@ -68,15 +68,15 @@ function linkVerdicts(clock) {
   }
 }
 
-// So much of a verdict is in sight, in pixels.
+// Least visible height of the chosen verdict in the list, pixels.
 const ROOM = 60;
 
-// Lists of many results: what to list, and which result the panels show.
+// The list of results: its filter, and the choice of the result that the panels show.
 function makeVerdicts(clock) {
   const verdicts = [...document.querySelectorAll(".verdict")];
   for (const verdict of verdicts) {
     if (verdict.dataset.result === undefined) continue;
-    // the heading of another result chooses it, which unfolds it; that of the chosen one folds it
+    // a click on another result's heading chooses and unfolds that result; the chosen result's heading folds it
     verdict.querySelector("summary")?.addEventListener("click", (event) => {
       const number = Number(verdict.dataset.result);
       if (number === clock.result) return;
@@ -148,7 +148,8 @@ function makeEvents(clock) {
   clock.on("result", show);
 }
 
-// The last event that is not later than a time: of several at once the first that is of the chosen result, if one is.
+// The index of the last event that is not later than a time. Of simultaneous events, the chosen result's first event is
+// preferred.
 function markedEvent(starts, time, isChosen) {
   if (!starts.length || starts[0] > time + 1e-9) return -1;
   const last = indexAt(starts, time);
@@ -163,7 +164,7 @@ function eventRow(event, choose) {
     element("span", {class: "sentence"}, ...withCode(event.parts)));
 }
 
-// Scrolls a list, and nothing around it, so that one of its rows shows.
+// Scrolls a list, but not the page around it, so that one of its rows is visible.
 function keepInSight(list, row) {
   const top = row.offsetTop;
   if (top < list.scrollTop) list.scrollTop = top;
