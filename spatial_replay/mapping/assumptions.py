@@ -244,7 +244,7 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
         or upright_count > _FEW_UPRIGHT * quaternion_count
     ):
         return None
-    # a tag on a table, seen from above, is upside down. In the other order it seems upright and unturned.
+    # the other order reads a table's upside-down tag as upright and unturned, so some objects have to turn
     if evidence.turned_otherwise < max(_FEW, _SOME_TURNED * quaternion_count):
         return None
     other_order = "xyzw" if layout.order == "wxyz" else "wxyz"
@@ -588,7 +588,7 @@ def _corners(evidence: TopicEvidence, log: Log) -> str | None:
     leftward_count, downward_count, box_count = extractor.leftward, extractor.downward, extractor.boxes
     if leftward_count < box_count / 5 and not box_count / 5 < downward_count < box_count * 4 / 5:
         return None
-    # corners in the other order reach as far as the first corners, but sizes do not
+    # swapped corners spread as widely as first corners, but widths and heights do not
     corner_reach = extractor.corner_high - extractor.corner_low
     if min(leftward_count, downward_count) == box_count and (corner_reach[1] > corner_reach[0] / 2).all():
         return None

@@ -421,7 +421,7 @@ class Motions:
             is_same_object = (name_codes[earlier_indices] == name_codes[new_indices]) & (
                 new_indices >= step_count
             )
-            # back means within a quarter of the shortest leap since then
+            # an object is back within a quarter of the shortest leap since its earlier position
             is_back |= is_same_object & (np.hypot(offset[:, 0], offset[:, 1]) < least_leap / 4)
         is_slow = (
             is_back & (step_s[new_indices] >= 1.0) & (leap_lengths[new_indices] < _FAST * step_s[new_indices])

@@ -85,7 +85,7 @@ class BoundObject:
         if self.quaternion:
             quaternions = numbers[:, list(self.binding.orientation)]
             self._check_quaternions(quaternions, mapping_name, episode)
-            # otherwise a disc would keep its position, and only lose its orientation
+            # all numbers become NaN, because a disc without an orientation would keep its position
             numbers[~np.isfinite(quaternions).all(axis=1)] = nan
         return detections_of(self.layout, self.binding, numbers)
 

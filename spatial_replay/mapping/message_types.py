@@ -321,7 +321,7 @@ def layout_of_topic(topic_type: str, mapping: TopicMapping) -> MessageLayout:
     layout = BUILT_IN.get(short_type(mapping.type or topic_type), GENERIC)
     is_list = mapping.objects is not None
     if is_list and mapping.objects != layout.objects:
-        # another list than the type's list of objects has elements with other fields
+        # elements of a list other than the type's list of objects have other fields
         layout = GENERIC
     changes: dict[str, object] = {}
     if is_list:

@@ -323,7 +323,8 @@ def _radius(covariance: Floats) -> Floats:
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
-"""Old observations are dropped after this many calls of `advance`, or from this many stored observations.
+"""Calls of `advance`, and stored observations, after which old observations are dropped.
+
 Dropping after each call would be slow, because a call may process a single message."""
 
 _FAR_NS = 366 * 86_400 * 10**9
@@ -592,7 +593,7 @@ class Tracker:
             self._events[topic] = Events(
                 last_events.name, lost_ns, blank_rows, expires_ns, last_events.class_code
             ).after(last_events)
-            # without reports, the loss is neither a pause nor a silence of the topic
+            # report times are removed, so that the loss is neither a pause nor a silence of the topic
             self._reported_ns.pop(topic, None)
         self._lost_until_ns |= dict.fromkeys(topics, FOREVER_NS)
         self._signals = {

@@ -179,7 +179,7 @@ def _intervals_of(
     if invariant.condition is None:
         return ViolatedInvariant(conjunct.spec, conjunct.node, tuple(intervals))
     condition_runs = _Runs.of(is_in_window & (nodes.ends(invariant.condition)[0] >= 0.0))
-    # a violation's interval of the condition is identified by the number of such intervals up to it
+    # the number of condition intervals that begin up to a violation identifies the violation's own interval
     missed_entries = np.unique(np.searchsorted(condition_runs.starts, violated_runs.starts, side="right"))
     condition_text = short_title(evidence.bound(nodes.tree[invariant.condition][0]))
     entry_counts = len(condition_runs.starts), len(missed_entries)

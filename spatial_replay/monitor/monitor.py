@@ -505,7 +505,7 @@ class _AwaitedNames:
     def _learn(self, *names: Collection[str]) -> None:
         """Store names as candidates for spelling hints."""
         if not self._remarks:
-            # limited, because a run may bring a new track name at every sample
+            # the names are limited, because a run may bring a new track name at every sample
             for names_so_far, new_names in zip(self._names_so_far, names, strict=True):
                 if len(names_so_far) < _MOST_KNOWN:
                     names_so_far.update(new_names)
@@ -732,7 +732,7 @@ class Settled:
         if self.is_whole and sample_count - self.start <= _AT_ONCE:
             yield self.start
             return
-        # an obligation that holds at every sample has the same atom wherever the evaluation starts
+        # an obligation for every sample (`G`) has the same deciding atom for any first sample
         for newest_count in (1, 8, _AT_ONCE, REMEMBERED // 2):
             if newest_count < sample_count - self.start:
                 yield sample_count - newest_count

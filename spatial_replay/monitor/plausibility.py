@@ -42,9 +42,9 @@ from spatial_replay.trace.trace import Pauses, Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
 _FAR = 10.0
-"""A length above this many times the log's extent is probably in another unit."""
+"""Largest plausible length, in extents of the log; a greater length is probably in another unit."""
 _APART = 5.0
-"""A threshold this many times above or below all measured numbers is out of reach."""
+"""Ratio between a threshold and all measured numbers above which the threshold is out of reach."""
 
 
 @dataclass(frozen=True, slots=True)

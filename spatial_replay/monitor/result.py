@@ -690,7 +690,7 @@ class Evaluation(Displayed):
         Warnings also name classes of templates without an object, and objects hidden by a definition of the
         same name.
         """
-        # computed on demand, because it takes as long as the evaluation itself
+        # names are checked on demand, because the check takes as long as the evaluation
         diagnostics = check_names(
             self.specification, self.objects, self.signals, classes=self.classes, each=self.each
         )
@@ -838,7 +838,7 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
-    # before trimming, because sentences count time from the first sample of the log
+    # the first time is read before trimming, because sentences count time from the log's first sample
     first_ns, needs = int(trace.times_ns[0]), Needs.of([specification], each or {})
     trace, left_out = trim_trace(trace, needs, start=not window[0], end=window[1] >= FOREVER)
     specification = with_numbers(specification, trace.units)

@@ -816,4 +816,4 @@ class Evaluator(NamedTuple):
         """
         if self.semantics == "paper":
             return left_out(leaves, self.program.leaves, positions, times_ns, first_ns)
-        return leaves  # their intervals already are unbounded beyond the log
+        return leaves  # intervals of leaves are already unbounded beyond the log

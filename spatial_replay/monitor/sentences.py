@@ -333,7 +333,7 @@ def verdict_sentence(
     """
     since_parts = (", certain since ", certain_since) if certain_since is not None else ()
     part_text = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
-    # compared as texts, because the sentence should not show the same time twice
+    # times are compared as texts, because the sentence should not show the same time twice
     is_later = least_at is not None and str(least_at) != str(certain_since)
     least_parts = (", least at ", least_at) if least_at is not None and is_later else ()
     verdict_words = f"{verdict}{_ENDED if has_ended else ''}"
@@ -737,7 +737,7 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
         for word, option, at_ns in zip(("before ", "from "), ("--from", "--to"), gap.window, strict=True):
             if at_ns is not None:
                 window_parts += [" or " if window_parts else "", word, Instant(at_ns, first_ns)]
-                # rounded down to milliseconds, so that the option does not leave the sample out
+                # the time is rounded down to milliseconds, so that the option does not leave the sample out
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
         onwards = " on" if gap.window[1] is not None else ""
         return Sentence(

@@ -428,7 +428,7 @@ class LiveStream:
         self._leaf_ranges = _ranges(len(program.leaves) for program in programs)
         self._is_online = semantics == "ltlf"
         first_leaves = [leaf_range.start for leaf_range in self._leaf_ranges]
-        # paired once, because `extend` reads the pairs at every sample; unused under the paper's semantics
+        # the pairs are made once, because `extend` reads them at every sample (not in the paper's semantics)
         self._online_runs = list(zip(cast(list[OnlineRun], self._runs), first_leaves, strict=True))
         self._start_ns = start_ns
         self._first_ns: int | None = None

@@ -506,7 +506,7 @@ def decode_image(data: bytes) -> Image:
     size = encoded_size(data)
     if size is None:
         raise LogError("an image is damaged, or neither JPEG nor PNG nor WebP")
-    # checked before decoding, because a few bytes may claim gigabytes
+    # the size is checked before decoding, because a few bytes may claim gigabytes
     if size[0] * size[1] > LARGEST_PICTURE:
         raise LogError(f"an image of {size[0]} x {size[1]} is too large")
     try:

@@ -360,7 +360,7 @@ class VideoFile:
         self._goes_back = False
         av = load_av()
         try:
-            # opened first, so that a missing file has the usual error
+            # the file is opened first, so that a missing file raises the usual error
             with path.open("rb"):
                 pass
         except OSError as error:
@@ -512,7 +512,7 @@ class VideoFile:
                 decoded_frames = self._decoder.decode(packet, (copies, slot))
             except av.InvalidDataError as error:
                 self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
-            # after decoding, because the filter consumes the packet's content
+            # copies follow the decoding, because the filter consumes the packet's content
             if annex_b_filter is not None and packet.size:
                 # a damaged packet was reported above
                 with suppress(av.InvalidDataError):

@@ -423,7 +423,7 @@ class ClipLog(RecorderLog):
         if self._open is None:
             return
         self._open.flush()
-        # without entries for longer than the clip lasts, the run has stopped
+        # if no entry comes for longer than the clip lasts, the run has stopped
         if (
             not self._open.waiting_entries
             and time.monotonic() - self._open.last_put_s > self._trigger.after_s + 2.0

@@ -19,7 +19,7 @@ from spatial_replay.spec.load import load_specification, load_specifications
 _MARK: Final = b"\xef\xbb\xbf"
 """Byte order mark of UTF-8, which some editors write."""
 _SETTLE_S: Final = 0.04
-"""A file counts as saved if its size and times are unchanged for this duration, seconds."""
+"""Time without a change of size or times after which a file counts as saved, seconds."""
 _ERROR_SETTLE_S: Final = 0.1
 """Further wait for a file that has errors or is missing, because an editor may be writing it, seconds."""
 _PATIENCE_S: Final = 1.0

@@ -221,7 +221,7 @@ def record_plan(
         settings = _settings(world, spec.formula, changes)
         planner = Planner(main_file, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
-        # a replay does not know the rate, so the log stores no automaton for bounds in seconds either
+        # a replay does not know the rate, so the log stores no automaton for bounds in seconds
         automata = (
             [SpecAutomaton(spec.name, main_file, spec, planner.automaton)] if planner.rate_hz is None else []
         )

@@ -73,7 +73,7 @@ class RunLog:
         self.newest_ns = sample.time_ns
         self.samples += 1
         if len(self._pending_samples) >= _STRETCH:
-            # flushed only at the next sample, because messages may follow with the time of the newest sample
+            # samples are flushed at the next sample, because messages may follow with the newest time
             self.flush()
         self._pending_samples.append(sample)
 

@@ -520,7 +520,7 @@ def is_negated(text: str) -> bool:
 
 def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
     """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether the limit is a lower one."""
-    # divided by the first factor, so that 2 x >= 2 and x >= 1 are one fact
+    # weights are divided by the first factor, so that 2 x >= 2 and x >= 1 are one fact
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
     return weights, -linear.constant / factor, factor > 0

@@ -558,7 +558,7 @@ class WordSearch:
 
     def _compose(self, automaton: Automaton, state: int) -> int:
         """Return the moves from a state as a diagram over facts, with states as leaves."""
-        # stored, because the id of a deleted automaton can be reused
+        # the automaton is stored, because the id of a deleted automaton can be reused
         self._automata[id(automaton)] = automaton
         conditions = self._conditions_of(automaton)
 

@@ -594,7 +594,7 @@ class PlaybackThinning:
             if channel.topic in _NEVER_THINNED:
                 continue
             times_ns, time_indices = np.unique(messages.log_time_ns[message_indices], return_inverse=True)
-            # a turn at the limit has one more sample, depending on its phase
+            # a turn at the rate limit may have one sample more than its limit, depending on its phase
             limit = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most_samples
             if len(times_ns) <= limit + (not _is_drawn(channel)):
                 continue

@@ -45,7 +45,7 @@ _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
 """Force of the fingers, N."""
 _PINCHED = 0.004
-"""A held body keeps the fingers at least this much wider apart than commanded, metres."""
+"""Least excess of the fingers' distance over the commanded distance while they hold a body, metres."""
 _MIDDLE, _FURTHEST = 0.78, 2.75
 """Tool yaw range relative to the direction from the base: its centre and its half width, radians."""
 _NEAREST, _FARTHEST = 0.27, 0.77
@@ -114,7 +114,7 @@ class Arm:
         radius_change, angle_change = math.hypot(x, y) - radius, math.atan2(y, x) - angle
         start_yaw = self._yaw
         yaw_change = yaw - start_yaw
-        # the radius counts at least 0.4 m, which limits the angular speed around the base
+        # the radius counts as at least 0.4 m, which limits the angular speed around the base
         arc_length = math.hypot(radius_change, angle_change * max(radius, 0.4))
         for share in _shares(arc_length / _FAST, abs(yaw_change) / _TURNING):
             tool_radius = max(radius + share * radius_change, _INSIDE)
@@ -135,7 +135,7 @@ class Arm:
             for _ in range(6):
                 yield
             current_width = self.width
-            # the fingers have stopped: at their distance, or at a body
+            # the fingers have stopped at the commanded distance, or at a body
             if abs(current_width - previous_width) < 2e-4:
                 return
             previous_width = current_width
@@ -481,7 +481,7 @@ def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]
     """Lower the held body onto its support; return the reason of a failure, or ""."""
     arm = scene.arm
     x, y, tool_z = arm.commanded
-    # measured now, because the grasp may have changed the pose of the body
+    # the height is measured now, because the grasp may have changed the pose of the body
     z = surface(scene, name, goal) + tool_z - scene.height(name)[0] + _SETTING_DOWN
     is_lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
     if is_lowered:

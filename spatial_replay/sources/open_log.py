@@ -282,10 +282,10 @@ def bag_metadata_at(file: RemoteFile) -> RemoteFile | None:
     if file.name == BAG_METADATA:
         return file
     try:
-        # the server gives the version, so that this fails if there is no such file
+        # the server gives the version, so that a missing file raises an error here
         _ = file.version
     except MissingFileError:
-        # the address may be a folder's, without the slash at its end
+        # the address may name a folder, without a slash at the end
         metadata = RemoteFile(f"{os.fspath(file)}/{BAG_METADATA}")
         with suppress(MissingFileError, RemoteError):
             _ = metadata.version

@@ -410,7 +410,7 @@ def with_operands(formula: Formula, node: int, operands: tuple[Formula, ...]) ->
 def without_variables(formula: Quantified) -> Formula:
     """Return the body of a quantifier with numbered variables, so that equality ignores variable names."""
     quantifier_count = sum(isinstance(part, Quantified) for part in iter_formulas(formula.body))
-    # a name of a text begins with a blank only in quotes, so in practice these clash with no other name
+    # these names begin with a blank, so they clash only with a quoted name that begins with a blank
     return substitute(
         formula.body,
         {name: Variable(f" {quantifier_count}.{index}") for index, name in enumerate(formula.variables)},

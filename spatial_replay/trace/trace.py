@@ -219,7 +219,7 @@ class MeasurementCache:
         """Return the array stored under a key, or None."""
         with self._lock:
             array = self._arrays.pop(key, None)
-            # moved to the end, because the order of the dict is the order of use
+            # the array is moved to the end, because the order of the dict is the order of use
             if array is not None:
                 self._arrays[key] = array
             return array
@@ -308,7 +308,7 @@ def duration_ns_from_text(text: str) -> int:
     if match is None:
         raise UsageError(f"{text!r} is not a duration; write it as 2s, 0.5s or 1500ms")
     nanoseconds = Decimal(match["number"]) * (10**9 if match["unit"].lower() == "s" else 10**6)
-    # limited before the conversion, because an exponent can give an integer of a hundred digits
+    # the number is limited before the conversion, because its exponent can give a hundred digits
     return _checked_ns(int(min(nanoseconds, Decimal(LATEST_NS + 1)).to_integral_value()), text)
 
 
@@ -880,7 +880,7 @@ def class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
 
 
 LONG_PAUSE: Final = 5
-"""An interval longer than this many usual intervals is a pause."""
+"""Longest interval that is no pause, in usual intervals."""
 _FEWEST: Final = 10
 """Minimum number of intervals to determine the usual interval."""
 _RARE: Final = 20

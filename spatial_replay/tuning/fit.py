@@ -507,7 +507,7 @@ def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Float
         if quantity.relation == "oriented":
             is_valid[:, 1, index] = False
         elif quantity.relation == "dist":
-            # leave out the depth of an overlap, and a large distance at some time
+            # limits of an overlap's depth, and a large distance at some time, are left out
             is_valid[:, 0, index] &= lowest[:, 0, index] >= 0.0
             is_valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
             is_valid[EVENTUALLY, 0, index] = False

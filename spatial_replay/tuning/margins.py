@@ -565,7 +565,7 @@ class Margins:
         try:
             return self._parse(value_by_name)
         except SpecificationError:
-            # such as a window with reversed ends, if both ends are constants
+            # some values are invalid together, such as reversed ends of a window
             return None
 
     def robustness(self, run: int, point: Point, results: Iterable[str] | None = None) -> Robustness | None:

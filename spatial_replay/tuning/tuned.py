@@ -271,7 +271,7 @@ class ExactSearch:
         return self._holds(run, _with(numbers, [axis], number), level, results)
 
     def _is_invalid(self, runs: Sequence[int], numbers: Sequence[int]) -> bool:
-        # such as a window with reversed ends; beyond invalid values the verdict may be right again
+        # reversed ends of a window are invalid, but values beyond them may give the right verdict again
         return self._margins.robustness(runs[0], self._point_of(numbers)) is None
 
     def _least(self, runs: Sequence[int], numbers: Sequence[int]) -> float:

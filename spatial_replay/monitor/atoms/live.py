@@ -1078,7 +1078,7 @@ class SampleLeaves:
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given numbers of unnamed members, from the cache if possible."""
         key, plans = (self._spec_members, tuple(sorted(counts.items()))), self._plans
-        # moved to the end, so that the order of the dict is the order of use
+        # the plan is moved to the end, so that the order of the dict is the order of use
         plan = plans.pop(key, None)
         if plan is None:
             plan = _plan(self._frame, self._prefix, *key)

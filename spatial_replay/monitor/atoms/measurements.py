@@ -102,7 +102,7 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
 
 def _key(scene: TraceScene, measurement: Measurement) -> Hashable:
     """Return the cache key of a measurement, with the shapes of regions instead of their names."""
-    # shapes, because an edited specification may use a name for another region
+    # the key has shapes, because an edited specification may use a region's name for another region
     shapes = tuple(scene.regions[name] for name in map(_region, measurement.terms) if name is not None)
     # `skip` is part of the key, because arrays begin with the sample `skip`
     if not shapes:

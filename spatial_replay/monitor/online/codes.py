@@ -30,10 +30,10 @@ NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
 WINDOW_MAX, WINDOW_MIN = 10, 11  # extremum of a over positions low to high back
 DELAY = 12  # a at distance low back; before the first sample, infinity with the sign high
-# infinity whose sign is high from a distance low after the first sample on, and the opposite before
+# infinity with the sign high at distances of at least low after the first sample, else the opposite infinity
 ELAPSED = 31
 RINGS = (WINDOW_MAX, WINDOW_MIN)  # store positions in a ring
-AHEAD = 16  # added to a code from ONCE on for the operator in reversed time (see `offline`)
+AHEAD = 16  # added to ONCE and greater codes for the operator in reversed time (see `offline`)
 
 # columns of parts' nodes
 # a = -1 if the left operand is missing: `true` in an until, `false` in a release
@@ -63,7 +63,7 @@ PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, P
 # later samples may exceed every pending position
 PART_KNOWN = 7
 PART_HAS_NOW = 8  # whether the part also reports its value at the newest sample
-# whether the operand never falls, if the root joins by the minimum; by the maximum, whether it never rises
+# whether the operand never falls (for a root that joins by the minimum) or never rises (by the maximum)
 PART_IS_MONOTONE = 9
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `signals`, `windows`

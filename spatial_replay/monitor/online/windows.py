@@ -947,7 +947,7 @@ def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floa
     """
     root, base = len(rows) - 2, state[HEAD, BASE]
     is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, rows[root, codes.NODE_B]
-    # docs/design/monitor.md shows an example; few positions stay open in most recordings
+    # docs/design/monitor.md shows by an example why few positions stay open in most recordings
     limit = tables[0, 0] if is_until else tables[0, 1]
     while base <= last_sample and not _outdoes(is_until, columns[body, base], limit):
         base += 1
