@@ -149,7 +149,7 @@ class Automaton(Displayed):
 
     @cached_property
     def can_reject(self) -> frozenset[int]:
-        """The states from which a run can still end in violation; the others accept permanently."""
+        """The states from which a run can still end in violation; all other states accept permanently."""
         return frozenset(self._distances(self._ends(frozenset(self.states) - self.accepting)))
 
     def step(self, state: int, symbol: Sequence[bool]) -> int:
@@ -159,7 +159,7 @@ class Automaton(Displayed):
             symbol: value of each proposition.
 
         Raises:
-            UsageError: no such state, or a symbol of another length.
+            UsageError: no such state, or a symbol without exactly one value per proposition.
         """
         self._check(state, symbol)
         place = self.entries[state]
@@ -175,7 +175,7 @@ class Automaton(Displayed):
             symbol: value of each proposition, None if it is unknown.
 
         Raises:
-            UsageError: no such state, or a symbol of another length.
+            UsageError: no such state, or a symbol without exactly one value per proposition.
         """
         pending_places = []
         for state in states:
@@ -200,7 +200,7 @@ class Automaton(Displayed):
         """Return whether a run of at least one sample satisfies the formula.
 
         Raises:
-            UsageError: no symbol, or one of another length.
+            UsageError: no symbol, or a symbol without exactly one value per proposition.
         """
         if not symbols:
             raise UsageError("a run has at least one sample; give one symbol for each")
@@ -325,7 +325,7 @@ class Automaton(Displayed):
     def _distances(
         self, goal_states: Collection[int], without: Collection[tuple[int, int]] = ()
     ) -> dict[int, int]:
-        """Map each state that can reach a goal state to the least number of samples that this takes."""
+        """Map each state with a path to a goal state to the least number of samples to a goal state."""
         # transitions to avoid are few; the other transitions of their sources are followed one by one
         avoided_targets: dict[int, set[int]] = {}
         for source, target in without:

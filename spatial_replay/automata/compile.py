@@ -55,7 +55,7 @@ def require_translatable(skeleton: Skeleton) -> None:
 
 
 def mona_program(skeleton: Skeleton) -> str:
-    """Translate a formula that is small enough into a MONA program.
+    """Translate a formula that `require_translatable` accepts into a MONA program.
 
     Proposition 3 becomes the set `P3`. Propositions that the formula does not depend on are left out.
     """
@@ -247,7 +247,7 @@ def _machine(output: str, proposition_count: int) -> Machine:
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:
-    """Return the diagram of disjoint cubes that cover all symbols; earlier variables are decided."""
+    """Return the diagram of disjoint cubes that cover all symbols and agree before `variable`."""
     symbol, target = cubes[0]
     if len(cubes) == 1:
         return diagrams.leaf(target)
@@ -320,8 +320,8 @@ class Obligations:
         """Split a function into cases by the number of failing members of its first chain.
 
         Returns:
-            Pairs (count, function) with ascending counts. A function applies if the number of failing members
-            is below its count, and not below the previous count.
+            Pairs (count, function) with ascending counts. A function applies if the number of failing
+            members is at least the previous count and below its own count.
         """
         cases: list[tuple[int, int]] = []
         count_limit = 0
@@ -333,7 +333,7 @@ class Obligations:
         return cases
 
     def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
-        """Yield pairs: a number of consecutive counts, and the function that applies to these counts."""
+        """Yield pairs: the length of a range of counts, and the function that applies in this range."""
         if self._diagrams[node].variable >= chain.first + chain.bits:
             yield 1 << (chain.bits - bit), node
             return
@@ -627,7 +627,7 @@ class _Joining:
         return len(self._decision_rows) - 1
 
     def _state(self, left_state: int, right_state: int) -> int:
-        """Return the place of a pair of states; (-1, -1) stands for every pair that one state decides."""
+        """Return the place of a pair of states; (-1, -1) stands for all pairs with a deciding state."""
         state = self._state_numbers.get((left_state, right_state))
         if state is None:
             state = self._state_numbers[left_state, right_state] = len(self._pairs)
@@ -762,8 +762,8 @@ def automaton(
         name: name of the spec; None for the only result of the file.
         rate_hz: sampling rate, which converts bounds in seconds into bounds in samples. The result is valid
             only for runs of this rate.
-        compiler: "own" for this package, or "mona"; both give equal automata. With None, MONA is tried
-            only if the formula exceeds this package's limits.
+        compiler: "own" for this package, or "mona"; both compilers give equal automata. With None, MONA is
+            tried only if the formula exceeds this package's limits.
         stored: contents of automaton files. A stored automaton of this spec replaces a call of MONA, unless
             the spec has bounds in seconds.
 

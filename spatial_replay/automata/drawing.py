@@ -66,7 +66,7 @@ def _graphviz(automaton: Automaton, dot_text: str, output_format: str) -> str:
 
 
 _SWEEPS: Final = 4
-"""Passes over the columns that reorder their rows."""
+"""Number of passes that reorder the rows of all columns."""
 
 
 class DrawnState(NamedTuple):

@@ -134,7 +134,7 @@ def node_copier(
 
     Args:
         variables: number of variables to copy; a node that decides on a later variable becomes a leaf.
-        leaf: function from a source node that becomes a leaf to the leaf's number in the target.
+        leaf: returns the number of the target's leaf for a source node that becomes a leaf.
     """
     copies: dict[int, int] = {}
 
@@ -189,8 +189,8 @@ class Propositions:
     """The propositions of a formula, numbered in the order of the text.
 
     Equivalent subformulas are one proposition: `a and b` and `b and a`, `a leftof b` and
-    `not (a rightof b)`. A subformula and its negation are also one proposition. Whichever is written first
-    is the proposition, the other its negated literal.
+    `not (a rightof b)`. A subformula and its negation are also one proposition. The first one in the text is
+    the proposition; the second one is its negated literal.
     """
 
     def __init__(self, formula: Formula) -> None:
@@ -420,8 +420,8 @@ class _Cover(NamedTuple):
     Attributes:
         size: number of cubes.
         union: disjunction of the cubes.
-        split: a variable, then the cubes that require it to be false, to be true, and all other cubes. The
-            three sets omit the variable's literal. None if the only cube is empty, or there is no cube.
+        split: a variable, the cubes with the variable false, the cubes with it true, and all other cubes.
+            These cubes omit the variable's literal. None without cubes, and if the only cube is empty.
     """
 
     size: int

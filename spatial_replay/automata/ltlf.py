@@ -41,7 +41,7 @@ def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
 
 
 def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
-    """Return a sentence on bounds in seconds: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" if it has none."""
+    """Return a sentence on bounds in seconds: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without bounds."""
     sentences: dict[str, None] = {}
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
@@ -98,7 +98,7 @@ def no_automaton(spec: NamedSpec, source: SourceText | None, reason: str) -> NoA
 def obstacle(
     source: SourceText | None, node: Formula | None, message: str, remedy: str = ""
 ) -> NoAutomatonError:
-    """Return the error for a node, with the node's place in the source text if both are given."""
+    """Return the error for a node, with its place in the text if `source` and `node` are given."""
     hint = f"it is evaluated all the same{'; ' if remedy else ''}{remedy}"
     if source is None or node is None:
         return NoAutomatonError(f"{message}; {hint}", message)
@@ -128,7 +128,7 @@ def _width(node: Formula) -> int:
 
 
 def _without_names(formula: Formula) -> Formula:
-    """Return the formula of the spec that a formula names, if the formula is only a name."""
+    """Replace the name of a spec by the spec's formula; return other formulas unchanged."""
     while isinstance(formula, Boolean) and formula.operator == "spec":
         (formula,) = formula.operands
     return formula
@@ -219,7 +219,7 @@ class Skeleton:
         return "and", (number,)
 
     def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
-        """Return the operands of a conjunction or disjunction, which includes operands of nested ones."""
+        """Return a conjunction's or disjunction's operands; nested nodes of the same kind are flattened."""
         operands: dict[int, None] = {}
         stack = [number]
         while stack:
@@ -231,7 +231,7 @@ class Skeleton:
         return tuple(operands)
 
     def _of(self, formula: Formula, is_positive: bool) -> int:
-        """Return the number of a formula, or of its negation."""
+        """Return the number of a formula or, if not `is_positive`, of its negation."""
         proposition = self._propositions.literal(formula)
         if proposition is not None:
             number, is_affirmed = proposition

@@ -1,1 +1,1 @@
-"""Robustness of formulas on traces, with deciding atoms: online, offline, and by the paper."""
+"""Robustness of formulas on traces, with deciding atoms: online, offline, and by the paper's definition."""

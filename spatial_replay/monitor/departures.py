@@ -46,7 +46,7 @@ _APPROACH_NS: Final = 1_000_000_000
 
 
 _STAND_IN: Final = "\0"
-"""A name that no object has; it sorts before all others."""
+"""A name that no object has; it sorts before all other names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,8 @@ class Departure:
         name: name of the object.
         start_ns: time of the first sample without the object.
         end_ns: time of the sample in which the object returns.
-        distance: distance to the other object of the atom. It is measured in the last sample before the
-            absence or, if the object was not near then, at `end_ns`.
+        distance: distance to the other object of the atom in the last sample before the absence. If the
+            object was not near before the absence, it is the distance at `end_ns`.
         message: a sentence.
     """
 
@@ -246,7 +246,7 @@ class _Absence(NamedTuple):
 
     Attributes:
         reason: beginning of the sentence about the absence.
-        early_ns: time of the first sample with the member in the last second up to `last_ns`.
+        early_ns: time of the member's first sample within the second that ends at `last_ns`.
         last_ns: time of the last sample with the member.
         start_ns: time of the first sample without the member.
         early_distances, last_distances: (watches,), distances at `early_ns` and `last_ns`.
@@ -263,7 +263,7 @@ class _Absence(NamedTuple):
 
 
 def _early(trace: Trace, memberships: Flags, sample: int, column: int) -> int:
-    """Return the index of the first sample with a member, within the last second up to `sample` - 1."""
+    """Return the first sample with a member within the second that ends at `sample` - 1."""
     first_sample = int(np.searchsorted(trace.times_ns[:sample], trace.times_ns[sample - 1] - _APPROACH_NS))
     return first_sample + int(memberships[first_sample:sample, column].argmax())
 

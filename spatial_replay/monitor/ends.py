@@ -256,7 +256,7 @@ class RunEnds:
         self.remarks = (*self.remarks, sentence)
 
     def _open_spans(self) -> Iterator[TopicSpan]:
-        """Yield needed spans that ended before the newest sample, but within their limits."""
+        """Yield needed spans that ended after the released samples, at most `limit_ns` before the newest."""
         if not self._may_trim_end:
             return
         for span in self.needs.choose(tuple(self._spans.values())):

@@ -33,7 +33,7 @@ from spatial_replay.text import Instant, Sentence, number_text, plural
 LISTED: Final = 5
 """Number of intervals that an explanation lists."""
 MOST_EXPLAINED: Final = 256
-"""Limit on an invariant's intervals with a deciding atom. Each such interval reads its sample again."""
+"""Limit on an invariant's intervals with a deciding atom, because each atom needs a sample to be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class ViolatedInterval:
         robustness: robustness of the operand at `worst_ns`.
         deciding: deciding atom at `worst_ns`. For a missed response, it is the atom that came closest to
             fulfilling the response. It is None after `MOST_EXPLAINED` intervals, and if no atom decides.
-        deciding_ns: time of the sample in which this atom was measured.
+        deciding_ns: time of the sample in which the deciding atom was measured.
         place: contact point of the deciding atom, else of the condition's atom, else None.
     """
 
@@ -107,8 +107,8 @@ def find_violated_invariants(
     Args:
         leaves: (C, A, T), the instance's leaves.
         times_ns: (T,), T at least 1.
-        goes_on: whether samples may follow; then only permanent violations count.
-        most: number of intervals per invariant that get a deciding atom. They are the first intervals.
+        goes_on: whether samples may follow; then only permanent violations are yielded.
+        most: limit on intervals per invariant with a deciding atom, which are the first intervals.
     """
     invariants = [invariant for conjunct in conjuncts if (invariant := _Invariant.of(conjunct)) is not None]
     if not invariants:
@@ -137,7 +137,7 @@ class _Invariant(NamedTuple):
 
     @property
     def end(self) -> End:
-        """The end of the operand's interval that decides a violation."""
+        """The low or high end of the operand's robustness interval, whichever decides a violation."""
         return End.HIGH if self.operator.operator == "G" else End.LOW
 
     @classmethod

@@ -79,7 +79,7 @@ class NodeUpdate(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Satisfied or violated if no continuation can change that; else pending."""
+        """Satisfied or violated if no continuation can change the verdict; else pending."""
         return online_verdict(self.lower, self.upper)
 
 
@@ -152,7 +152,7 @@ class Settlement(NamedTuple):
 
 
 class Update:
-    """The numbers and verdicts after one sample. Later samples do not change it."""
+    """The numbers and verdicts after one sample. Later samples do not change this object."""
 
     # a frozen dataclass takes 0.5 µs more to construct, at every sample
     __slots__ = ("_monitored", "_numbers", "_settlement", "_specs", "_time_ns")
@@ -239,7 +239,7 @@ class Ending(NamedTuple):
     Attributes:
         robustness: value of the root on the samples so far; NaN if undetermined.
         lower, upper: ends of the value's interval over the finished log.
-        unit: declared unit of the three numbers, or "".
+        unit: declared unit of `robustness`, `lower` and `upper`, or "".
         reason: explanation of an unknown verdict; "" for other verdicts, and without `note_unknown`.
         doubts: assumptions that the verdict depends on, and that the run contradicts.
     """
@@ -358,7 +358,7 @@ class Monitor:
         return tuple(sorted(self._start.missing)) if self._start.begin_ns is not None else ()
 
     def endings(self) -> tuple[Ending, ...]:
-        """Return the result of each spec if the run ends here. It is unknown before an evaluated sample."""
+        """Return the result of each spec if the run ends here; unknown before the first evaluated sample."""
         results = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
         endings = (_ending(spec, final, numbers, unit) for spec, final, numbers, unit in results)
         return tuple(
@@ -446,7 +446,7 @@ class _Start:
         self._first_ns: int | None = None
 
     def has_begun(self, sample: Sample) -> bool:
-        """Return whether evaluation has begun or begins with the next sample, which is given."""
+        """Return whether evaluation has begun or begins with the next sample, `sample`."""
         if self.begin_ns is not None:
             return True
         self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
@@ -600,7 +600,7 @@ class Violation:
 
     @property
     def threshold(self) -> Threshold | None:
-        """The change of the atom's number that would have prevented the violation; None without one."""
+        """The change of the atom's number that would have prevented the violation, or None."""
         return None if self.witness is None else self.witness.threshold
 
     @property
@@ -670,8 +670,8 @@ class Settled:
 
     Attributes:
         verdict: permanently satisfied, permanently violated, or unknown at the end of a run.
-        number: end of the interval that settles the verdict: the lower end of a satisfied part, the upper end
-            of a violated part.
+        number: robustness bound that settles the verdict: the lower end for a satisfied part, the upper end
+            for a violated part.
         samples: newest samples of the run.
         start: index in `samples` of the first evaluated sample.
         is_whole: whether `samples` begins with the first sample of the run.
@@ -716,7 +716,7 @@ class Settled:
     def witness(self) -> Witness | None:
         """The witness on the newest samples, or None.
 
-        It uses few samples, if the part has `verdict` and `number` on them.
+        It uses the smallest tried number of newest samples on which the part has `verdict` and `number`.
         """
         for begin in self._begins():
             witness = self._witness_from(begin)

@@ -4,8 +4,8 @@ A monitor, in contrast, computes robustness only at the first and the newest sam
 evaluated as a separate log at each position.
 
 The last sample is known, so each operator takes one pass, independent of the width of its window.
-A future operator is a past operator in reversed time: kernels count *steps* 0, 1, … and look back. Step i is
-sample begin + i. For a future operator, it is sample end - 1 - i.
+A future operator is a past operator in reversed time: kernels number *steps* 0, 1, … and look back. For a
+past operator, step i is sample begin + i. For a future operator, step i is sample end - 1 - i.
 """
 
 from __future__ import annotations
@@ -369,8 +369,8 @@ def _judged_operands(tree: Sequence[tuple[Formula, list[int]]]) -> dict[int, Boo
     """Return the operands of temporal operators that contain rates, by id, as `given` or `with` formulas.
 
     A temporal operator leaves out samples in which a rate of its operand has no value. The operand is
-    therefore judged as `given` or `with`. Its first operand is the condition that all rates have values, and
-    its second is the operand itself.
+    therefore judged by a `given` or `with` formula. This formula's first operand is the condition that all
+    rates have values. Its second operand is the judged operand.
     """
     return {
         identifier: operand
@@ -399,8 +399,8 @@ def evaluate_prefix(
 ) -> OfflineNodes:
     """Evaluate every node over samples that further samples may follow.
 
-    Values after the last sample are unknown, [-inf, +inf], so the robustness at the first sample is that of a
-    monitor. Its deciding path ends at the atom that settled a verdict before the log ended. Arguments are as
+    Values after the last sample are unknown, [-inf, +inf], so the robustness at the first sample is that of
+    a monitor. A deciding path ends at the atom that settled a verdict before the log ended. Arguments are as
     for `evaluate_offline`.
     """
     return replace(_evaluate_beyond(formula, order, leaves, times_ns, _is_open), goes_on=True)
@@ -436,7 +436,8 @@ class _OpenFormulas:
 
     Attributes:
         leaves: one leaf for each operator whose window is open at some sample.
-        columns: (T,) for each leaf, whether the leaf is unknown at a sample. At other samples it is `false`.
+        columns: (T,) for each leaf, whether the leaf is unknown at a sample. At all other samples, the leaf
+            is `false`.
     """
 
     def __init__(self, times_ns: Integers, find_open: Callable[[Temporal, Integers], Booleans]) -> None:

@@ -56,7 +56,7 @@ class ThresholdRange:
         bound: quantifiers that bind the atom's variables, outermost first. A template parameter counts as a
             variable with a quantifier.
         least, greatest: range of the quantity over all objects that the variables stand for. The range is
-            empty (least > greatest) for a text, and for a quantity that is never known.
+            empty (least > greatest) for a comparison with a text, and for a quantity that is never known.
         known: number of samples in which the quantity is known.
         holding: number of samples in which the atom holds for all objects.
         failing: number of samples in which the atom fails for all objects.

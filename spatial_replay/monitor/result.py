@@ -134,7 +134,8 @@ class SpecResult(Displayed):
         first_satisfied_ns: time of the first sample at which the root's value is at least 0, or None. Later
             values may be below 0.
         settled_ns: (N, 2), see `InstanceStream`.
-        times_ns: (T,) int64, times of the evaluated samples; empty if no numbers of samples were stored.
+        times_ns: (T,) int64, times of the evaluated samples; empty if the numbers of each sample were not
+            stored.
         series: (N, 4, T), value, now, lower, upper of each node (see `NodeResult`); T = 0 if not stored.
         leaves: (C, A, T), leaves of the instance, which witnesses and signals need; None if not stored.
         evidence: access to the samples of the log.
@@ -266,12 +267,12 @@ class SpecResult(Displayed):
 
     @property
     def satisfied_at_ns(self) -> int | None:
-        """Time at which satisfaction became certain; None if only the end decided, and for other verdicts."""
+        """Time at which satisfaction became certain; None if only the end decided, or if not satisfied."""
         return self.certain_ns() if self.verdict is Verdict.SATISFIED else None
 
     @property
     def violated_at_ns(self) -> int | None:
-        """Time at which violation became certain; None if only the end decided, and for other verdicts."""
+        """Time at which violation became certain; None if only the end decided, or if not violated."""
         return self.certain_ns() if self.verdict is Verdict.VIOLATED else None
 
     def certain_ns(self, node: int = 0) -> int | None:
@@ -342,8 +343,9 @@ class SpecResult(Displayed):
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
 
-        The column `seconds` counts from the log's first sample. Each node has the columns `NAME value`,
-        `NAME now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's id and text.
+        The column `seconds` has the time since the log's first sample, s. Each node has the columns
+        `NAME value`, `NAME now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's
+        id and text.
 
         Raises:
             UsageError: pandas is not installed, or the numbers of each sample were not stored.
@@ -361,7 +363,7 @@ class SpecResult(Displayed):
 
     @property
     def least_at_ns(self) -> int | None:
-        """Time of the first cause's least robustness; None unless that is later than its settling time."""
+        """Time of the first cause's least robustness; None if it did not fall after the cause settled."""
         return self._least_at_ns(self.causes)
 
     @cached_property
@@ -495,7 +497,7 @@ class SpecResult(Displayed):
         return deciding_path(nodes, 0, End.of(final_verdict(*nodes.interval(0)))).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
-        """Return sentences on the robustness, and on the first violation if that was earlier.
+        """Return sentences on the robustness and, if it fell after settling, on the first violation.
 
         The text is "" without a witness (see `worst`).
         """
@@ -523,7 +525,7 @@ class SpecResult(Displayed):
         return "\n".join(self.sentences(first_ns))
 
     def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
-        """Return the sentences of `explain`, with times counted from `first_ns`."""
+        """Return the sentences of `explain`, with times relative to `first_ns`."""
         sentences = self.sentences_about(0, self.causes, first_ns)
         return (*sentences, *counted_from(self.remarks, first_ns))
 
@@ -594,7 +596,7 @@ class SpecResult(Displayed):
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)
 
     def _settled_witness(self, node: int, settled_ns: int | None) -> Witness | None:
-        """Return the witness of a node's verdict at `settled_ns`, or on the whole log if that is None."""
+        """Return the witness of a node's verdict at `settled_ns`; for None, on the whole log."""
         if self.leaves is None or not self.can_explain:
             return None
         if settled_ns is None:
@@ -647,9 +649,8 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
     """Return the indices of results, worst first: violated, then unknown, then others.
 
-    Violated results are sorted by settling time. A violation that only the end of the log decided counts as
-    the latest. Otherwise results keep the order of the files. Robustness is not compared, because units may
-    differ.
+    Violated results are sorted by settling time. Violations that only the end of the log decided follow.
+    Otherwise results keep the order of the files. Robustness is not compared, because units may differ.
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 
@@ -824,10 +825,10 @@ def evaluate(
             class.
 
     Raises:
-        SpecificationError: a text that names no number of its signal, if the trace declares names of numbers.
-            With `strict_names`, also a name that the trace never has.
-        UsageError: no sample in the window, a template without its objects, unknown semantics, an
-            operator that the semantics does not define, or an argument of another type.
+        SpecificationError: a text that is not among the names that the trace declares for numbers of its
+            signal. With `strict_names`, also a name that the trace never has.
+        UsageError: no sample in the window, a template without its objects, unknown semantics, an operator
+            that the semantics does not define, or an argument of the wrong type.
     """
     require_specification(specification)
     _require_trace(trace)

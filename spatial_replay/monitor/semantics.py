@@ -44,10 +44,10 @@ class PaperMemory(NamedTuple):
     Attributes:
         stamps: (room,), times of the samples in ns; only the first time if there are no columns.
         columns: (K, room), stored numbers at each sample, on the samples so far.
-        value: (N,), each node at the first sample.
-        now: (N,), each node at the newest sample.
+        value: (N,), value of each node at the first sample.
+        now: (N,), value of each node at the newest sample.
         left: (N,), running minimum of an until's left operand, for the until at the first sample.
-        starts: (N,), first sample in the window of sample `opens`; -1 before it is known.
+        starts: (N,), first sample in the window of sample `opens`; -1 until this window begins.
         opens: (N,), earliest sample whose window is still open.
         pairs: minimum of an until's left operand from each sample to each end, one row per end.
         pair_starts: (P, room), `pair_starts[p, t] + s` is the index in `pairs` for sample s and end t.
@@ -508,9 +508,9 @@ def scan_until(
 ) -> None:  # fmt: skip
     """Compute until from each sample to `last`, for a left operand that depends on no later sample.
 
-    The scan runs backwards, and the left operand at each sample caps the best value over later ends. If all
-    numbers of an end were left out so far, the end's value is the left operand, which no other end can
-    exceed.
+    The scan runs backwards, and the left operand at each sample caps the best value over later ends. An end
+    whose numbers were all left out so far gets the next left operand that is not left out. No other end can
+    exceed this value.
     """
     best_value, is_lost, is_any_left_out = np.nan, 0, False
     for sample in range(last, first - 1, -1):
@@ -569,7 +569,8 @@ class PaperRun:
     """The numbers of every node on every prefix by Def. 16.
 
     A temporal operator over formulas without temporal operators stores one number. Below another temporal
-    operator, it stores a number for every sample so far, and the time of an update grows with their number.
+    operator, it stores a number for every sample so far, and the time of an update grows with the number of
+    samples.
     """
 
     def __init__(
@@ -579,7 +580,7 @@ class PaperRun:
 
         Args:
             leaves: atoms and open quantifiers of the formula, in the order in which `extend` receives them.
-            max_pairs: limit on compared pairs of samples.
+            max_pairs: limit on pairs of samples for which untils store a number.
         """
         self._max_pairs = max_pairs
         self._table = paper_table(formula, leaves)
@@ -675,7 +676,7 @@ def left_out(
 ) -> Floats:
     """Return leaves with NaN where they are left out, because they look back (`a[-3]`) beyond the log.
 
-    A leaf with a rate is also NaN where the rate has no value, if an operator leaves such samples out.
+    A leaf with a rate is also NaN where the rate has no value, if an operator omits samples without a value.
 
     Args:
         values: (C, A, T), numbers of the leaves.

@@ -42,10 +42,10 @@ class Cause:
         verdict: violated or unknown.
         robustness: robustness of the conjunct on the whole log; NaN if undetermined.
         settled_ns: time at which the violation became certain; None if only the end of the log decided.
-        witness: witness of the conjunct on the samples up to `settled_ns`, or on the whole log if that is
-            None. The witness is None under the paper's semantics, and if leaves were not stored.
-        least: witness of the robustness on the whole log if that is less than the robustness at
-            `settled_ns`; else None.
+        witness: witness of the conjunct on the samples up to `settled_ns`, or on the whole log if
+            `settled_ns` is None. The witness is None under the paper's semantics, and if leaves were not
+            stored.
+        least: witness of `robustness` if it is less than the robustness at `settled_ns`; else None.
         requirement, title: id ("REQ-12") and title of the spec's requirement, or None.
     """
 
@@ -72,8 +72,8 @@ class LeastPart:
 
     Attributes:
         spec: innermost named spec that contains the conjunct.
-        name: the spec's name. If the first cause or the result has that name, it is the shortened text of
-            the conjunct instead.
+        name: the spec's name. If the first cause or the result has the same name, `name` is the conjunct's
+            shortened text instead.
         node: node id of the conjunct.
     """
 
@@ -324,8 +324,8 @@ def verdict_sentence(
 
     Args:
         title: name of the result.
-        ends: ends of its interval on the finished log.
-        unit: declared unit of its robustness, or "".
+        ends: ends of the robustness interval on the finished log.
+        unit: declared unit of the robustness, or "".
         certain_since: time at which the verdict became certain.
         has_ended: whether the verdict was pending until the end of the log, and is violated because of that.
         least: conjunct with the least robustness, if that is not the first cause's conjunct.
@@ -449,7 +449,7 @@ def _join(first: Sentence, *others: Sentence) -> Sentence:
 
 
 def cause_reason(cause: Cause, first_ns: int) -> Sentence:
-    """Return sentences on a cause's robustness, and on the first violation if that was earlier.
+    """Return sentences on a cause's robustness and, if it fell after settling, on the first violation.
 
     The result is "" without a witness.
     """

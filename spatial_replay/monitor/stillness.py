@@ -102,7 +102,7 @@ class Stillness:
 
 
 def _numbers(trace: Trace) -> Floats:
-    """Return the sum of the vertices and the yaw of each observation, (R, 3)."""
+    """Return each observation's sum of vertex x, sum of vertex y, and yaw, (R, 3)."""
     batch = trace.footprints
     vertex_starts = batch.vertex_start[batch.part_start]
     sums = np.zeros((len(trace.yaw), 3))

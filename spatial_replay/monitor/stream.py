@@ -446,8 +446,8 @@ class LiveStream:
         """Add the next sample, which is later than the previous sample.
 
         Returns:
-            (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns`, the entry of
-            a formula is None. Under the paper's semantics, its numbers are NaN then.
+            (N, 4) for each formula: value, now, lower and upper of each node. Before `start_ns`, the entry
+            of a formula is None, or NaN numbers under the paper's semantics.
         """
         if not self._is_online:
             return self._extend_apart(sample)

@@ -366,12 +366,12 @@ class _Windows:
 def _scopes(
     formula: Formula, windows: _Windows, holding_samples: _Holding, *, is_conditional: bool = False
 ) -> list[_Samples]:
-    """Return for each node the samples (T,) at which the formula's robustness depends on it.
+    """Return for each node the samples (T,) at which the formula's robustness depends on the node.
 
     Samples are excluded if an operator leaves them out because a rate has no value.
 
     Args:
-        is_conditional: whether consequents count only at samples where their antecedents may hold.
+        is_conditional: whether a consequent only gets the samples at which its antecedent may hold.
     """
     tree = nodes_with_operands(formula)
     # the verdict is decided by the robustness of the root at the first sample
@@ -392,7 +392,7 @@ def _scopes(
 
 
 def _below(formula: Temporal, operand_index: int, scope: _Samples, windows: _Windows) -> _Samples:
-    """Return the samples (T,) at which an operand counts, if its operator counts at the samples `scope`."""
+    """Return the samples (T,) of an operand, from the samples `scope` of its operator (see `_scopes`)."""
     begins, ends = windows(formula)
     counting_samples = np.flatnonzero(scope & (begins < ends))
     begins, ends = begins[counting_samples], ends[counting_samples]
@@ -423,7 +423,7 @@ def _empty_windows(
     windows: _Windows,
     evidence: Evidence,
 ) -> Iterator[_Idle]:
-    """Find operators whose windows are empty at all samples where they count.
+    """Find operators whose windows are empty at all samples of their scopes.
 
     Args:
         scopes: samples at which the robustness depends on each node.
@@ -492,9 +492,9 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
 
 
 def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
-    """Yield each implication in a quantifier's body, a formula, and whether the implication is nested.
+    """Yield for each implication in a quantifier's body the implication, a formula, and whether it is nested.
 
-    The formula is that the antecedent holds for some member. A nested implication is in the consequent of
+    The formula states that the antecedent holds for some member. A nested implication is in the consequent of
     another implication, and its formula also requires the antecedent of that implication.
     """
     pending_parts: list[tuple[Formula, tuple[Formula, ...]]] = [(_body(node), ())]

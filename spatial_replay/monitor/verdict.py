@@ -66,7 +66,7 @@ def final_verdict(lower: float, upper: float) -> Verdict:
 def online_verdict(lower: float, upper: float) -> Verdict:
     """Return the verdict during a run from the interval of the robustness over all continuations.
 
-    It is unknown for NaN, because the paper's semantics has no continuations.
+    The verdict is unknown for NaN, because the paper's semantics has no continuations.
     """
     if lower >= 0.0:
         return Verdict.SATISFIED

@@ -23,7 +23,7 @@ class Doubt:
 
     Attributes:
         assumption: name of the assumption, as in `accept` of a mapping.
-        topic: topic whose messages contradict it; "" for a log without topics.
+        topic: topic whose messages contradict the assumption; "" for a log without topics.
         text: sentence with the topic, the measurement, and the mapping key that settles the doubt.
         objects, signals: names whose values depend on the assumption.
         is_accepted: whether the mapping accepts the doubt. Verdicts are not doubtful then.
@@ -83,7 +83,7 @@ def doubts_from_metadata(record: Mapping[str, str]) -> Iterator[Doubt]:
 
 
 def distinct_doubts(doubts: Iterable[Doubt], first_ns: int) -> tuple[Doubt, ...]:
-    """Return each doubt once, with the times in its text counted from `first_ns`."""
+    """Return each doubt once, with the times in its text relative to `first_ns`."""
     return tuple(
         replace(doubt, text=counted_from([doubt.text], first_ns)[0]) for doubt in dict.fromkeys(doubts)
     )

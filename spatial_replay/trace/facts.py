@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Distribution(NamedTuple):
-    """Least, median and greatest number of a set, and the time of the greatest number or None."""
+    """Least, median and greatest value of a quantity, and the time of the greatest value, ns, or None."""
 
     least: float
     median: float

@@ -20,7 +20,7 @@ class TopicSpan:
         classes: classes of its possible objects, in lower case; None for any class.
         limit_ns: longest time that may be left out at an end of the log because of this topic, ns.
         begun_ns, heard_ns: times of its first and last message; None without messages.
-        first_ns, last_ns: times of the first and the last such sample; None without such samples.
+        first_ns, last_ns: times of the first and the last sample in which the topic could be judged, or None.
     """
 
     topic: str

@@ -339,8 +339,8 @@ class Trace(Displayed):
 
     Objects are stored as observations: rows of flat arrays, one row for each report of an object.
     `rows[t, n]` is the observation of object n in sample t, or `ABSENT`. An observation with a number
-    that is not finite is unreadable, and its object is unknown. `rows` has -2 - row for such an observation,
-    which keeps its row number.
+    that is not finite is unreadable, and its object is unknown. An unreadable observation in row r has the
+    entry -2 - r in `rows`.
 
     Two traces are equal if they hold the same samples. Equality ignores `faults`, `remarks`, `doubts`,
     `units`, `spans`, the order of observations, and names that no sample uses.

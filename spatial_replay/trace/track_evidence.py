@@ -47,9 +47,9 @@ class TrackEvidence:
             self._turning_objects.update(trace.names)
 
     def _add_steps(self, trace: Trace) -> None:
-        """Update the count of fast steps, and whether angles count turns.
+        """Update the number of fast steps, and whether angles are unwrapped.
 
-        Angles that count turns begin within one turn, and each step is shorter than half a turn.
+        Unwrapped angles begin within one turn, and each step is smaller than half a turn.
         """
         yaw = np.where(trace.rows >= 0, trace.yaw[np.maximum(trace.rows, 0)], np.nan)
 

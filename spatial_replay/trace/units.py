@@ -1,7 +1,7 @@
 """The axes and units of a source: direction of y, unit of lengths, and units of signals.
 
-Samples always have y upwards, so that `above` means above and drawings are the right way up. Image rows count
-downwards, so coordinates from images are mirrored once, when they are read.
+Samples always have y upwards, so that `above` means above and drawings are the right way up. Row numbers of
+images increase downwards, so coordinates from images are mirrored once, when they are read.
 """
 
 from __future__ import annotations

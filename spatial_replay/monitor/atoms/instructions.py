@@ -4,10 +4,10 @@ Each instruction writes one column in every channel (see `online.codes`). It com
 columns, measurements, signals or constants.
 
 For some quantifiers, only the closest two members of a group are measured.
-`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. The body
-depends only on the distance of p and q, and falls with the distance, so the closest pair has the least value.
-Likewise, the closest pair has the greatest value for `exists p, q` with a body that rises as the distance
-falls.
+`forall p, q in people: p dist q >= 0.5` has a binding for each ordered pair, 39,800 for 200 people. The
+body's robustness depends only on the distance of p and q, and rises with this distance. The closest pair
+therefore has the least robustness. In `exists p, q`, the closest pair has the greatest robustness if
+robustness falls as the distance rises.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def run_instructions(
     """Run the instructions over the samples from `begin` to before `end`.
 
     Args:
-        code: four numbers for each instruction.
+        code: operation, a, b and c of each instruction.
         values, spreads, signals, closest, members: rows of T numbers each; four rows per closest pair.
         outputs: (A,), number of the instruction that computes each leaf.
         leaves: (C, A, T), output.
@@ -336,10 +336,10 @@ class OpenGroups(Protocol):
 
 
 class Membership(NamedTuple):
-    """A binding of an open quantifier, with a number for each sample.
+    """A binding of an open quantifier, with a flag for each sample.
 
-    The number is 1 in samples in which all `candidates` are members, else 0. Without candidates, it is -1 in
-    samples with unknown members, else 0.
+    The flag is 1 in samples in which all `candidates` are members, else 0. Without candidates, the flag is -1
+    in samples with unknown members, else 0.
 
     Attributes:
         candidates: indices of objects among the candidates of the group.
@@ -353,8 +353,8 @@ class LeafCode:
     """Instructions for leaves, operands first. Equal instructions share a column.
 
     Attributes:
-        rows: number of an instruction, by its operation, a, b and c.
-        constants, measurements, signals, closest, members: number of an input, by kind of input.
+        rows: number of each instruction, by (operation, a, b, c).
+        constants, measurements, signals, closest, members: index of each input among inputs of its kind.
     """
 
     def __init__(self, groups: OpenGroups) -> None:
@@ -439,7 +439,7 @@ class LeafCode:
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
     def _current(self, rate: Rate, bindings: Bindings) -> int:
-        """Return a row that is NaN in samples without an object of a rate, or without its signal."""
+        """Return a row that is NaN in samples that lack the rate's signal or one of its objects."""
         if rate.signal is not None:
             return self._expression(rate.signal, bindings)
         row, *other_rows = [self._expression(Projection(term, "x", "min"), bindings) for term in rate.terms]

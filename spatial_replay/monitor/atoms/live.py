@@ -109,8 +109,8 @@ class PlanArrays(NamedTuple):
             and `second`, which is -1 for a single operand.
         yaws: (Y, 3), number of each measurement between orientations, and its two rows.
         closest_enlargement: total enlargement of each closest pair.
-        is_group: 1 for an entry that stands for a group itself. Its members are unknown in samples without
-            the listed row.
+        is_group: 1 for a binding that stands for a whole group. The group's members are unknown in samples
+            without the listed row.
         code, constants, outputs: arguments of `run_instructions`.
     """
 
@@ -538,9 +538,9 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, end: int, leav
 
     Args:
         whole, real: arrays of a `PackedPlan`.
-        sample: 0 or `ABSENT` for each sample, then the value of each signal. If the plan distinguishes
-            classes, the class code of each place follows. The `packed` object of each place comes last. It
-            has 0 parts for an absent object, and -1 parts for an unknown position.
+        sample: 0 or `ABSENT` for each sample that the plan reads, then the value of each signal. If the plan
+            distinguishes classes, the class code of each place follows. The `packed` object of each place
+            comes last. It has 0 parts for an absent object, and -1 parts for an unknown position.
         end: end of the sample's numbers, where the work space begins.
         leaves: (MOST_CHANNELS, A, 1), output.
 
@@ -729,7 +729,7 @@ class PlanRows:
         return [Row(place_row(name)) for name in named_members(base)]
 
     def required_rows(self, term: Term) -> list[Row]:
-        """Return the rows without which a term is unknown, with the row of an earlier sample."""
+        """Return the rows without which a term is unknown, including the row of its earlier sample."""
         current_term, base = standing(term), base_of(term)
         sample_rows = [Row(self._sample_of(current_term))] if isinstance(current_term, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
@@ -948,10 +948,11 @@ def _enlargement(term: Term) -> float:
 
 
 MOST_PLANS = 64
+"""Limit on the number of stored plans."""
 _MOST_BYTES = 1 << 22
-"""Limits on the number and the bytes of stored plans. The least recently used plans are evicted first."""
+"""Limit on the size of all stored plans, bytes. The least recently used plans are evicted first."""
 _MOST_CLASSES = 1024
-"""Limit on cached class names. Objects may write a class in upper and lower case."""
+"""Limit on cached spellings of class names, which may differ in upper and lower case."""
 
 _NO_OBJECT = ""
 """A name that no object has."""
@@ -1014,7 +1015,7 @@ class SampleLeaves:
         self.room = SampleRoom(len(formulas))
 
     def look_at(self, sample: Sample) -> Sequence[Sample | None]:
-        """Add the next sample. Return the sample at each delay of terms, or None before the first sample."""
+        """Add the next sample. Return the sample at each delay; None for a delay beyond the first sample."""
         if not self._looks_back:
             return (sample,)
         self._reports.add(sample)

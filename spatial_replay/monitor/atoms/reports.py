@@ -1,4 +1,4 @@
-"""Reports of objects and signals in samples: the previous report, and the time between both reports.
+"""Reports of objects and signals in samples: the previous report, and the time since that report.
 
 Consecutive samples may show the same report. The first report after a sample without a report has no previous
 report.
@@ -29,7 +29,7 @@ from spatial_replay.trace.trace import Sample, Trace
 
 
 def before_last_reports(trace: Trace) -> Integers:
-    """Return the sample before the begin of the newest report, for objects and signals with report times."""
+    """Return the last sample before the newest report, for each object and signal with report times."""
     columns = [(trace.rows >= 0, trace.reported_ns)] if trace.reported_ns is not None else []
     for name, reported_ns in trace.signals_reported_ns.items():
         columns.append((is_signal_known(trace.signals[name])[:, None], reported_ns[:, None]))
@@ -59,7 +59,8 @@ class Reports(NamedTuple):
     Attributes:
         before: (T,), last sample with the previous report; -1 without a previous report, such as after a
             sample without a report.
-        seconds: (T,), time between both reports; NaN if it is not positive, or without a previous report.
+        seconds: (T,), time from the previous to the current report, s; NaN if it is not positive, or without
+            a previous report.
     """
 
     before: Integers
@@ -86,7 +87,8 @@ class LatestReport:
         value: the object, or the number of the signal.
         reported_ns: time of the report.
         before: previous report, or None.
-        seconds: time between both reports; NaN if it is not positive, or without a previous report.
+        seconds: time from the previous report to this report, s; NaN if it is not positive, or without a
+            previous report.
         centre: packed centre of an object; None until it is needed.
     """
 
@@ -97,7 +99,7 @@ class LatestReport:
     centre: tuple[bytes, bytes] | None = None
 
     def follow(self, value: Any, reported_ns: int) -> LatestReport:
-        """Return the report of the next sample. It is this report again if the report times are equal."""
+        """Return the report of the next sample; this report itself if the report times are equal."""
         if reported_ns == self.reported_ns:
             return LatestReport(value, reported_ns, self.before, self.seconds)
         step_ns = reported_ns - self.reported_ns

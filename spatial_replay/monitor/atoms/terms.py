@@ -120,7 +120,7 @@ class RecentSamples:
         self._is_newest_only = [delay for delay, _ in self._queues] == [NO_DELAY]
 
     def add(self, sample: Sample) -> list[Sample | None]:
-        """Add the next sample. Return the sample at each delay, or None before the first sample."""
+        """Add the next sample. Return the sample at each delay; None for a delay beyond the first sample."""
         if self._is_newest_only:
             return [sample]
         return [_at_delay(delay, queue, sample) for delay, queue in self._queues]

@@ -99,7 +99,7 @@ CHANNELS = 4
 """Number of channels: nominal low and high, wide low and high."""
 
 _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3)})
-"""Number of the stored channel that equals each of the four channels, by the number of stored channels."""
+"""Index of the stored channel that equals each of the four channels, by how many channels are stored."""
 
 
 def in_channels(numbers: Floats, channels: int) -> Floats:

@@ -101,7 +101,7 @@ class SignalTable:
         return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
 
     def array(self, kept_rows: Iterable[int]) -> Integers:
-        """Return the table (S, SIGNAL_WIDTH) with numbers of rings.
+        """Return the table (S, SIGNAL_WIDTH), with each row's ring and whether its history is read.
 
         Args:
             kept_rows: rows that parts read at earlier samples.
@@ -175,8 +175,9 @@ class SignalTable:
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
         """Add a since over a window, phi S[a,b] psi.
 
-        It is rewritten as O[a,b] psi and phi S[a,inf] psi. phi S[a,inf] psi is rewritten as phi over the last
-        a, and phi S psi before. Both identities are exact for robustness, because min distributes over max.
+        It is rewritten as O[a,b] psi and phi S[a,inf] psi. phi S[a,inf] psi is rewritten as H[0,a-1] phi
+        and, delayed by a, phi S psi. Both identities are exact for robustness, because min distributes over
+        max.
         """
         row = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
@@ -303,7 +304,7 @@ class PartRows:
     def _add(self, formula: Formula, is_positive: bool) -> int:
         """Return the row of a formula or, if not `is_positive`, of its negation, in negation normal form.
 
-        Each of the two rows is built once, because the expansion of `xor` has operands of both signs.
+        A formula's row and its negation's row are each built once, because `xor` expands to both.
         """
         formula = expand(formula)
         while isinstance(formula, Boolean) and formula.operator == "not":

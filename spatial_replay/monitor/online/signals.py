@@ -117,8 +117,8 @@ def run_signals(
 
     Args:
         first_leaf: index of the program's first leaf in `leaves`.
-        position: number of the first of these samples in the run.
-        begin: place of that sample in the history.
+        position: index of sample t in the run.
+        begin: place of sample t in the history.
         times: times of the recent samples, then a ring for each sliding window and channel.
         memory: (4, …), every signal at the last sample, then at the first sample, by channel.
     """
@@ -315,8 +315,8 @@ def run_table(
         part: row of the part.
         table: begin of the part's table in the `memory` of the channel.
         top: first free row of `work`.
-        position: number of the first of the `count` samples in the run.
-        begin: place of that sample in the history.
+        position: index in the run of the first of the `count` samples.
+        begin: place of this first sample in the history.
 
     Returns:
         the row of `work` with the part's value. The rows of its lower and its upper bound follow.

@@ -6,8 +6,8 @@ of a tile, because the only arithmetic is minima, maxima and negation.
 
 In one channel, a node has four numbers for each sample: value, now, lower and upper. In more channels (see
 `codes`), it has eight numbers, the low and high ends of four values. The four values are the value, `now`,
-the value over every continuation, and the value if the run ends with the sample. A number depends on the
-numbers of its operands in the same row. Under a negation, it depends on the numbers in the mirror row.
+the value over every continuation, and the value if the run ends with the sample. A node's number depends on
+its operands' numbers in the same row. A negation's number depends on the mirror row.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def report(
         rows: rows of a program (see `Program`).
         history, memory: history and memory of the signals (see `run_signals`).
         work: numbers of the parts, then the output: numbers of the nodes, and the series.
-        begin: place of the first of these samples in the history.
+        begin: place of the first of the `count` samples in the history.
     """
     first_report, node_count = rows[0, codes.HEAD_REPORTS_AT], rows[0, codes.HEAD_REPORTS]
     operands_begin, width = rows[0, codes.HEAD_OPERANDS_AT], rows.shape[1]
@@ -210,7 +210,7 @@ ROOM = 256
 """Initial capacity of a live run in recent samples, small enough for the CPU cache."""
 
 BEGIN, FINISH = 1, 2
-"""Phases of `run_samples`: computes signals and parts without windows; computes the numbers of all nodes."""
+"""Phases of `run_samples`: BEGIN runs signals and parts without windows, FINISH runs all nodes."""
 _UNKNOWN = -2
 """Entry of `KNOWN` for a set of columns without a sample."""
 
@@ -229,8 +229,8 @@ def run_samples(
         times: (1 + 4 W, room + RING), times of the recent samples, then rings of sliding windows, by channel.
         memory: (4, …), each signal at the last and at the first sample, then the tables of parts.
         work: rows for the numbers of parts and nodes, for the series, and for intermediate numbers.
-        position: number of the first of the `count` samples in the run.
-        begin: place of that sample in the history.
+        position: index in the run of the first of the `count` samples.
+        begin: place of this first sample in the history.
     """
     channel_count, signal_count, part_count = (
         leaves.shape[0],
@@ -280,7 +280,7 @@ def run_sample(
     Args:
         whole, real, sample, end, leaves: arguments of `measure_sample`.
         numbers: (N, 4), output: value, now, lower and upper of each node.
-        channels: number of channels of the leaves; 0 if they are not measured yet.
+        channels: number of channels of the leaves; 0 if the leaves are not measured yet.
         run_channels: number of channels of the state. If the leaves have more channels, the program does not
             run.
 
@@ -519,7 +519,7 @@ class OnlineRun:
         Args:
             leaves: (C, A, T) with as many channels as the run.
             times_ns: times of the samples.
-            t: index in `leaves` of the first of these samples.
+            t: index in `leaves` of the first added sample.
         """
         if not self._program.keeps_history:
             self._offset = self._position

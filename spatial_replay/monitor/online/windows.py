@@ -120,7 +120,7 @@ def window_of(rows: Integers, node: int) -> tuple[bool, int, int, int, int]:
 
 @inlined
 def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last_sample: int) -> int:
-    """Return the first position in the window of `position`; `last_sample` + 1 if it has not begun."""
+    """Return the first position in the window of `position`; `last_sample` + 1 before it begins."""
     is_ahead, unit, near_end, far_end, times_row = window
     if unit != codes.SAMPLES:
         return int(min(state[times_row, position], last_sample + 1))
@@ -809,7 +809,7 @@ def _reach(
 
 @piece
 def find_lows(rows: Integers, state: Integers, stamps: Integers, last_sample: int) -> None:
-    """Store the first position of each node that is still needed."""
+    """Store for each node the first position that is still needed."""
     _reach(rows, state, stamps, min(state[HEAD, BASE], last_sample), last_sample, last_sample)
     for node in range(len(rows) - 1):
         state[LOWS, node] = state[LOW, node]

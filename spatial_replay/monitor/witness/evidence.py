@@ -30,8 +30,8 @@ class Gap:
         samples: number of all samples.
         first_ns, last_ns: times of the first and the last of the missing samples.
         window: start and end (not included) of the samples with the object or signal, if it is missing only
-            at the ends of the log; else None. Also None for an object with a class that is absent in a
-            sample.
+            at the ends of the log; else None. It is also None for an object with a class, if the object is
+            absent from a sample.
         longest_ns: times of the first sample of the longest gap, and of the first sample after the gap.
         is_filled: whether the longest gap is filled to its end, as by `max_gap`. A lost connection adds a
             sample only at the beginning of a gap.
@@ -119,7 +119,7 @@ class Evidence:
         return joined_channels([leaf_values(scene, [formula], bindings) for formula in formulas], axis=1)
 
     def first_ns(self) -> int:
-        """Return `zero_ns`, or the time of the first sample of all traces if that is None."""
+        """Return `zero_ns`; if it is None, the time of the first sample of all traces."""
         if self._zero_ns is not None:
             return self._zero_ns
         return next(int(trace.times_ns[0]) for trace in self._traces() if len(trace))

@@ -147,7 +147,7 @@ def _normal_form(
 def attaining_operands(
     part: SignedOperand | Extremum, end: End, interval: Callable[[int], Interval]
 ) -> list[SignedOperand]:
-    """Return the operands that attain an extremum. Several equal operands are in order.
+    """Return the operands that attain an extremum, in the order of its operands.
 
     Args:
         interval: returns the low and high end of an operand, before negation.
@@ -292,7 +292,7 @@ class _Walk:
     def _lasting(self, node: int, sample: int, end: End) -> PathNode | None:
         """Return the least left operand so far of an until with an open window, if it decides the until.
 
-        The result is None for the low end, because later samples cannot lower it.
+        The result is None for the low end, because later samples cannot lower this end.
         """
         formula, operands = self._nodes.tree[node]
         if not isinstance(formula, Temporal) or formula.operator not in ("U", "R"):
@@ -369,7 +369,7 @@ class _Walk:
 
 
 def _least_between(column: Floats, *, is_ahead: bool) -> Floats:
-    """Return for each place the minimum of a column from its near end to before the place."""
+    """Return the minimum of the column before each place; after each place if not `is_ahead`."""
     ordered_column = column if is_ahead else column[::-1]
     minima = np.minimum.accumulate(np.concatenate([[np.inf], ordered_column[:-1]]))
     return minima if is_ahead else minima[::-1]
@@ -668,7 +668,7 @@ def _may_decide(
 def _branch(
     scene: TraceScene, expression: Expression, end: End, weight: float
 ) -> Iterator[tuple[float, Expression]]:
-    """Iterate over the weights and summands of an expression. Minima and maxima have their chosen operand."""
+    """Iterate over the weights and summands of an expression; of a minimum or maximum, its chosen operand."""
     match expression:
         case Sum():
             yield from _branch(scene, expression.first, end, weight)

@@ -204,7 +204,7 @@ _STEPS = 8.0
 """Floating-point steps by which a flipping number is moved further, so that rounding cannot undo the flip."""
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
-"""Rounds of a search for dials that do not shift all samples equally, and parts of the interval per round.
+"""Number of search rounds for dials that do not shift all samples equally, and interval parts per round.
 
 Each round reads the log once, and divides the interval between a number that flips the verdict and a number
 that does not flip it.
@@ -413,7 +413,7 @@ class _Search:
         return "others" if verdict is self._verdict else "unknown"
 
     def _is_flipped(self, verdict: Verdict) -> bool:
-        """Return whether a verdict is the opposite verdict or, if samples may follow, another verdict."""
+        """Return whether a verdict is flipped; an unknown verdict is flipped only if samples may follow."""
         return verdict is not self._verdict and (self._goes_on or verdict is not Verdict.UNKNOWN)
 
     def _is_possible(self, number: float) -> bool:

@@ -110,19 +110,19 @@ class Witness:
             beyond the log, or at a quantifier over an empty group.
         threshold: change of the atom's number that flips the verdict, or None.
         obstacle: reason why a deciding atom has no threshold; else None.
-        open_end: atom that leaves the other end of a known verdict's interval open, and the time of its
-            sample; else None.
+        open_end: atom that leaves the non-deciding end of a known verdict's interval open, and the time of
+            its sample; else None.
         settled_ns: time of the sample that made the verdict certain. The interval then belongs to that
             sample. None for a witness over the whole log.
         missed: outermost failed implication on the path, or None.
         gaps: missing samples of the objects and signals in an unknown atom.
         closest: atom that came closest to fulfilling a missed response, and the time of its sample. None
-            without a missed response, and if this atom decides.
+            without a missed response, and if the condition does not decide.
         closest_path: path from the response to the atom in `closest`.
         units: declared units of signals by name; the unit of lengths under "".
         unit: declared unit of `lower` and `upper`, or "".
-        while_present: verdict of the formula with `present`, if it is unknown only because samples lack its
-            objects; else None.
+        while_present: verdict of the formula restricted by `present`, if `verdict` is unknown only because
+            samples lack objects; else None.
         closest_threshold: change of the number of `closest` that flips the verdict, or None.
     """
 
