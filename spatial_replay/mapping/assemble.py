@@ -53,7 +53,7 @@ _MOST_STEPS = 100_000
 """Limit of samples between two messages. A longer gap is a jump of the clock."""
 
 _ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
-"""Least jump back that shows two clocks, nanoseconds, such as simulated time and time since 1970."""
+"""Least jump back, nanoseconds, that shows two clocks, such as simulated time and time since 1970."""
 
 _MOST_AT_ONCE = 1_000_000
 """Limit of samples per step, because all samples of a step are in memory together."""
@@ -65,8 +65,8 @@ class _Assembling:
     Args:
         name: name of the log, for errors and remarks.
         decoder: function from a topic to its decoder.
-        start_ns, end_ns: half-open window of the samples. Messages outside the window may be added; they
-            affect its samples.
+        start_ns, end_ns: half-open window of the samples. Messages outside the window may be added, because
+            they may affect samples in the window.
         on_time_jump: effect of a jump back by more than the plan's `late_ns`: an error or the end of the log.
     """
 
@@ -450,7 +450,8 @@ class Assembler(_Assembling):
     the division into calls.
 
     Args:
-        goes_on: function that returns whether the log has messages after the added ones; by default False.
+        goes_on: function that returns whether the log has messages after the last added message; by default,
+            False.
     """
 
     _step_limit, _step_count, _step_bytes = _FIRST_STEP, 0, 0
@@ -470,7 +471,7 @@ class Assembler(_Assembling):
         """Note the times of the log's first messages, for a window that begins after them.
 
         Args:
-            sampled_ns: time of the first message of the sampled topic; None if that message will be added.
+            sampled_ns: time of the sampled topic's first message; None if `add` will receive this message.
             others_ns: time of the first message of the fallback topics.
         """
         self._silences.know_start(sampled_ns, others_ns)
@@ -553,8 +554,8 @@ class _SampleTimes:
         """Return the distinct times of the next samples.
 
         Args:
-            times_ns: times of the new messages of the sampled topic or, for multiples of a step, of all
-                topics with objects or signals.
+            times_ns: times of new messages: of the sampled topic or, for multiples of a step, of all topics
+                with objects or signals.
             upto_ns: time up to which samples are decided.
 
         Raises:
@@ -572,7 +573,7 @@ class _SampleTimes:
         return sample_times_ns
 
     def note(self, time_ns: int) -> bool:
-        """Note an extra sample if it follows the last sample; return whether it does."""
+        """Note an extra sample at a time after the last sample; return False for any other time."""
         comes_after = 0 <= self._last_ns < time_ns
         if comes_after:
             self._last_ns = time_ns
@@ -609,12 +610,13 @@ class _SampleTimes:
 class _Silences:
     """Long silences of the sampled topic, in which fallback topics are sampled.
 
-    The limit of a silence depends only on the two messages before it, and is at most the plan's
-    `longest_silence_ns`. So a log, a window of the log and a running system give the same decision.
+    A silence is too long above a limit, which depends only on the interval between the two messages before
+    the silence. The limit is at most the plan's `longest_silence_ns`. So a log, a window of the log and a
+    running system give the same decision.
 
     Attributes:
         first_ns: time of the sampled topic's first message; None without a message.
-        before_ns: time of the first sample before `first_ns`; None without such a sample.
+        before_ns: time of the first sample if samples begin before `first_ns`; otherwise None.
         goes_on: function that returns whether the log has messages after the last message read.
     """
 
@@ -681,7 +683,7 @@ class _Silences:
         return upto_ns
 
     def _silences(self, times_ns: Integers, known_ns: int, *, is_last: bool) -> Booleans:
-        """Return for each message whether the silence after it is too long.
+        """Return for each message of the sampled topic whether the silence after the message is too long.
 
         The last element concerns the silence before the first message.
         """
@@ -700,7 +702,11 @@ class _Silences:
         return np.append(next_ns[1:] - times_ns > limits_ns, begins_late)
 
     def sampled_in(self, others_ns: Integers) -> Integers:
-        """Return the times to sample among fallback topics' times, which are up to the `limit`."""
+        """Return the message times of fallback topics at which to sample.
+
+        Args:
+            others_ns: message times of fallback topics, at most the time from `limit`.
+        """
         message_index = np.searchsorted(self._times_ns, others_ns, "right") - 1
         is_sampled = self._is_filled[message_index]
         start_ns, end_ns = self._window_ns
@@ -751,7 +757,7 @@ class _Silences:
 
 
 _MOMENT_S: Final = 0.001
-"""Span in which messages with equal times arrive, if all messages arrive in the order of time, seconds."""
+"""Wait for further messages of the same time, seconds, if all messages arrive in the order of time."""
 
 _MOST_HELD: Final = 4_096
 """Limit of observations that wait for transforms; further observations do not wait."""
@@ -795,8 +801,8 @@ class _Held(NamedTuple):
     """An observation that waits for the transforms of its frame.
 
     Attributes:
-        time_ns: time of its message on the clock of the samples.
-        at_ns: time of the transforms: the observation's stamp, or the time of its message.
+        time_ns: time of the observation's message on the clock of the samples.
+        at_ns: time at which transforms are needed: the observation's stamp, or `time_ns`.
         by_stamp: whether `at_ns` is a stamp.
         until_s: deadline, seconds.
     """
@@ -813,15 +819,16 @@ class LiveAssembler(_Assembling):
     """Assembler of the samples of a running system.
 
     Callers pass the time of their clock, `now_s`, in seconds. A sample is final when every topic has reached
-    its time, or `max_delay_s` after the first message at or after its time. So the samples equal the samples
-    of a log of the same messages, if topics interleave within that delay.
+    the sample's time. It is final at the latest `max_delay_s` after the arrival of the first message at or
+    after the sample's time. So a log of the same messages gives the same samples, if topics interleave within
+    that delay.
 
     Args:
         in_order: whether the server stamps messages when it sends them, so that messages of all topics arrive
             in the order of log time.
 
     Attributes:
-        late: number of messages that arrived after the samples of their time.
+        late: number of messages that arrived when the samples of the message's time were already final.
         overdue: number of observations that are unknown because their transforms did not arrive in time.
         overdue_frame: topic and frame of the last overdue observation.
     """
@@ -869,7 +876,7 @@ class LiveAssembler(_Assembling):
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Topics that samples depend on, without topics that are sent once and stay valid."""
+        """Topics that samples depend on, except topics that are sent once and stay valid."""
         passing_topics = (
             planned.topic for planned in self._plan.planned if not (planned.is_lasting or planned.is_latched)
         )
@@ -921,10 +928,11 @@ class LiveAssembler(_Assembling):
         return self._settle(self._newest_ns, is_last=True)
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Make reports of lost topics unknown; return the samples so far, and one sample of the loss.
+        """Make objects and signals of lost topics unknown; return the new samples.
 
-        A topic is lost with its connection, or after a silence. Its objects and signals stay unknown until it
-        reports them again. Messages of other topics wait as before.
+        A last sample shows the loss. The objects and signals stay unknown until their topic
+        reports them again. A topic is lost when its connection ends, or after a silence. Messages of other
+        topics wait as before.
         """
         newly_lost_topics = self._names_of(topics) - self._lost
         if not newly_lost_topics:

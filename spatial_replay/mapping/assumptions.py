@@ -53,8 +53,8 @@ class Assumption:
 def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
     """Yield contradictions of the assumptions: doubts, or remarks if the data may be unusual but sound.
 
-    One sentence covers a contradiction in many topics. An accepted name without a contradiction also gives a
-    remark.
+    If many topics contradict an assumption, one sentence covers all of them. A name in `accept` that the log
+    does not contradict gives a remark, too.
     """
     uncontradicted = dict.fromkeys(mapping.accept)
     for evidence in log.values():
@@ -180,7 +180,7 @@ def _still_stamps(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _LONG_STILL_S, _LONG_STILL = 0.3, 5
-"""Limits of the time without a new stamp: seconds, and usual periods of the topic."""
+"""Longest accepted time without a new stamp, in seconds and in median periods; the longer time applies."""
 
 
 def _unit_of_stamps(evidence: TopicEvidence, log: Log) -> str | None:
@@ -255,8 +255,9 @@ def _order_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _MOST_UPRIGHT, _FEW_UPRIGHT, _SOME_TURNED = 0.9, 0.5, 0.05
-"""Limits of shares of objects: least share upright in the other order, greatest share upright in this order,
-least share turned in the other order."""
+"""Shares of quaternions that contradict the mapping's order: at least the first share is upright in the other
+order, at most the second share in the mapping's order. At least the third share is turned in the other order.
+"""
 
 
 def _length_of_quaternion(evidence: TopicEvidence, log: Log) -> str | None:
@@ -282,7 +283,7 @@ _LENGTH_ERROR, _OUTLIERS = 0.05, 0.02
 
 
 def _is_unwrapped(evidence: TopicEvidence, turn: float) -> bool:
-    """Return whether angles may be unwrapped. They begin within a turn, and steps are below half a turn."""
+    """Return whether angles may be unwrapped: they begin within a turn, and steps are below half a turn."""
     return evidence.first_turn <= turn and evidence.motions.turn_step < turn / 2
 
 
@@ -366,7 +367,7 @@ def _heading(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 def _compass(evidence: TopicEvidence, log: Log) -> str | None:
-    """Return a clause on an angle next to satellite fixes, unless motions confirm its zero."""
+    """Return a clause on a yaw next to satellite fixes, unless motions confirm the mapping's yaw."""
     yaw = None if evidence.planned.mapping is None else evidence.planned.mapping.yaw
     courses = evidence.motions.courses
     goes_along = abs(courses["read"]) > _STEADY and abs(phase(courses["read"])) < _ASKEW
@@ -385,10 +386,11 @@ def _compass(evidence: TopicEvidence, log: Log) -> str | None:
 _FEW_STEPS: Final = 20
 """Least number of steps for a comparison of yaw and course."""
 _STRAIGHT, _CLOSE = 0.8, 0.95
-"""Least lengths of mean unit vectors: courses on a straight path, differences from a fitting angle."""
+"""Least lengths of two mean unit vectors: of courses on a straight path, and of the difference between course
+and yaw if an interpretation of the angle fits."""
 _STEADY, _ASKEW, _ALONG = 0.9, pi / 4, pi / 9
-"""Least length of a steady mean unit vector, and limits of its angle, radians: for the yaw as read, and for
-another reading."""
+"""Least length of the mean unit vector of a steady difference between course and yaw. Limits of this
+difference, radians: for the mapping's interpretation of the angle, and for any other interpretation."""
 
 
 def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
@@ -409,7 +411,7 @@ def _degrees_as_metres(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FAST_DEGREES: Final = 0.01
-"""Limit of the speed of positions in degrees, degrees per second."""
+"""Highest plausible speed of an object, degrees per second; faster coordinates are not degrees."""
 
 
 def _upward(evidence: TopicEvidence, log: Log) -> str | None:
@@ -518,7 +520,7 @@ def _publishers(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _IN_TURN: Final = 0.01
-"""Least share of messages that return to an earlier publisher."""
+"""Least share of messages with a change back to an earlier publisher."""
 
 
 def _one_object(evidence: TopicEvidence, log: Log) -> str | None:
@@ -558,7 +560,7 @@ def _complete_list(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _REGULAR: Final = 0.8
-"""Least share of objects that return after the usual number of messages."""
+"""Least share of steps whose two reports are the usual number of messages apart."""
 
 
 def _ordinal(number: int) -> str:
@@ -630,7 +632,8 @@ def _one_unit(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _THOUSAND, _SOUND, _SIZES_A_SECOND = 200, 343.0, 1_000.0
-"""Least ratio that shows millimetres, speed of sound in metres per second, and limit of sizes per second."""
+"""Least ratio to other topics that shows millimetres; speed of sound, metres per second; highest plausible
+speed, object sizes per second."""
 
 
 def _one_frame(evidence: TopicEvidence, log: Log) -> str | None:
@@ -654,7 +657,7 @@ def _alternating(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _IN_PAIRS: Final = 0.5
-"""Least share of messages in which an alternating signal returns."""
+"""Least share of messages in which an alternating signal has the value of two messages before."""
 
 
 def _by_place(evidence: TopicEvidence, log: Log) -> str | None:
@@ -726,7 +729,8 @@ def _leap(evidence: TopicEvidence, log: Log) -> str | None:
 
 
 _FEW_LEAPS, _FAST_LEAP, _FARTHER = 10, 20.0, 3.0
-"""Least number of steps; limits of a leap and of a comeback, as multiples of the usual speed."""
+"""Least number of steps of objects or signals; least speeds of a suspicious leap, and of a suspicious step
+over an absence, as multiples of the usual speed."""
 
 _DEGREES: Final = "`yaw: {field: PATH, unit: deg}` reads degrees"
 

@@ -72,7 +72,10 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
 
 
 def order_remarks(objects: Iterable[BoundObject], columns: Columns) -> Iterator[str]:
-    """Yield remarks on objects with unnamed quaternions that stand upright only in the other order."""
+    """Yield a remark on each object that stands upright only if its quaternion is read as w x y z.
+
+    Quaternions whose numbers have names are skipped.
+    """
     for bound_object in objects:
         places = bound_object.quaternion
         if (

@@ -136,7 +136,7 @@ class EpisodeSource(Source):
         yield Block(trace, remarks=tuple(remarks))
 
     def _point_remarks(self, columns: EpisodeColumns) -> Iterator[str]:
-        """Yield a remark on bodies without a shape in both data set and mapping."""
+        """Yield a remark on bodies to which neither the data set nor the mapping gives a shape."""
         shapes = {} if self.mapped_by is None else self.mapped_by.shapes
         names = [body.name for body in columns.bodies if body.shapes is None and body.name not in shapes]
         if names:
@@ -306,7 +306,7 @@ _MOST_FRAMES: Final = 2**15
 
 
 def read_together(sources: Sequence[Source]) -> list[Source]:
-    """Return the sources, after reading episodes with a common data set and mapping together.
+    """Read consecutive episodes of one data set and mapping together; return all sources in the same order.
 
     An unreadable episode stays unread, so that iterating over its blocks raises the error.
     """
@@ -324,7 +324,7 @@ def read_together(sources: Sequence[Source]) -> list[Source]:
 
 
 def _read_alike(sources: Sequence[EpisodeSource]) -> Iterator[EpisodeSource]:
-    """Yield episodes of one data set and mapping, after reading episodes with equal feature shapes."""
+    """Yield episodes of one data set and mapping; episodes with equal feature shapes are read together."""
     columns_by_index: dict[int, EpisodeColumns] = {}
     frame_count = 0
     for index, source in enumerate(sources if sources[0].mapped_by is not None else ()):

@@ -34,11 +34,10 @@ _ROWS_AT_ONCE: Final = 4_096
 """Number of objects measured together, because a short column costs as much as a long column."""
 
 _LONGEST_GAP: Final = 9
-"""Limit of counted gaps between two reports of an object, messages. Longer gaps count as gaps of this
-length."""
+"""Longest distinguished gap between two reports of an object, messages. Longer gaps are clipped to it."""
 
 _MOST_LEAPS: Final = 4
-"""Limit of reports after which an object may return to its place."""
+"""Largest number of steps within which a return of an object to its place is detected."""
 
 _MOST_ROWS: Final = 32_768
 """Limit of kept last reports of objects; the oldest reports are dropped."""
@@ -47,7 +46,8 @@ FAR_LEAP: Final = 5.0
 """Least length of a suspicious step, in sizes of the object."""
 
 _FAST: Final = 100.0
-"""Least speed of a leap there and back that cannot be one robot, footprint units per second."""
+"""Limit of a robot's speed, footprint units per second. A faster object that leaps there and back is two
+objects under one name."""
 
 
 class Spread:
@@ -120,10 +120,10 @@ class Arrivals:
         period_s, log_period_s: intervals between messages on the topic's clock, and between log times.
         lateness_s: time from the stamps of messages to their recording.
         publish_varies, log_varies: whether publish times, and log times, are not all equal.
-        publishers: numbers of the channels.
-        returns: number of changes back to an earlier channel.
+        publishers: channel numbers, one for each publisher.
+        returns: number of changes of the publisher back to an earlier publisher.
         longest_still_s: longest time without a new stamp.
-        still_ns: log time at which that longest time began.
+        still_ns: log time at which `longest_still_s` began.
         stamps_vary: whether stamps are not all equal.
         stamps_passed_s: difference of the last and the first stamp.
         log_passed_s: difference of the log times of the last and the first stamp.
@@ -231,7 +231,7 @@ class Arrivals:
 
 
 _NAME, _MESSAGE, _SECONDS, _X, _Y, _YAW, _TURN, _SIZE, _CLASS, _IS_NEW = range(10)
-"""Columns of reports of objects."""
+"""Columns of an array of reports, with one row per report of an object."""
 
 HEADINGS: Final[dict[str, tuple[float, float]]] = {
     "unit: rad": (0.0, 1.0),
@@ -241,7 +241,8 @@ HEADINGS: Final[dict[str, tuple[float, float]]] = {
     "unit: rad, zero: east, clockwise: true": (0.0, -1.0),
     "unit: deg, zero: east, clockwise: true": (0.0, -pi / 180),
 }
-"""Interpretations of a number as a yaw, by keys of a mapping: yaw at 0 and yaw per unit, in radians."""
+"""Possible interpretations of a field as a yaw: (yaw at field 0, yaw per unit of the field), in radians. The
+keys are text of a mapping."""
 
 
 class Motions:
@@ -253,19 +254,19 @@ class Motions:
         jump: longest step of an object.
         jump_s: duration of the longest step.
         comeback: longest step over an absence. In an absence, messages lack the object for a second or more.
-        comeback_s: duration of that step.
+        comeback_s: duration of the step in `comeback`.
         zeros: number of leaps to (0, 0) without an absence, by more than five sizes of the object.
         turn_step: greatest change of the raw angle that is read as yaw.
-        chances: number of reports of objects with at least two earlier reports.
-        returns: number of reports with an object back at its place two to four reports earlier. All steps
-            since then are longer than its size.
-        slow_returns: number of returns at the speed of a robot, after a step of a second or more.
+        chances: number of reports that follow at least two earlier reports of the same object.
+        returns: number of reports in which an object is back at its position of two to four reports earlier.
+            All steps in between are longer than the object's size.
+        slow_returns: number of returns whose last step takes a second or more, at the speed of a robot.
         return_moment: first return; None without a return.
-        gaps: (10,) numbers of steps, by the count of messages between the step's two reports.
+        gaps: (10,) element n is the number of steps whose two reports are n messages apart.
         changes: first changes of classes.
         change_count: number of all changes of classes.
-        courses: mean of exp(i (course - angle)) over the steps of moving objects, for the angle as read and
-            for each of `HEADINGS`.
+        courses: mean of exp(i (course - yaw)) over the steps of moving objects, for the mapping's yaw
+            ("read") and for each interpretation in `HEADINGS`.
         course: mean of exp(i course) over the same steps.
     """
 
@@ -486,15 +487,15 @@ class TopicEvidence:
         most_at_once: greatest number of objects in one message.
         quaternion_length: lengths of quaternions other than zeros.
         quaternions: number of quaternions other than zeros.
-        upright: number of upright objects in the order of the mapping.
-        upright_otherwise: number of upright objects in the other order, with w at the other end.
-        turned_otherwise: number of objects that are upright in the other order, and turned by more than 20
-            degrees.
+        upright: number of upright objects if quaternions have the mapping's order.
+        upright_otherwise: number of upright objects if w is at the other end of quaternions.
+        turned_otherwise: number of objects in `upright_otherwise` with a turn of more than 20 degrees.
         turn: raw angles that are read as yaw.
         first_turn: greatest absolute raw angle in the first message with angles.
         low, high: (3,) least and greatest coordinates, as the messages give them.
-        is_single: whether coordinates are float32 numbers; tested for degrees, and far from the origin.
-        has_fraction: whether some of the tested coordinates are not integers.
+        is_single: whether coordinates are float32 numbers. Only degrees, and coordinates far from the origin,
+            are tested.
+        has_fraction: whether some coordinates tested for `is_single` are not integers.
         size: longer sides of outlines.
         shorter: shorter sides of outlines.
         pointlike: number of objects whose sides are 0.
@@ -502,8 +503,8 @@ class TopicEvidence:
         uncertainty: radii of uncertainty.
         covariances: number of covariances.
         zero_covariances: number of covariances of zeros.
-        signal_chances: number of messages with signals after at least two such messages.
-        signal_returns: (S,) number of messages in which each signal returns to its last but one value.
+        signal_chances: number of messages with signals, except the first two messages.
+        signal_returns: (S,) number of messages in which a signal is back at its value of two messages before.
     """
 
     def __init__(self, reader: TopicReader, names: Codes, classes: Codes) -> None:
@@ -716,7 +717,7 @@ class TopicEvidence:
         self._reports, self._reports_rows = [reports[report_count:]], len(reports) - report_count
 
     def _measure_signals(self) -> None:
-        """Count returns of signals to their last but one value."""
+        """Update `signal_chances` and `signal_returns`."""
         if not self._waiting_values:
             return
         values = np.concatenate([self._last_values, *self._waiting_signals])

@@ -46,7 +46,7 @@ _FOUR_BOUNDS = (
 """Names of a box's four numbers. The last row is a corner and a size (sensor_msgs/RegionOfInterest)."""
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "mmsi", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
-"""Names of lists with the names of another list's elements."""
+"""Names of lists whose elements are the names of objects in another list."""
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
 """Words in names of ids that several objects share, such as `class_id` and `frame_id`."""
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
@@ -101,7 +101,7 @@ class Guess:
         has_order: whether the orientation is a list, which needs an `order`.
         yaw: path of an angle.
         polygon: path of an outline.
-        is_own: whether the outline is in the object's frame, at its pose.
+        is_own: whether the corners of the outline are relative to the object's pose.
         bounds: path of a list with a box's two opposite corners, or paths of its four numbers.
         bounds_have_size: whether the last two numbers of the bounds are width and height.
         size: paths of length, width and maybe height, or path of a radius.
@@ -138,7 +138,10 @@ class Guess:
 
     @property
     def is_body(self) -> bool:
-        """Whether the object has a name and an extent or an orientation; required of further lists."""
+        """Whether the object has a name, and an extent or an orientation. Plans are excluded.
+
+        A further list of objects is used only if this is True.
+        """
         has_extent = bool(self.size or self.polygon or self.bounds or self.orientation or self.yaw)
         return bool(self.names) and has_extent and not self.is_plan
 
@@ -225,7 +228,7 @@ def _best(messages: Sequence[object]) -> Guess | None:
 
 
 def _with_evidence(guess: Guess, messages: Sequence[object]) -> Guess:
-    """Return a guess after corrections by the values of its fields in all messages."""
+    """Correct a guess by the values of the guessed fields in all messages."""
     if guess.names == (INDEX,):
         return guess
     if isinstance(guess.position, tuple) and geodetic_order(guess.position):
@@ -269,8 +272,8 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
 def signals_in(message: object) -> tuple[str, ...]:
     """Return the paths of numbers and truth values in a message, without times and the header.
 
-    Elements of a list need a list `name` next to it, as in `position[name=elbow]`. A text is a signal only if
-    it is the field `data`, as in `std_msgs/String`.
+    A list of numbers is used only if a neighbouring list `name` names the numbers: `position[name=elbow]`. A
+    text is a signal only if it is the field `data`, as in `std_msgs/String`.
     """
     paths: list[str] = []
     for path, value in _iter_fields(message, is_skipped=_is_time):
@@ -390,7 +393,10 @@ def _objects_in(guess: Guess, message: object) -> Iterator[object]:
 
 
 def takes_turns(texts: Sequence[str]) -> bool:
-    """Return whether a text returns after another text. Names of several senders return; counters do not."""
+    """Return whether a text occurs again after a different text, as names of several senders do.
+
+    The texts of a counter do not occur again.
+    """
     run_starts = [
         text for text, previous_text in zip(texts, (None, *texts), strict=False) if text != previous_text
     ]
@@ -661,7 +667,7 @@ def _paths_by_name(fields: dict[str, object], names: tuple[str, ...]) -> list[st
 
 
 def _paths_by_last_word(fields: dict[str, object], names: tuple[str, ...]) -> list[str]:
-    """Return the paths whose last name has several words, the last of them in `names`, by depth.
+    """Return the paths whose last name has several words and ends with a word of `names`, by depth.
 
     Names of planned or earlier positions are excluded.
     """

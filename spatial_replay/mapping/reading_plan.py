@@ -44,15 +44,15 @@ class PlannedTopic:
     """Plan for one topic, or for one list of objects in its messages.
 
     Attributes:
-        name: topic, with the entry's index after the first entry: `/scene`, `/scene[1]`.
+        name: topic; from the topic's second entry on, with the index of the entry: `/scene`, `/scene[1]`.
         topic: topic of the log.
         mapping: entry of the mapping; None for topics read only for transforms or times.
         layout: places of object fields; None for a topic without objects.
         max_age_ns: validity of an observation or a signal, nanoseconds.
-        between_ns: longest time between two transforms that are interpolated, nanoseconds. Within a longer
-            time, objects are unknown.
-        silence_ns: silence after which the topic has ended, nanoseconds. This holds even if its last message
-            stays valid.
+        between_ns: longest gap between two transforms that interpolation bridges, nanoseconds. Objects in a
+            longer gap are unknown.
+        silence_ns: silence after which the topic has ended, nanoseconds. The topic ends even if its last
+            message stays valid.
         is_transforms: whether the messages are transforms between frames.
         is_static: whether the transforms hold at all times.
         is_lasting: whether a message stays valid forever.
@@ -274,8 +274,8 @@ def _topics_in_words(by_name: Mapping[str, Topic]) -> str:
 def _most_frequent(mapping: LogMapping, by_name: Mapping[str, Topic]) -> str:
     """Return the topic to sample by default: the topic with objects and most messages.
 
-    Without objects, all topics are candidates. If the log does not give message counts, the first candidate
-    is sampled.
+    If no topic has objects, all topics are candidates. If the log does not give message counts, the first
+    candidate is sampled.
     """
     existing_entries = [entry for entry in mapping.topics if entry.topic in by_name]
     candidate_names = [entry.topic for entry in existing_entries if entry.reads_objects] or [
@@ -331,7 +331,12 @@ def _slow_sampling(
 def doubts_of(
     topics: Iterable[Topic], *, has_frames: bool = False, has_stamps: bool = False
 ) -> Iterator[str]:
-    """Yield doubts about a mapping without a fixed frame, or with `clock: log`."""
+    """Yield doubts about unused information in the log: transforms of several robots, and simulated time.
+
+    Args:
+        has_frames: whether transforms place objects in a fixed frame.
+        has_stamps: whether the mapping has `clock: header`.
+    """
     topics = tuple(topics)
     transform_topics = [topic.name for topic in topics if short_type(topic.type) in TRANSFORM_TYPES]
     moving_topics = [topic_name for topic_name in transform_topics if not topic_name.endswith("tf_static")]

@@ -103,14 +103,14 @@ class TopicSuggestion:
     Attributes:
         fields: entry of a mapping, as values in YAML's flow style by key; None if no field looks like an
             object.
-        name: template of object names: of the entry, or the default.
+        name: template of object names, from the entry or by default.
         remarks: notes for the user, which become comments.
         is_transforms: whether messages are transforms, which are objects only in a log without other objects.
         frames: frames of coordinates, according to the entry.
         axes: kind of axes of coordinates.
         numbers: paths of possible signals.
         aside: reason why the entry is not used; "" if it is used.
-        layout: layout of the entry; None without one.
+        layout: layout of the entry; None without an entry.
         lateness_s: (N,) time from each message's stamp to its recording; None if stamps are not a clock.
         path: path of the list of objects.
         further: suggestions for further lists of objects in the messages.
@@ -754,7 +754,10 @@ def _time_lines(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) 
 
 
 def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
-    """Return the clock and the reason for it: `header` if delays of recording differ too much."""
+    """Return the clock, "log" or "header", and the reason for the choice.
+
+    The clock is "header" if stamps are of one clock, and the delays from stamps to recording differ too much.
+    """
     lateness_by_topic = [(suggestion.topic.name, suggestion.lateness_s) for suggestion in active]
     stampless_topics = [topic for topic, lateness in lateness_by_topic if lateness is None]
     median_by_topic = {
@@ -793,7 +796,7 @@ def _clock(active: Sequence[TopicSuggestion]) -> tuple[str, str]:
 
 
 def _topic_to_sample(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> Topic:
-    """Choose the topic to sample: the last topic to start among frequent topics that start together.
+    """Choose the topic to sample: the topic with the latest start among frequent topics that start early.
 
     So all these topics have a message at the first sample.
     """

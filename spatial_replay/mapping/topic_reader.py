@@ -118,7 +118,7 @@ class Extractor:
     ) -> None:
         self.noted_frames: set[str] = set()
         self.unseen: tuple[str, ...] = ()
-        """Paths of the position with `missing: 0`; () once an object has one of these fields."""
+        """Position paths that no object has had so far, if the mapping has `missing: 0`; otherwise ()."""
         if mapping.has_zeros_left_out and mapping.position is not None:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
@@ -130,9 +130,9 @@ class Extractor:
         self._scene_stamps_ns: dict[int, int] = {}
         """Timestamps of existing scene entities, by name code."""
         self.boxes, self.leftward, self.downward = 0, 0, 0
-        """Numbers of bounds: all, with the second corner left of the first, and below the first."""
+        """Numbers of bounds: all, with a second corner left of the first, with a second corner below it."""
         self.corner_low, self.corner_high = np.full((2, 2), np.inf), np.full((2, 2), -np.inf)
-        """Least and greatest coordinates: a row for the first corners, a row for the second corners."""
+        """Least and greatest coordinates of bounds: one row for first corners, one row for second corners."""
         self.differences = 0
         """Number of messages marked as a list of changes by their field `is_diff`."""
         self.turned, self.unturned = 0, 0
@@ -202,8 +202,8 @@ class Extractor:
             is_early: whether the messages will be read again, in the order of their times.
 
         Raises:
-            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message has
-                another form. Only a FieldError describes the difference.
+            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message lacks
+                fields of the first message, or has fields of other types. Only a FieldError names the fields.
         """
         object_values, message_indices, list_keys = self._flatten(messages)
         # `is_diff` marks a list of changes, as in moveit_msgs/PlanningScene
@@ -371,7 +371,7 @@ class Extractor:
     def _deleted_entities(
         self, messages: Sequence[object], entities: _Objects
     ) -> tuple[list[tuple[int, int]], dict[int, int]]:
-        """Return (message, name) of each deletion in a foxglove.SceneUpdate, and the remaining stamps.
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate, and all remaining stamps.
 
         A deletion concerns only earlier entities
         (https://docs.foxglove.dev/docs/sdk/schemas/scene-entity-deletion). A message's entities are added
@@ -723,10 +723,10 @@ class TopicReader:
         log_times_ns: Sequence[int],
         is_good: Booleans,
     ) -> list[DetectionChunk]:
-        """Read the objects of the good messages; together, if all good messages have the same form.
+        """Read the objects of the good messages: all together or, if a message does not fit, one by one.
 
         Args:
-            first: index of the first message in its batch.
+            first_index: index of the first message in its batch.
         """
         good_indices = np.flatnonzero(is_good)
         try:
@@ -860,7 +860,7 @@ def _getter_of_set_values(path: FieldPath, example: object) -> Get:
 
 
 def unit_of_stamp(stamp: int, log_time_ns: int) -> str:
-    """Return the unit in which a stamp is within an hour of the log time; "ns" if there is none."""
+    """Return the unit in which a stamp is within an hour of the log time; "ns" if no unit fits."""
     near_units = (
         unit for unit, unit_ns in UNITS_NS.items() if abs(stamp * unit_ns - log_time_ns) < 3600 * 10**9
     )

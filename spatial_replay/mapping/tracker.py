@@ -67,7 +67,7 @@ class Events:
         return select(self, np.flatnonzero(is_last & (self.row != LEFT)))
 
     def after(self, before: Events) -> Events:
-        """Return earlier events of the topic joined with these events."""
+        """Join earlier events of the same topic, `before`, with these events."""
         joined = concatenate_tables([before, self])
         # events are sorted, because events of a running system may be late
         return select(joined, np.lexsort((joined.time_ns, joined.name)))

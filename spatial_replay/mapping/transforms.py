@@ -120,7 +120,7 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
 
 # a buffer of tf2 keeps transforms for 10 s by default, too
 HISTORY_NS = 10 * 10**9
-"""Longest time between two transforms that are interpolated, nanoseconds."""
+"""Longest gap between two transforms that interpolation bridges, nanoseconds."""
 
 _LONGEST_CHAIN = 100
 """Limit of frames between a frame and its root."""
@@ -133,7 +133,8 @@ _MANY_JUMPS = 3
 _MOST_PUBLISHERS = 4
 """Limit of publishers that may send a frame in turn."""
 LEAST_STEP_NS = 10_000_000
-"""Least step back of a clock, nanoseconds. Recorders with several threads mix messages by less."""
+"""Least step back of a clock, nanoseconds. Smaller steps occur in the logs of recorders with several
+threads."""
 _MOST_RESTARTS = 1_000
 """Limit of kept restarts."""
 
@@ -268,8 +269,8 @@ class FrameTree:
         """Add one transform. A transform that tf2 would ignore is only counted.
 
         A static transform holds from its stamp on. A frame's first static transform also holds before its
-        stamp. A static transform holds from its clock time on if it has no stamp, or a stamp older than its
-        predecessor's.
+        stamp. If a static transform has no stamp, or an older stamp than the previous static transform, it
+        holds from its clock time on.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.
@@ -304,8 +305,8 @@ class FrameTree:
     def _note_restart(self, name: str, child: _Child, new: _Entry) -> None:
         """Note a restart if the stamps of a frame step back.
 
-        If the next transform steps forward again, there was no restart. Two programs with different clocks
-        send the frame in turn.
+        If the next transform steps forward again, two programs with different clocks send the frame in turn.
+        Then the noted restart is removed.
         """
         old, earlier_restart, child.restart = child.moving[-1], child.restart, None
         if earlier_restart in self._restarts and new.stamp_ns >= earlier_restart.old.stamp_ns - DISORDER_NS:
@@ -365,7 +366,7 @@ class FrameTree:
         Args:
             times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
             log_ns: (N,) times of recording, which identify the run; None for transforms of all runs.
-            longest_ns: longest time between two transforms that are interpolated.
+            longest_ns: longest gap between two transforms that interpolation bridges, nanoseconds.
             holds: whether a transform holds for `longest_ns` if no transform follows in that time.
         """
         time_count = len(times_ns)

@@ -1,6 +1,7 @@
 """Trials of mapping entries: an entry and some messages of its topic in, contradictions out.
 
-`choose_entry` adds keys to an entry that resolve contradictions, unless the number of contradictions grows.
+To resolve a contradiction, `choose_entry` adds keys to an entry. Keys that cause more contradictions
+than they resolve are not added.
 """
 
 from __future__ import annotations

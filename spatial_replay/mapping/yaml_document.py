@@ -313,7 +313,7 @@ def _faults_in_words(error: Any) -> Iterator[tuple[Place, str]]:
 
 
 def _around(error: Any) -> str:
-    """Return the description of the nearest enclosing rule of a violated rule without a description."""
+    """Return the description of the nearest rule around a violated rule that has no description itself."""
     parent = error.parent
     while parent is not None and "description" not in parent.schema:
         parent = parent.parent
