@@ -71,8 +71,8 @@ def tree_nodes(root: Behaviour) -> tuple[TreeNode, ...]:
 class Nav2Tree:
     """Nodes of a Nav2 behaviour tree, from its log of status changes.
 
-    The log names no parents. Nodes are sorted by `uid`, which Nav2 counts depth first. Older versions of Nav2
-    give no `uid`; then nodes are in the order of their first status change.
+    The log names no parents. Nodes are sorted by `uid`, a number that Nav2 assigns in depth-first order.
+    Older versions of Nav2 give no `uid`; then nodes are in the order of their first status change.
     """
 
     def __init__(self) -> None:

@@ -160,8 +160,8 @@ class Block:
     Attributes:
         trace: the samples; `trace.faults` lists the losses since the previous block.
         messages: messages that a copy of the log must contain, except topics derived from the samples; empty
-            for sources without messages. A copy adds a topic of samples if the messages have none.
-        remarks: notes on the data without a loss, such as the number of stale observations.
+            for sources without messages. If the messages do not contain the samples, a copy adds their topic.
+        remarks: notes on the data that do not concern losses, such as the number of stale observations.
         doubts: assumptions that the log contradicts.
         facts: how each mapped topic was read; empty until the topics are read to their end.
     """

@@ -142,7 +142,8 @@ def layout_of(message: ObjectStates) -> SlotLayout:
 
 
 SAMPLES_PER_LAYOUT = 32
-"""Least mean number of messages per layout; the setup of a layout takes as long as 32 messages by pieces."""
+"""Least mean number of messages per layout. The setup of a layout takes as long as decoding 32 messages in
+pieces."""
 FIRST_LAYOUTS = 16
 """Number of layouts that are set up even if they serve few messages."""
 
@@ -178,7 +179,7 @@ def decode_objects(
         concave: how polygons that are not convex are handled; our own logs hold none.
 
     Returns:
-        the trace of the valid messages, and a fault with its time for each other message.
+        the trace of the valid messages, and one fault per invalid message, with the message's time.
     """
     faults: dict[int, str] = {}
     groups = _groups(payloads, faults)

@@ -124,7 +124,7 @@ class _DurableWriter(io.BufferedWriter):
 class _OutputFile(io.FileIO):
     """An unbuffered file whose failures are OutputErrors, also if a library writes to it.
 
-    A forked process writes nothing to it; otherwise, the bytes in the shared buffer would be written twice.
+    A forked process writes nothing to the file, because bytes in the shared buffer would be written twice.
     """
 
     def __init__(self, file: int, output: Path) -> None:

@@ -60,7 +60,8 @@ class ReadOptions:
             default, y points down in drone annotations, and up in all other files.
         max_lateness: largest lateness of messages in an external log, such as "2s"; "all" sorts the whole log
             in memory.
-        max_gap: longest pause, such as "1s"; objects are unknown in longer pauses of samples or their topic.
+        max_gap: longest pause, such as "1s". Objects are unknown in a longer pause of the samples, and in a
+            longer pause of the object's topic.
 
     Raises:
         UsageError: an invalid value.
@@ -211,7 +212,7 @@ class FaultList:
             self._pending.append(fault)
 
     def move_to(self, target: FaultList) -> None:
-        """Move pending faults to `target`; add the number of faults beyond the limit to its count."""
+        """Move pending faults to `target`; the number of faults beyond the limit moves, too."""
         for fault in self.take():
             target.add(fault)
         excess = max(0, self._fault_count - MOST_FAULTS)

@@ -41,7 +41,8 @@ Range: TypeAlias = tuple[int, int]
 """Byte range [begin, end)."""
 
 _BATCH_BYTES: Final = 2**26
-"""Largest batch, bytes. Longer reads are split into batches that grow from a 32nd to half of this size."""
+"""Largest total size of planned ranges that are fetched as one batch, bytes. A larger total is split into
+batches, which grow from a 32nd to half of this size."""
 MOST_HELD_BYTES: Final = 2**28
 """Size of the cache of a remote file, bytes."""
 _WASTE: Final = 0.08
@@ -130,8 +131,9 @@ def each_ahead(
 ) -> Iterator[_Read]:
     """Yield `read(item)` of each item, in order, while threads read the next items.
 
-    One item per thread is always read ahead. Further items are read ahead while their total size is at most
-    `most`, and at most twice the yielded size. So a caller that takes only the first item reads few items.
+    One item per thread is always read ahead. Further items are read ahead up to the total size `most`, but
+    at most twice the size of the items yielded so far. So a caller that takes only the first item reads few
+    items.
     """
     threads = ThreadPoolExecutor(at_once, "reading-ahead")
     pending_reads: deque[tuple[int, Future[_Read]]] = deque()

@@ -101,7 +101,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        """The base name of its file."""
+        """Base name of the log's file."""
         raise NotImplementedError
 
     @property

@@ -101,7 +101,7 @@ def topic_of_camera(topic: str, number: int) -> str:
 
 
 MAGIC = b"\x89MCAP0\r\n"
-"""The first bytes of an MCAP file, and the last."""
+"""The first eight and the last eight bytes of an MCAP file."""
 
 LIBRARY = "spatial-replay"
 """Library name in the header of our logs."""

@@ -264,7 +264,7 @@ def words_of(columns: Sequence[NDArray[Any]]) -> Words:
 
 
 def join_in_order(groups: Sequence[tuple[Integers, Payloads]]) -> Payloads:
-    """Join groups of messages, and sort the messages by the places of the groups."""
+    """Join groups of messages, and sort the messages by their places; a group is (places, messages)."""
     places = np.concatenate([np.empty(0, np.int64), *(places for places, _ in groups)])
     return Payloads.concatenate([payloads for _, payloads in groups]).select(np.argsort(places))
 

@@ -58,7 +58,7 @@ def _first_line(error: Exception) -> str:
 
 
 class Group:
-    """A group of an HDF5 file. Links to other files, and soft links out of `top`, are refused.
+    """A group of an HDF5 file. Links to other files, and soft links out of the group `top`, are refused.
 
     Methods with a path raise LogError for a refused link.
     """

@@ -177,7 +177,7 @@ class DataSet:
 
     @property
     def name(self) -> str:
-        """The base name of its folder or file."""
+        """Base name of the data set's folder or file."""
         return self.path.name or self.path.absolute().name
 
     def columns(
@@ -240,7 +240,7 @@ class DataSet:
         raise NotImplementedError
 
     def count_states(self, run: Run) -> int:
-        """Return the number of states; an array with a row per step may have one row less."""
+        """Return the number of states; arrays with one row per step may have one row fewer."""
         raise NotImplementedError
 
     def poses(self, run: Run, count: int) -> EpisodeColumns:
@@ -310,7 +310,7 @@ class DataSet:
         return next((feature for feature in self.features if feature.name == name), None)
 
     def required_fps(self, reading: EpisodeReading) -> float:
-        """Return the frames per second: of the mapping if it names them, otherwise of the data set.
+        """Return the frames per second from the mapping or, if the mapping lacks `fps`, from the data set.
 
         Raises:
             UsageError: neither the mapping nor the data set names them.

@@ -100,7 +100,7 @@ class _Demonstrations(InGroups):
     """A data set whose episodes are numbered groups.
 
     Attributes:
-        left_out: first path parts of arrays that are no features.
+        left_out: names of groups in an episode whose arrays are not features, such as `next_obs`.
         task: task of episodes that name no task.
     """
 

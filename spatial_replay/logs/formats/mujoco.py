@@ -153,7 +153,7 @@ class SceneModel:
         """Return times (n,), in seconds, and free bodies of states (n, 1 + nq + nv): time, qpos, qvel.
 
         Raises:
-            LogError: states of another length.
+            LogError: states do not have 1 + nq + nv numbers, or the model has no free body.
         """
         expected_width = 1 + self.nq + self.nv
         if states.ndim != 2 or states.shape[1] != expected_width:
@@ -168,7 +168,7 @@ class SceneModel:
         """Return the free bodies at positions (n, nq) of the joints.
 
         Raises:
-            LogError: positions of another length.
+            LogError: positions do not have nq numbers, or the model has no free body.
         """
         if qpos.ndim != 2 or qpos.shape[1] != self.nq:
             raise LogError(
@@ -344,7 +344,7 @@ def model_from_file(path: Path, assets: Path | None = None) -> SceneModel:
     """Return the model in a file, with meshes from a folder; by default, from the folder of the file.
 
     Raises:
-        LogError: a model that cannot be read or compiled.
+        LogError: the model cannot be read or compiled.
     """
     return model_from_xml(_text_of(path), path.name, assets or path.absolute().parent)
 
@@ -373,7 +373,9 @@ def model_from_xml(text: str, place: str, assets: Path | None = None) -> SceneMo
 
 
 def identity_of_model(model: Path | None, assets: Path | None) -> str:
-    """Return a hash of a mapping's model and its files; without a model, of the assets' names and times.
+    """Return a hash of the content of a mapping's model, with the files that the model uses.
+
+    Without a model, the hash covers the names, sizes and modification times of all files in `assets`.
 
     Raises:
         LogError: the files cannot be read.

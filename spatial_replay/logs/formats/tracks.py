@@ -292,7 +292,7 @@ def _signals(entry: Any) -> dict[str, float]:
 
 
 def _number(value: Any, subject: str) -> float:
-    """Return the number; null and NaN stand for an unknown number."""
+    """Return a JSON value as a number; null and NaN stand for an unknown number."""
     if value is None:
         return nan
     if type(value) is not int and type(value) is not float:
@@ -317,7 +317,7 @@ def _check_keys(entry: dict[str, Any], keys: set[str], subject: str) -> None:
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
-    """Return whether a text has an encoding in UTF-8. JSON can spell lone surrogates, which have none."""
+    """Return whether a text has an encoding in UTF-8. Lone surrogates in JSON have no encoding."""
     return is_encodable(text) if text else empty
 
 

@@ -480,7 +480,11 @@ class _Scan:
 
 
 def _iter_places(window: bytes, mark: bytes) -> Iterator[int]:
-    """Yield the possible offsets of chunks in a window, in order, from a compression's marks."""
+    """Yield the possible offsets of chunks in a window, in order.
+
+    Args:
+        mark: bytes that name the compression in the head of a chunk.
+    """
     mark_offset = window.find(mark)
     while mark_offset >= 0:
         if mark_offset >= _BEFORE_COMPRESSION:

@@ -71,7 +71,7 @@ from spatial_replay.trace.units import Axes
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 """Limits of a decompressed chunk or message: bytes that are always allowed, and compression ratio."""
 _ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
-"""Limits of messages that wait for other chunks: bytes, and multiple of the log. The larger limit counts."""
+"""Limits of messages that wait for other chunks: bytes, and multiple of the log; the larger limit applies."""
 _AHEAD_BYTES: Final = 2**24
 """Maximum decompressed size of the chunks read ahead, bytes; one chunk per core is always read ahead."""
 BLOCK_BYTES = 64 * 2**20
@@ -79,7 +79,7 @@ BLOCK_BYTES = 64 * 2**20
 AFTER_ALL_NS = 2**64
 """A time after all times of MCAP, which are unsigned 64-bit integers."""
 _LEAST_BOUND: Final = 2**20
-"""Size that a chunk may always have, bytes; some writers leave the size out of the index."""
+"""Chunks up to this size are accepted whatever size the index gives, bytes; some writers leave sizes out."""
 _LONGEST_HEAD: Final = 80
 _CHANNELS: Final = 2**16
 """Number of channels that a file can have."""
@@ -338,7 +338,7 @@ class ChunkWalk:
         self.channels[channel.id] = self._renamed(log_channel)
 
     def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
-        """Report a fault of a place's messages; their times are between the texts `before` and `after`."""
+        """Report a fault of a place; its text is `before`, the times of the place's messages, and `after`."""
         time_words = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
         place_text = f"{self.name}: at byte {place.offset}: "
         self.faults.add(Sentence(place_text, Sentence(before, *time_words, after)))

@@ -42,7 +42,7 @@ WHOLE_CHUNK_NS = 10 * CHUNK_NS
 REPEAT_NS = 5 * 10**9
 """Time after which a channel is declared again, nanoseconds; its first two chunks declare it, too.
 
-Declarations in every chunk would add 15 % to an annotated log; these declarations add up to 5 %.
+Declarations in every chunk would make an annotated log 15 % larger; at this interval, at most 5 %.
 """
 WAITING_BYTES = 64 * 2**20
 """Maximum bytes of chunks that wait for compression; images and point clouds make large chunks."""
@@ -358,7 +358,7 @@ class LogWriter:
             begin = end
 
     def _fill(self, lane_number: int, part: _Records, starts: Integers, begin: int, end: int) -> None:
-        """Add messages of one lane with times that do not decrease; each step fills the open chunk."""
+        """Add messages of one lane, with times that do not decrease, chunk by chunk."""
         times_ns = part.times_ns
         while begin < end:
             time_ns = int(times_ns[begin])
