@@ -60,7 +60,7 @@ _HEAD = 4096
 
 
 def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source:
-    """Open a log in any format. The file's content decides the format, but not its name.
+    """Open a log in any format. The file's content decides the format; the file's name does not matter.
 
     Only the needed parts of an MCAP log at an address are read. A log of another format is downloaded once.
 
@@ -348,7 +348,7 @@ def is_bag_folder(path: Path) -> bool:
 def _head(path: LogFile) -> bytes:
     """Return the first bytes of a file, decompressed.
 
-    A damaged gzip file counts as track JSONL, because that reader reports the damage with its place.
+    A damaged gzip file counts as track JSONL, because the JSONL reader reports the place of the damage.
     """
     try:
         with open_text(path) if isinstance(path, Path) else path.open() as stream:

@@ -189,8 +189,8 @@ class Fitness:
     Attributes:
         samples: regularity of the samples.
         topics: regularity of messages, by topic; empty for logs without messages.
-        objects: share of samples with a known state of the object, by name, with three decimals, rounded
-            down.
+        objects: by object name, share of samples in which the object's state is known. The share is rounded
+            down to three decimals.
     """
 
     samples: Regularity

@@ -61,7 +61,7 @@ class Recovery:
             an index declares no counts.
         spans: known (start, end) times of losses, in nanoseconds.
         samples: gaps among the samples of our own recordings; empty for other logs.
-        faults: sentences on damage with its place, with times from the first message.
+        faults: sentences on damage, each with the place in the file. Times count from the first message.
         remarks: notes that do not concern losses.
     """
 
