@@ -945,7 +945,7 @@ class LiveAssembler(_Assembling):
             self._newest_ns, max(self._latest_ns_by_topic[topic] for topic in newly_lost_topics)
         )
         trace = self._settle(max(self._upto_ns(now_s), last_message_ns), is_last=True)
-        # one nanosecond later, so that the loss is a separate sample
+        # the loss is one nanosecond later, so that it is a separate sample
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return trace
@@ -990,7 +990,7 @@ class LiveAssembler(_Assembling):
         step_back_ns = step_back_ns[
             (step_back_ns >= 0) & (newest_ns[:-1] >= 0) & (step_back_ns < self._max_delay_s * 1e9)
         ]
-        # one nanosecond more, because samples are final only before the earliest time that may still arrive
+        # the step is one nanosecond more, because samples are final only before the earliest possible time
         self._step_back_ns[topic_name] = max(
             self._step_back_ns[topic_name], int(step_back_ns.max(initial=-1)) + 1
         )

@@ -209,7 +209,7 @@ _FACTORS: Final = (1e3, 1e6, 1e9)
 
 def _another_clock(evidence: TopicEvidence, log: Log) -> str | None:
     lateness_s = [topic.arrivals.lateness_s for topic in log.values() if topic.has_moving_stamps]
-    # sorted by distance from the log's clock, because the nearer of two clocks counts as right
+    # medians are sorted by distance from the log's clock, because the nearer of two clocks counts as right
     medians_s = sorted((late_s.median for late_s in lateness_s), key=abs)
     late_s = evidence.arrivals.lateness_s
     if not (evidence.uses_stamps and evidence.has_moving_stamps):

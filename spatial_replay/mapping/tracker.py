@@ -76,7 +76,7 @@ class Events:
         """Return the state of all N objects at T times."""
         object_starts = np.flatnonzero(np.append(True, self.name[1:] != self.name[:-1])[: len(self.name)])
         if len(times_ns) == 1 and len(object_starts):
-            # vectorised over objects, because a running system has one time and many objects
+            # the search is vectorised over objects, because a running system has one time and many objects
             event_indices = (
                 object_starts + np.add.reduceat(self.time_ns <= times_ns, object_starts, dtype=np.int64) - 1
             )

@@ -172,7 +172,7 @@ def run_offline(
             mirror_channel = channel ^ 1 if channel_count > 1 else channel
             target = columns[channel, row[codes.OFFLINE_TARGET]]
             if code == codes.LEAF:
-                # element by element, because a slice assignment's check of lengths takes seconds to compile
+                # elements are copied singly, because a slice's check of lengths takes seconds to compile
                 for sample in range(begin, end):
                     target[sample] = leaves[channel, row[1], sample]
                 continue
@@ -233,7 +233,7 @@ class OfflineTable(SignalTable):
         Returns:
             (R, OFFLINE_WIDTH), operands first.
         """
-        # reversed, so that the first of several equal nodes owns the row
+        # nodes are reversed, so that the first of several equal nodes owns the row
         column_of_row = {row: node for node, row in reversed(list(enumerate(nodes)))}
         other_rows = (row for row in range(len(self._rows)) if row not in column_of_row)
         column_of_row |= dict(zip(other_rows, count(len(nodes)), strict=False))
@@ -554,7 +554,7 @@ def full_signal(
     formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
 ) -> Floats:
     """Return each node's robustness (N, T) from each sample to the end of the log; NaN if undetermined."""
-    # only the nominal ends, because a curve of robustness ignores uncertainty
+    # only the nominal ends are evaluated, because a curve of robustness ignores uncertainty
     return _determined_numbers(evaluate_offline(formula, order, leaves[:2], times_ns).columns)
 
 

@@ -616,12 +616,12 @@ class PaperRun:
         low_channel, high_channel = low_and_high(len(leaves), wide=False)
         numbers = np.ascontiguousarray(leaves[low_channel])
         lost_flags = ((numbers != leaves[high_channel]) & ~np.isnan(numbers)).astype(np.int8)
-        times_ns = np.array(times_ns, np.int64)  # writable, because kernels are compiled for writable arrays
+        times_ns = np.array(times_ns, np.int64)  # kernels are compiled for writable arrays
         series = empty((len(self._table.rows), 4, len(times_ns)))
         sample_count, rows = self._position + len(times_ns), self._table.rows
-        # only unbounded windows, because pairs of bounded windows are counted when their samples come
+        # only unbounded windows are checked, because pairs of bounded windows are counted with their samples
         window_lows = rows[(rows[:, PAIRS] >= 0) & (rows[:, HIGH] < 0) & (rows[:, IS_IN_NS] == 0), LOW]
-        # half of all pairs, because no end comes before its start
+        # half of all pairs count, because no end comes before its start
         self._check_pairs(int((np.maximum(sample_count - window_lows, 0) ** 2 // 2).sum()), sample_count)
         for tile_start in range(0, len(times_ns), _TILE):
             tile_length = min(_TILE, len(times_ns) - tile_start)
@@ -638,7 +638,7 @@ class PaperRun:
     def _make_room(self, sample_count: int) -> None:
         memory, pair_table_count = self._memory, self._table.pairs
         if self._table.columns and sample_count > len(memory.stamps):
-            # doubled, so that a long run copies each number a constant number of times
+            # the capacity is doubled, so that a long run copies each number a constant number of times
             added_length = max(sample_count, 2 * len(memory.stamps)) - len(memory.stamps)
             memory = memory._replace(
                 stamps=_longer(memory.stamps, added_length),

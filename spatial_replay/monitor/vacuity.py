@@ -174,7 +174,7 @@ def find_vacuous(
     )
 
 
-# cached, because a batch evaluates the same instances on each of its logs
+# answers are cached, because a batch evaluates the same instances on each of its logs
 @lru_cache(maxsize=256)
 def _may_decide_nothing(instance: Instance) -> bool:
     """Return whether a part of an instance's formula can be untested in some log.
@@ -598,7 +598,7 @@ def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -
     while pending_nodes:
         node = pending_nodes.pop()
         if isinstance(node, Boolean) and node.operator in ("and", "spec"):
-            # reversed on the stack, so that goals come in the order of the text
+            # operands are reversed on the stack, so that goals come in the order of the text
             pending_nodes += reversed(node.operands)
         elif (
             isinstance(node, Temporal)

@@ -211,7 +211,7 @@ def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Flo
     edge_shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
     edge_points = corners[:, :, None] + edge_shares[:, None] * edge_vectors[:, :, None]
     offsets = np.arange(-round(_WIDEST / _APART), round(_WIDEST / _APART) + 1) * _APART
-    # one pixel more on each side, because steps are differences
+    # the range has one pixel more on each side, because steps are differences
     wide_offsets = np.arange(offsets[0] - 1.0, offsets[-1] + 1.0 + _APART / 2, _APART)
     sample_points = edge_points[..., None, :] + wide_offsets[:, None] * outward_normals[:, :, None, None]
     brightness = _bilinear(grey, sample_points)
@@ -250,7 +250,7 @@ def _refine(grey: Image, corners: Floats, cells: int, range_share: float) -> Flo
 def _bilinear(grey: Image, points: Floats) -> Floats:
     """Interpolate an image between its pixels. Points beyond the border have the value at the border."""
     height, width = grey.shape
-    # clipped to less than the last pixel, so that each pixel has a next pixel
+    # points are clipped to less than the last pixel, so that each pixel has a next pixel
     x = np.clip(points[..., 0], 0, width - 1.001)
     y = np.clip(points[..., 1], 0, height - 1.001)
     columns, rows = x.astype(np.int64), y.astype(np.int64)

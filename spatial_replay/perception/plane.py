@@ -316,7 +316,7 @@ def _refuse_misfit(
     if tag_errors_px.max() <= limit_px:
         return
     first_tag = references[0]
-    # half a turn first, because OpenCV prints AprilTags upside down
+    # half a turn is tried first, because OpenCV prints AprilTags upside down
     for turns in (2, 1, 3):
         # the corners of all tags in a turned order
         turned_corners = np.roll(known_corners.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)

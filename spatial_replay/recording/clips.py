@@ -389,7 +389,7 @@ class ClipLog(RecorderLog):
         entries = [*self._held_messages(messages)]
         entries += [_RingEntry(sample.time_ns, sample, _sample_bytes(sample)) for sample in samples]
         self._begin_due()
-        # in order of time, so that the ring holds the messages around the sample that fires
+        # entries are added in order of time, so that the ring holds the messages around the sample that fires
         for entry in sorted(entries, key=lambda entry: entry.time_ns):
             if self._zero_ns is None and isinstance(entry.content, Sample):
                 self._zero_ns = entry.time_ns

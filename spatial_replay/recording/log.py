@@ -170,7 +170,7 @@ class Recording:
 
     def layout_ahead(self) -> Attachment:
         """Return the layout for viewers before the first sample, with panels for all possible contents."""
-        # imported late, because only live viewers need a layout before the end of the log
+        # the import is late, because only live viewers need a layout before the end of the log
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
         return layout_attachment(self._evaluation.contents(None, (), self._axes))
@@ -426,7 +426,7 @@ class FileLog(RecorderLog):
         Args:
             number: index of the planner's specification.
         """
-        # imported late, because a log without a planner does not need the planner's code
+        # the import is late, because a log without a planner does not need the planner's code
         from spatial_replay.planning.decision_log import plan_metadata
 
         self._plans.append(plan_metadata(planner, self._recording.files[number].filename))

@@ -83,7 +83,7 @@ class MessageQueue:
             if message_channel is None:
                 channel_id = len(self.channels)
                 message_channel = MessageChannel(self, channel_id, channel)
-                # replaced instead of changed, because the writing thread reads it without the lock
+                # the mapping is replaced, not changed, because the writing thread reads it without the lock
                 self._channels_by_id = MappingProxyType({**self._channels_by_id, channel_id: channel})
                 self.channels[channel.topic] = message_channel
             elif message_channel.declaration != channel:

@@ -388,7 +388,7 @@ class Recorder(SampleWriter):
             UsageError: the recorder already has a planner, has a trigger, drops samples, or does not record
                 the planner's specification; or the planner has observed samples.
         """
-        # imported late, because a recorder without a planner does not need the planner's code
+        # the import is late, because a recorder without a planner does not need the planner's code
         from spatial_replay.planning.decision_log import BlackBox
 
         self._refuse_planner(planner)

@@ -726,7 +726,7 @@ def run_replay(
     )
     if output is None:
         return replay.run(advance=advance)
-    # imported here, because a replay without an annotated log needs no writer
+    # the import is here, because a replay without an annotated log needs no writer
     from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
     from spatial_replay.logs.output_file import replacing
 

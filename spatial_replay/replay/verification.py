@@ -265,7 +265,7 @@ def explain_differences(
 def _difference(topic: str, new_payload: bytes, old_payload: bytes) -> str | None:
     """Return a clause on the difference of two messages; None if only their encodings differ."""
     try:
-        # literals, because a bare name in a pattern would capture the topic
+        # patterns are literals, because a bare name in a pattern would capture the topic
         match topic:
             case "/spatial/objects":
                 return _of_samples(ObjectStates.FromString(new_payload), ObjectStates.FromString(old_payload))

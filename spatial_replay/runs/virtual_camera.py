@@ -133,7 +133,7 @@ def _expose(
 ) -> Image:
     image = background.copy()
     rotation = rotations(pose[None, :3])[0]
-    # far plates first, so that near plates cover them
+    # far plates are drawn first, so that near plates cover them
     depths = [float((rotation @ plate.centre + pose[3:])[2]) for plate in plates]
     for plate_index in np.argsort(depths)[::-1].tolist():
         _draw(

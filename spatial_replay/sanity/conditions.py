@@ -147,7 +147,7 @@ def _add(left: Tree, right: Tree) -> Tree:
     weight_by_quantity = dict(left.weights)
     for quantity, weight in right.weights:
         weight_by_quantity[quantity] = weight_by_quantity.get(quantity, Fraction(0)) + weight
-    # in a fixed order, so that equal sums are equal values
+    # weights have a fixed order, so that equal sums are equal values
     weights = sorted(
         ((quantity, weight) for quantity, weight in weight_by_quantity.items() if weight),
         key=lambda item: repr(item[0]),

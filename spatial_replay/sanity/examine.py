@@ -367,7 +367,7 @@ class _Examiner:
     def _antecedents(self, part: NamedSpec) -> None:
         satisfying = self._reading(part).satisfying
         nodes = (node for _, _, node in iter_nodes(part.formula))
-        # keyed by place, because expanded macros and quantifiers repeat an implication
+        # keys are places, because expanded macros and quantifiers repeat an implication
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }

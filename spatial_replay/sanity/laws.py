@@ -68,7 +68,7 @@ def laws(
     distances = [quantity for quantity in all_quantities if isinstance(quantity, SignedDistance)]
     protrusions = [quantity for quantity in all_quantities if isinstance(quantity, Protrusion)]
     inequalities += _enlargement(distances, protrusions)
-    # in text order (a set has no order), so that equal questions take equal steps
+    # distances are in text order (a set has no order), so that equal questions take equal steps
     bare_distances = dict.fromkeys(
         _distance(without_radius(distance.first), without_radius(distance.second)) for distance in distances
     )

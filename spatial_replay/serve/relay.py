@@ -73,7 +73,7 @@ class Gate:
             return "403 Origin Not Allowed"
         if self.token is not None:
             token = parse_qs(urlsplit(words[1]).query).get("token", [""])[0]
-            # in constant time, so that response times do not reveal the token
+            # the comparison takes constant time, so that response times do not reveal the token
             if not hmac.compare_digest(token.encode(), self.token.encode()):
                 return "401 Token Missing Or Wrong"
         return None

@@ -159,7 +159,7 @@ def replace_constants(
             hint = nearest_hint(name, statements) or f"its constants are: {', '.join(statements) or 'none'}"
             raise UsageError(f"constants: the specification has no const {name!r}; {hint}")
         replacements.append((statements[name].value.span, _new_text(name, value, values[name])))
-    # backwards, so that the offsets of earlier lines stay valid
+    # values are replaced backwards, so that the offsets of earlier lines stay valid
     for span, new_text in sorted(replacements, key=lambda replacement: replacement[0].start, reverse=True):
         text = text[: span.start] + new_text + text[span.end :]
     return text

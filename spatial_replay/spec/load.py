@@ -1036,7 +1036,7 @@ def _with_titles(
     text = changed.source
     faults = Faults(SourceText.of(text, changed.filename))
     tokens = tokenize(text, RELATION_NAMES | changed.relations, faults)
-    # backwards, so that the offsets of earlier titles stay valid
+    # specs are changed backwards, so that the offsets of earlier titles stay valid
     for spec in sorted(changed.specs, key=lambda spec: spec.span.start, reverse=True):
         if spec.title is None or spec.formula == written_formulas[spec.name]:
             continue

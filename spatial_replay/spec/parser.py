@@ -243,7 +243,7 @@ class TreeBuilder:
         depth = _deeper((left, right), span_of(token))
         can_merge = operator in ("and", "or") and isinstance(left, BooleanSyntax)
         if can_merge and left.operator == operator and not left.is_bracketed:
-            # in place, because a copy for each operand would take quadratic time in a long chain
+            # the list is changed in place, because copies would take quadratic time in a long chain
             left.operands.append(right)
             return BooleanSyntax(operator, left.operands, span, max(left.depth, 1 + depth_of(right)))
         return BooleanSyntax(operator, [left, right], span, depth)

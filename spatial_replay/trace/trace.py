@@ -319,7 +319,7 @@ def _ns_from_calendar(match: re.Match[str], text: str) -> int:
     except ValueError as error:
         raise UsageError(f"{text!r} is not a calendar time: {error}") from error
     fraction_ns = int((match["fraction"] or "").ljust(9, "0"))
-    # integer arithmetic, because a timestamp as float would lose nanoseconds
+    # the arithmetic uses integers, because a timestamp as float would lose nanoseconds
     return (whole_seconds - _EPOCH) // timedelta(seconds=1) * 10**9 + fraction_ns
 
 

@@ -484,7 +484,7 @@ class LeafCode:
         if self._groups.may_be_unknown(group):
             # the quantifier is unknown in samples with unknown members
             row = self._row(op, row, row, self._member(group, ()))
-        # permutations, because different variables stand for different members
+        # members are permuted, because different variables stand for different members
         for indices in permutations(range(len(candidate_names)), len(formula.variables)):
             members = [TrackedName(candidate_names[index]) for index in indices]
             member_bindings = {**bindings, **dict(zip(formula.variables, members, strict=True))}

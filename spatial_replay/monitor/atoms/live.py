@@ -614,7 +614,7 @@ class SampleRoom:
         self._plan, self._objects_length = plan, objects_length
         size = objects_begin + 4 * objects_length + 8 * plan.room
         if size > len(self._bytes):
-            # doubled, because numbers of objects and vertices change from sample to sample
+            # the size is doubled, because numbers of objects and vertices change from sample to sample
             self._bytes = bytearray(2 * size)
             self._numbers = np.frombuffer(self._bytes)
         self.arguments = (

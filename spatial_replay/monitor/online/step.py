@@ -288,7 +288,7 @@ def run_sample(
         the number of channels of the leaves.
     """
     if channels == 0:
-        # in the same kernel, because an update by two kernels took 1.4 times as long
+        # the same kernel measures, because an update by two kernels took 1.4 times as long
         channels = measure_sample(whole, real, sample, end, leaves)
         # a run with more channels than the leaves reads copies (see `codes.in_channels`)
         for channel in range(channels, CHANNELS):

@@ -741,7 +741,7 @@ def run_windows(
                 columns[rows[root, codes.NODE_B], last_sample],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
             )
-        # counted from the first sample of the run, so that the length of a tile does not matter
+        # samples are counted from the first sample of the run, so that the length of a tile does not matter
         if (state[HEAD, OFFSET] + last_sample) % CLOSING == CLOSING - 1:
             _absorb(rows, stamps, columns, state, tables, last_sample)
 
@@ -959,7 +959,7 @@ def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last_sample: int
 ) -> None:
     """Move the base over all positions whose windows have all closed."""
-    # large runs first, so that the tables are computed once for many positions
+    # large runs come first, so that the tables are computed once for many positions
     size, old_base = CLOSING, state[HEAD, BASE]
     while size > 0:
         base = state[HEAD, BASE]

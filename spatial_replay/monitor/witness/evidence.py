@@ -87,7 +87,7 @@ class Evidence:
 
     def scenes(self, times_ns: Collection[int]) -> dict[int, TraceScene]:
         """Return a scene for each of several times (see `scene`), in one pass over the log."""
-        # in descending order, so that `pop` removes the earliest time
+        # times are in descending order, so that `pop` removes the earliest time
         pending_ns, scenes = sorted(times_ns, reverse=True), dict[int, TraceScene]()
         for scene in self._scenes() if pending_ns else ():
             trace = scene.trace
