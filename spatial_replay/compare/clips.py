@@ -102,7 +102,8 @@ class _Decision(NamedTuple):
             cause. Other ends are left out, because samples that decide nothing can make these ends unknown.
         cause: id of the part that failed first, or None.
         path: path to the deciding atom of the node over all samples.
-        settled: path to the atom that settled the cause, or else the verdict, at the time of settling.
+        settled: path from the cause to the deciding atom, over the samples until the cause was settled.
+            Without a cause, the path begins at the node.
     """
 
     verdict: Verdict
@@ -424,9 +425,9 @@ def cut_clip(
 ) -> Clip:
     """Write the smallest part of a log that has the log's verdicts, robustness and witnesses.
 
-    If either end loses one more sample, or any power of two of samples, a result changes. The clip has all
-    messages in its window. From before the window, it has the last message of each topic, and the last
-    transform of each frame. Times do not change.
+    If either end loses one more sample, a result changes. The clip has all messages in its window. From
+    before the window, it has the last message of each topic, and the last transform of each frame. Times do
+    not change.
 
     Args:
         options: options of the evaluation; `keep` selects the topics.

@@ -534,7 +534,7 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """Node of both trees whose operands may differ; `site` is an index if the node's window differs."""
+    """Node of both trees whose operands may differ; `site` is the index of a changed window, or None."""
 
     site: int | None
     old: Boolean | Temporal
@@ -681,7 +681,7 @@ class _Comparison:
     def meaning(self, node: Formula) -> int:
         """Return a number that is the same for nodes of equal meaning.
 
-        It ignores names, and the order of a commutative operator's operands.
+        Names, and the order of a commutative operator's operands, do not change the number.
         """
         cache_entry = self._known_meanings.get(id(node))
         if cache_entry is None:

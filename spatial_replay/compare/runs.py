@@ -83,8 +83,9 @@ class Parting(NamedTuple):
     """Divergence of two runs in one automaton: their first states that differ.
 
     Attributes:
-        a_ns, b_ns: time at which each run enters its differing states; None if the run ends before.
-        a_states, b_states: differing states of each run; () if the run ends before.
+        a_ns, b_ns: time at which each run enters its differing states; None if the run ends before the
+            divergence.
+        a_states, b_states: differing states of each run; () if the run ends before the divergence.
     """
 
     a_ns: int | None
@@ -557,7 +558,7 @@ class RunSpecDiff:
         nodes: ids of the deepest nodes with different verdicts; for equal verdicts with different robustness,
             the deciding node of A.
         parting: divergence in the automaton; None for equal verdicts or without an automaton.
-        moved: differences of the objects that these nodes mention.
+        moved: differences of the objects that `nodes` mention.
     """
 
     a: SpecResult

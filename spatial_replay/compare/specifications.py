@@ -197,7 +197,7 @@ class SpecDiff(Displayed):
         name, old_name: name in the new file and in the old file.
         old, new: results over the log.
         tree: edits between the two formulas, which can be applied to the old formula one by one.
-        cause: edits that changed the verdict or, for equal verdicts, the robustness; empty if both are equal.
+        cause: edits that changed the verdict or, for equal verdicts, the robustness; empty for equal results.
             These edits alone give the new outcome, and all other edits alone give the old outcome.
         alone: outcome with a single edit, for each edit of the cause; None if the edit needs other edits.
         old_places, new_places: edited declaration or line in each text, by edit.

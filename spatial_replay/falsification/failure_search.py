@@ -339,20 +339,20 @@ def _table(coverages: tuple[Coverage, ...]) -> Iterator[str]:
 LARGEST_COST: Final = 1e9
 """Substitute for an infinite cost, because the optimiser needs finite costs; impossible cases cost more."""
 _LOOK: Final = 10
-"""Points before each descent, spread over the whole space."""
+"""Number of points before each descent, which are spread over the whole space."""
 _STEP: Final = 0.2
 """Initial standard deviation of a descent, as a fraction of the ranges."""
 _NARROWEST: Final = 2e-3
 """Standard deviation at which a descent ends, as a fraction of the ranges."""
 _FLAT: Final = 3
-"""Generations with equal costs after which a descent ends."""
+"""Number of generations with equal costs after which a descent ends."""
 _STALLED: Final = 5
 _FALLS: Final = 1e-3
 """A descent ends after `_STALLED` generations without a decrease of the least cost by this fraction."""
 _PROPOSED: Final = 20
-"""Proposals of CMA-ES for each simulated point."""
+"""Number of proposals of CMA-ES for each simulated point."""
 _PARTS: Final = 3
-"""Rounds of a generation; the model chooses the points of a round by the costs of earlier rounds."""
+"""Number of rounds of a generation; costs of earlier rounds decide the points of the next round."""
 _KNOWN: Final = 80
 """Number of points for fitting the model: the newest points and the best older points, half each."""
 _LENGTHS: Final = (0.15, 0.3, 0.6)
@@ -585,7 +585,7 @@ Rounds: TypeAlias = Generator[Sequence[Case], Sequence[SearchedRun], _Result]
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """Case to simulate; its log is written if it violates a specification."""
+    """Case to simulate; its log is written if its run violates a specification."""
 
     number: int
     case: Case
@@ -680,7 +680,7 @@ class _Queue(Generic[_Result]):
 
 
 def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
-    """Simulate and evaluate a case; write its log if it violates a specification."""
+    """Simulate and evaluate a case; write its log if its run violates a specification."""
     try:
         simulated_case = simulation.run(task.case)
     except Exception as error:
@@ -722,9 +722,9 @@ FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
-"""Maximum number of halvings of a group's distance from rest, if the run at rest does not fail."""
+"""Maximum number of times that a group moves half way to rest, if the run at rest does not fail."""
 _BARREN: Final = 50
-"""Rounds without a new case after which the search ends."""
+"""Number of rounds without a new case after which the search ends."""
 _DRAWN: Final = 10
 """Number of runs in a round if only seeds are varied."""
 

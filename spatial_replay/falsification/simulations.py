@@ -137,7 +137,7 @@ class Space:
         }
 
     def nearer(self, case: Case, group: str) -> dict[str, float | None] | None:
-        """Return a case with a group half way to rest; None if it is at rest or lacks a value at rest."""
+        """Return a case with a group half way to rest; None if the group is at rest or lacks a rest value."""
         new_case = dict(case)
         for parameter in self.parameters:
             value = case[parameter.name]
@@ -503,7 +503,10 @@ def _conditions(case: Case) -> Conditions:
 
 
 def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:
-    """Return a body's footprint at the start, with the scatter of seeds if `starts` lacks the body."""
+    """Return a body's footprint at its start in `starts`.
+
+    Without a start, return the footprint at its placement, enlarged by the scatter of seeds.
+    """
     x, y, yaw, room_m = placement.x, placement.y, placement.yaw, scatter_m
     if (start := starts.get(placement.body.name)) is not None:
         x, y, yaw, room_m = start.x, start.y, yaw if start.turn is None else start.turn, 0.0

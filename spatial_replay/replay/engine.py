@@ -133,8 +133,8 @@ class Replayed:
             result.
         certificate: hashes of inputs and results; empty unless requested.
         semantics: the semantics of the formulas.
-        left: absences of group members and of objects in `present`, near a threshold (see `Departures`);
-            `remarks` has their sentences, too.
+        left: absences near a threshold, of group members and of objects in `present` (see `Departures`).
+            `remarks` has sentences on these absences, too.
         doubts: assumptions that the log contradicts; each result has the doubts about its own assumptions.
     """
 

@@ -61,8 +61,9 @@ from spatial_replay.trace.doubts import Doubt, distinct_doubts
 from spatial_replay.trace.trace import Trace, within
 
 _FEW: Final = 2_000
+"""Maximum number of messages of a topic that is kept in memory."""
 _FEW_BYTES: Final = 1 << 26
-"""Limits of the topics that are kept in memory: messages per topic, and bytes of all these topics."""
+"""Maximum size of all topics that are kept in memory, bytes."""
 
 _PIECE: Final = 256
 """Samples per encoded piece."""
@@ -304,7 +305,7 @@ class LoadedLog:
         self.constants: Mapping[str, Constant] = self._constants(self._files)
 
     def with_files(self, files: Sequence[Specification]) -> LoadedLog:
-        """Return the log with other specifications. Both share the samples and the cached measurements.
+        """Return the log with other specifications. Both logs share the samples and the cached measurements.
 
         The log is read again if only the new specifications look back at samples before the window. A log
         with trimmed ends is also read again if the new specifications name other objects or signals.

@@ -142,7 +142,8 @@ class ReplayOptions:
         strict_names: whether missing names are errors. Otherwise missing objects and signals are unknown, and
             a template has no result for a missing class.
         keep: messages of the log that a copy keeps: "all", "mapped", or patterns of topics; () for samples
-            only. For a copy, None stands for `default_keep`; otherwise it leaves the source unchanged.
+            only. A copy with None keeps the topics of `default_keep`. Without a copy, None leaves the source
+            unchanged.
         arrow: title of the result whose violation the scene points at; "" for the first result.
     """
 

@@ -25,8 +25,9 @@ _ERROR_SETTLE_S: Final = 0.1
 _PATIENCE_S: Final = 1.0
 """Longest wait for a file that keeps changing, seconds."""
 _IDLE_MS: Final = 100
+"""Timeout of a wait for changes, milliseconds."""
 _STEP_MS: Final = 10
-"""Timeout of a wait for changes, and wait for further changes after a change, milliseconds."""
+"""Wait for further changes after a change, milliseconds."""
 
 
 _State: TypeAlias = tuple[int, int, int, int]
@@ -118,7 +119,8 @@ class SpecificationFiles:
 
         Args:
             values: new values by name, one mapping per file.
-            loaded: files for which the new values were chosen. Constants that were saved since are refused.
+            loaded: files for which the new values were chosen. Constants that another program saved since
+                then are refused.
 
         Returns:
             The changed values by name.

@@ -22,11 +22,13 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Trace
 
 _MOST_SAMPLES: Final = 2**12
+"""Maximum number of samples of a log that is measured together with other logs."""
 _MOST_BYTES: Final = 2**22
-"""Limits of a log that is measured together with others: samples and bytes."""
+"""Maximum size of a log that is measured together with other logs, bytes."""
 _ENOUGH_SAMPLES: Final = 2**14
+"""Number of samples above which no log is added to the logs that are measured together."""
 _ENOUGH_BYTES: Final = 2**25
-"""Limits of all logs that are measured together: samples and bytes."""
+"""Size above which no log is added to the logs that are measured together, bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class ShortLog:
 class JointReplay:
     """Replays of the same specifications over many logs with the same units.
 
-    All bits of the results equal the results of `Replay` with `keep_leaves`.
+    The results are identical to the results of `Replay` with `keep_leaves`, to the last bit.
 
     Attributes:
         trees: formula tree and reported name of each result.

@@ -213,7 +213,7 @@ class FirstDifferences:
 def explain_differences(
     recorded: Mapping[str, str], computed: Mapping[str, str], differences: Mapping[str, Sentence]
 ) -> list[Sentence]:
-    """Return a sentence on each part of a certificate. It says where a part differs first.
+    """Return a sentence on each part of a certificate: whether the part differs, and where it differs first.
 
     Args:
         differences: clause on the first difference, by topic (see `FirstDifferences`).

@@ -352,9 +352,9 @@ class Fact(NamedTuple):
     Attributes:
         weights: quantities of a sum with their factors, the first factor 1; empty for an opaque proposition.
         threshold: limit of the sum.
-        side: comparison of the sum with the threshold. ">" is true above the threshold and false below.
-            It leaves equality open, because a relation between footprints is marginal there. ">=" and "<="
-            are exact; they are used for sums that some relation compares with "==".
+        side: comparison of the sum with the threshold. ">" is true above the threshold and false below it.
+            At the threshold, ">" is neither, because a relation between footprints is marginal there.
+            ">=" and "<=" are exact. They are used for sums that some relation compares with "==".
         texts: formulas for the true fact and for the false fact.
         alone: value of a quantifier over a class if no object has that class; None for other facts.
     """
@@ -473,7 +473,7 @@ class FactDiagrams:
         return node if is_lower_limit else self.diagrams.complement(node)
 
     def equal_texts(self, number: int) -> Iterator[tuple[str, str]]:
-        """Yield pairs of comparisons with the same robustness in a fact, such as "x > 1" and "x >= 1"."""
+        """Yield pairs of comparisons in one fact that have equal robustness, such as "x > 1" and "x >= 1"."""
         texts = dict.fromkeys((*self._written_texts.get(number, ()), *self.facts[number].texts))
         for strict in texts:
             for sign in (" > ", " < "):
@@ -519,7 +519,7 @@ def is_negated(text: str) -> bool:
 
 
 def _with_threshold(linear: Linear) -> tuple[Weights, Fraction, bool]:
-    """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether the limit is a lower one."""
+    """Return `linear >= 0` as a limit of a sum: factors, threshold, and whether it is a lower limit."""
     # weights are divided by the first factor, so that 2 x >= 2 and x >= 1 are one fact
     factor = linear.weights[0][1]
     weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)

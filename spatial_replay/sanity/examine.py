@@ -241,7 +241,12 @@ def refuse_constant_results(specification: Specification) -> None:
 
 
 def _refuse(specification: Specification, names: Sequence[str], outcomes: Sequence[bool]) -> None:
-    """Raise an error for named specs that no run satisfies (True in `outcomes`) or violates (False)."""
+    """Raise an error for specs without a run that has a required outcome.
+
+    Args:
+        names: names of the examined specs.
+        outcomes: required outcomes: True for a satisfied spec, False for a violated spec.
+    """
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
     findings = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in outcomes]
@@ -341,7 +346,7 @@ class _Examiner:
         return None
 
     def _of_whole(self, part: NamedSpec, satisfied: bool) -> Answer | None:
-        """Return the answer from the automaton of the whole part; None if this is undecided, too."""
+        """Return the answer from the automaton of the whole part; None if the automaton gives no answer."""
         try:
             side = Side(automaton_of(self._specification, part.name, part.formula), satisfied)
             if not side.may_agree(side.automaton.initial):

@@ -105,7 +105,7 @@ _DIGITS: Final = 9
 """Significant digits of coordinates, in the samples and in their file."""
 
 _SHARES: Final = {2: 0.7, 3: 0.57}
-"""Limit of the gap along each of two or three axes that keeps the distance below 1."""
+"""By number of axes: greatest gap along each axis with which the distance stays below 1."""
 
 Ways: TypeAlias = list[list[Inequality]]
 """Alternatives: all inequalities of at least one list must hold."""
@@ -171,7 +171,7 @@ class Setting:
 
 
 Core: TypeAlias = frozenset[tuple[int, int]]
-"""Facts that exclude each other, as pairs: index of the sample, index among its facts."""
+"""Facts that exclude each other, as pairs: index of a sample, index of a fact in the sample."""
 
 
 def placements(
@@ -179,8 +179,8 @@ def placements(
 ) -> Iterator[tuple[tuple[Sample, ...] | None, Core | None]]:
     """Yield placements in which facts have given values, from wide to narrow margins.
 
-    Each item has the samples of a placement, or the facts that exclude each other. An attempt that reaches
-    its limit yields (None, None).
+    Each item has the samples of a placement, or the facts that exclude each other. (None, None) stands
+    for an attempt that reached `MAX_SOLUTIONS`.
 
     Args:
         facts: facts of each sample with their values.
@@ -304,8 +304,8 @@ class _Attempt:
     ) -> Mapping[Any, float] | frozenset[int]:
         """Return values of the unknowns, or the labels of facts that exclude each other.
 
-        The search branches on the first choice that the current values do not fulfil. A conflict without
-        that choice ends the branch, because it excludes all alternatives of the choice.
+        The search branches on the first choice that the current values do not fulfil. If a conflict does not
+        contain this choice, the other alternatives of the choice are not tried, because they also fail.
         """
         self._solutions_left -= 1
         start_values = self._start(samples)
@@ -550,11 +550,11 @@ def shortest_example(
     """Return the example of a word, with samples if a placement is found.
 
     Args:
-        is_exact: whether the word certainly has the verdict; if not, the result is None without a placement
-            that confirms it.
+        is_exact: whether the word certainly has the verdict. If not, the result is None unless a placement
+            confirms the verdict.
         rate_hz: sample rate of the run, Hz.
-        another: function from words that cannot be placed to another word of the same length that avoids
-            them; None without such a word.
+        another: function that receives words to avoid and returns another word of the same length. It returns
+            None if there is no such word.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
     # a guess about bounds in seconds may be right at only one rate
@@ -656,7 +656,7 @@ def _evaluate(specification: Specification, spec: NamedSpec, trace: Trace) -> tu
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:
-    """Return the setting of a spec, with objects and signals of all specs, because all are evaluated."""
+    """Return the setting of a spec, with the objects and signals of all results, which are evaluated, too."""
     own_atoms = _atoms(spec)
     all_atoms = [*own_atoms, *(atom for result in specification.results for atom in _atoms(result))]
     is_upright = is_about_heights(all_atoms)

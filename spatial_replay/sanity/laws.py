@@ -127,7 +127,7 @@ def _across(
     bare_protrusions: Mapping[Protrusion, None],
     diameters: Mapping[str, Fraction],
 ) -> Iterator[Inequality]:
-    """Yield: a distance is at most a region's diameter plus both protrusions from the region."""
+    """Yield: a distance is at most a region's diameter plus the protrusions of both terms from the region."""
     for distance, (name, diameter) in product(distances, diameters.items()):
         region = RegionName(name)
         pair_protrusions = [Protrusion(distance.first, region), Protrusion(distance.second, region)]

@@ -67,7 +67,7 @@ def solve(
         laws: further inequalities; a law is added once the current values violate it, because few of many
             laws matter to one question.
         exact: whether to compute with fractions; floats have a tolerance.
-        start: initial values of quantities, which only inequalities change; 0 by default.
+        start: initial values of quantities, 0 by default. A value changes only if an inequality requires it.
     """
     tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
     active_inequalities, pending_laws = list(inequalities), list(laws)
@@ -111,7 +111,7 @@ class _Tableau:
         self._upper: list[tuple[_Pair, int] | None] = []
 
     def extend(self, inequalities: Sequence[Inequality], first_index: int) -> set[int] | None:
-        """Add bounds with numbers from `first_index` on and search again; return the result of `search`."""
+        """Add bounds with indices from `first_index` on, and search again; return a conflict or None."""
         for index, inequality in enumerate(inequalities, first_index):
             if not self.add(inequality, index):
                 return self.conflict
@@ -245,7 +245,7 @@ class _Tableau:
         return left[0] < right[0] - self._tolerance if self._tolerance else left < right
 
     def _violation(self) -> tuple[int, bool] | None:
-        """Return the first sum outside of its bounds, and whether it must rise; None if there is none."""
+        """Return the first sum outside of its bounds, and whether the sum must rise; None if all fit."""
         # the lowest number first (Bland's rule), so that the pivots cannot cycle
         for variable in sorted(self._rows):
             value, lower, upper = self._values[variable], self._lower[variable], self._upper[variable]

@@ -1,8 +1,8 @@
 """Shortest runs that automata jointly accept or reject, among the runs that geometry allows.
 
-The product of many automata has too many states for a search. Short runs need no product: the runs of a few
-samples with the outcome of an automaton are a small diagram over the facts of all samples. A spec without an
-automaton has looser readings, which still decide some questions.
+The product of many automata has too many states for a search. Short runs need no product: a small
+diagram over the facts of all samples describes the short runs that an automaton accepts or rejects. A spec
+without an automaton has looser readings, which still decide some questions.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def word_of_length(
     conflicts: Callable[[Cube], Iterable[Cube]],
     avoided: Sequence[Sequence[Cube]] = (),
 ) -> tuple[Cube, ...] | None:
-    """Return a run of given length with the outcomes of all sides; None if there is no such run.
+    """Return a run of given length with the required outcome of each side; None if there is no such run.
 
     The run is given by its requirements on each sample.
 
@@ -123,7 +123,7 @@ def agreements(
     diagrams: Diagrams,
     condition_of: Callable[[Automaton], Sequence[int]],
 ) -> list[tuple[bool, bool]]:
-    """Return for each side whether some run with a word, and whether every such run, has its outcome.
+    """Return two flags per side: some run with a word, and every run with the word, has the side's outcome.
 
     Raises:
         NoAutomatonError: the diagrams need too many nodes.
@@ -276,7 +276,7 @@ MAX_ALL_STEPS: Final = 400_000
 """Maximum number of steps of all questions about one specification."""
 
 _STEPS_OF_GEOMETRY: Final = 50
-"""Steps that one check of geometry counts as."""
+"""Cost of one check of geometry, steps."""
 
 MAX_CONFLICTS: Final = 2000
 """Maximum number of excluded combinations of facts before a question is undecided."""
@@ -295,7 +295,7 @@ MAX_PAIRS: Final = 200
 """Maximum number of pairs of automata that are tested for excluding each other."""
 
 Runs: TypeAlias = tuple[tuple[Side, ...], ...]
-"""Alternatives: the runs that have the outcomes of all sides of at least one alternative."""
+"""Set of runs as alternatives. A run is in the set if it has the outcomes of all sides of one alternative."""
 
 
 class UndecidedError(Exception):
@@ -413,7 +413,7 @@ class WordSearch:
     def _refine(self, sides: Sequence[Side]) -> Answer:
         """Return the answer for all sides from searches with few sides.
 
-        A side that disagrees with the run of the chosen sides is added to them.
+        A side that disagrees with the run of the chosen sides is added to the chosen sides.
         """
         side_pairs = combinations(sides, 2) if len(sides) > 2 else ()
         for side_pair in islice(side_pairs, MAX_PAIRS):
@@ -669,7 +669,10 @@ class WordSearch:
         return solve(inequalities, geometry_laws).conflict
 
     def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
-        """Return the exclusions with all facts in the automata, else those with at least one such fact."""
+        """Return the exclusions whose facts all occur in the automata.
+
+        If there are none, return the exclusions with at least one fact of the automata.
+        """
         facts = self._read(sides)
         exclusions_with_facts = [
             (exclusion, {fact for fact, _ in exclusion}) for exclusion in self._exclusions

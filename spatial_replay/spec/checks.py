@@ -77,7 +77,7 @@ def reach_warnings(tokens: Sequence[Token], source: SourceText, published: bool)
     Args:
         published: whether to warn also where the grammar of the published implementation groups differently.
             That grammar has no precedence: Boolean operators group to the right, and `not` reaches as far as
-            F and G. Its U reaches to the ends of the formula on both sides.
+            F and G. In that grammar, U reaches to the ends of the formula on both sides.
     """
     levels = [_Level()]
     for previous, token in pairwise([None, *tokens]):
@@ -150,7 +150,8 @@ def _differs(first_operator: Token, second_operator: Token) -> bool:
 def spelling_warnings(tokens: Sequence[Token], source: SourceText) -> Iterator[Diagnostic]:
     """Yield a warning for each operator in the spelling of a tool that defines the operator differently.
 
-    A bounded until has the same spelling in R2U2, so its warning requires `&&` or `||` in the text.
+    This language and R2U2 spell bounded U and R equally. The warning about R2U2 requires `&&` or `||` in
+    the text.
     """
     connectives = (token for token in tokens if token.type in ("AND", "OR"))
     has_r2u2_sign = any(_source_text(token, source) in _R2U2_SIGNS for token in connectives)
@@ -449,7 +450,7 @@ def _listing(kind: str, names: tuple[str, ...]) -> str:
 
 
 def _places(specification: Specification, source: SourceText) -> tuple[dict[str, Span], dict[str, Span]]:
-    """Return the place of the first occurrence by name, and the place of the definition by name."""
+    """Return two places for each name: its first occurrence, and its definition."""
     relations = RELATION_NAMES | specification.relations
     tokens = tokenize(specification.source, relations, Faults(source))
     first_places: dict[str, Span] = {}

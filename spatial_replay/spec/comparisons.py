@@ -62,7 +62,7 @@ _MIRRORED: Final[Mapping[str, str]] = MappingProxyType(
     {"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "==", "!=": "!="}
 )
 _SIMPLE: Final = (Name, DistanceSyntax, RateSyntax)
-"""Quantities whose comparison with a constant is a relation: "signal", "dist", "speed", "rate"."""
+"""Quantities whose comparison with a constant has a relation name: "signal", "dist", "speed" or "rate"."""
 
 
 class Comparison(NamedTuple):
@@ -335,7 +335,7 @@ class ComparisonBuilder:
     def _check_units(
         self, left: Expression, right: Expression, written: Arithmetic | ComparisonSyntax, scope: Scope
     ) -> None:
-        """Report a sum or a comparison of a distance and a speed."""
+        """Report a sum of a distance and a speed, or a comparison of a distance with a speed."""
         dimensions = {dimension for dimension in (_kind(left), _kind(right)) if dimension}
         if len(dimensions) > 1:
             hint = "multiply one of them by a constant: a dist b >= 2 * speed(a)"

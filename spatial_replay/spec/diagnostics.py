@@ -16,7 +16,7 @@ MAX_FAULTS = 100
 """Maximum number of faults in one report; further faults are only counted."""
 
 _MAX_SUGGESTION_EFFORT = 10_000
-"""Maximum number of name comparisons for the hints of one text; otherwise millions might be needed."""
+"""Maximum number of name comparisons for the hints of one text; large texts could need millions."""
 # not str.splitlines, which also splits at form feeds and Unicode line separators
 _LINE_END = re.compile(r"\r\n|\r|\n")
 

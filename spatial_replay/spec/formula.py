@@ -102,8 +102,8 @@ class Earlier:
     """Delayed term; exactly one of `samples`, `duration_ns` and `rate` is given.
 
     `a[-3]` is the term 3 samples earlier. `a[-2.5s]` is the term in the last sample that is at least 2.5 s
-    earlier. With `rate`, the term is moved back along its velocity between its last two reports, by the
-    shortest report interval of the terms in `rate`.
+    earlier. With `rate`, the term is moved back along its velocity between its last two reports. The time of
+    this motion is the shortest report interval of the terms in `rate`.
     """
 
     term: TrackedName | Variable | RegionName | Group
@@ -193,7 +193,7 @@ class Measurement(_Arithmetic):
     @property
     @abstractmethod
     def extrema(self) -> tuple[Side, ...]:
-        """Extreme over the members of each term that is a group; the first term's extreme comes last."""
+        """Extreme over the members of a group, one per term; the last term's extreme is computed first."""
 
     @property
     def radius_effects(self) -> tuple[int, ...]:
@@ -318,7 +318,7 @@ class ComputedSignal(Signal):
 
 @dataclass(frozen=True, slots=True)
 class PreviousSignal(Signal):
-    """Signal at the report before the report of the sample."""
+    """Value of a signal one report earlier than its value in the sample."""
 
     signal: Signal
 
@@ -342,7 +342,7 @@ class Rate(Signal):
 
 @dataclass(frozen=True, slots=True)
 class ReportStep(Signal):
-    """Time between the last two reports of a rate, seconds; the shortest time if there are several terms.
+    """Time between the last two reports of a rate's terms or signal, seconds; the shortest of several times.
 
     Attributes:
         terms: terms of a speed, without regions.
@@ -506,9 +506,10 @@ class Atom:
 BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "spec", "given", "with"]
 """Boolean operators of the language, and three internal operators.
 
-`spec` has the value of its one operand: the spec only repeats another spec under a new name. `given` and
-`with` occur only in expansions: they make an operator skip samples without a rate (see `judged_operands`).
-Their first operand is the condition that the rate has a value; their last operand is in the text.
+`spec` has the value of its one operand. It stands for a spec that only repeats another spec under a new name.
+`given` and `with` occur only in expansions. They make an operator skip samples in which a rate has no value
+(see `judged_operands`). Their first operand is the condition that the rate has a value. Their last operand is
+the operand in the text.
 """
 
 
@@ -645,7 +646,7 @@ _LEFT_OUT_AS: Final[Mapping[str, tuple[BooleanOperator, ...]]] = MappingProxyTyp
         "R": ("with", "given"),
     }
 )
-"""Internal operators that skip samples or members without a rate, by operator: one for each operand."""
+"""Internal operator of each operand (see `judged_operands`), by temporal operator or quantifier."""
 
 
 def judged_operands(operator: str, operands: tuple[Formula, ...]) -> tuple[Formula, ...]:
@@ -674,10 +675,10 @@ def judged_operator(formula: Temporal) -> Temporal:
 
 
 def rate_conditions(formula: Formula) -> list[Formula]:
-    """Return one condition for each rate in a formula: the rate has a value in the sample that is read.
+    """Return one condition for each rate in a formula: the rate has a value where the formula reads it.
 
-    A rate inside an operator that already skips samples has no condition. If an operator reads before the
-    first or after the last sample, the condition holds, because no sample is skipped there.
+    A rate inside an operator that already skips samples has no condition. X and WX read the next sample, Y
+    reads the previous sample. If the log has no such sample, the condition holds.
     """
     match formula:
         case Atom():
@@ -820,7 +821,7 @@ class Scale:
 class Specification(Displayed):
     """All specs of one text, with macros, constants and quantifiers over named groups expanded.
 
-    Specifications are equal if they mean the same: source, file name, constants and warnings do not count.
+    Specifications are equal if they mean the same: source, file name, constants and warnings are ignored.
 
     Attributes:
         specs: all specs in text order.

@@ -576,8 +576,8 @@ def function_hint(name: str, argument: str, arguments: Sequence[str] = ()) -> st
     """Return the remedy for a function of other tools; "" if the function is unknown.
 
     Args:
-        argument: text of all arguments, in brackets.
-        arguments: texts of the arguments if a number is expected; else empty.
+        argument: text of all arguments with their brackets, "(a, b)".
+        arguments: text of each argument where a number is expected; else empty.
     """
     match name.lower(), arguments:
         case "fabs" | "norm" | "magnitude", [inner]:

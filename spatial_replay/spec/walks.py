@@ -226,7 +226,7 @@ def iter_parts(formula: Formula) -> Iterator[Expression]:
 
 
 def leaf_key(leaf: Formula) -> tuple[object, ...]:
-    """Return a key that is equal for equal leaves; names and places in the text do not count."""
+    """Return a key that is equal for equal leaves; names and places in the text are ignored."""
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body
     return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
@@ -478,7 +478,7 @@ def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], T
 LENGTHS = "lengths"
 """Name of the footprint units in `scale`."""
 MULTIPLES = "multiples"
-"""Name of the unit of a number that has only multiples as summands, as in `2 * x <= 1`."""
+"""Name of the unit of a sum in which every signal or distance has a factor, as in `2 * x <= 1`."""
 
 
 @dataclass(frozen=True, slots=True)

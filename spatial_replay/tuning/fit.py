@@ -224,14 +224,14 @@ def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
 PATTERNS: Final[tuple[Pattern, ...]] = ("always", "finally", "eventually")
 ALWAYS, FINALLY, EVENTUALLY = range(3)
 _MARGIN: Final = 3.0
-"""Margin of a limit from the nearest good run, in mean distances between the values of good runs."""
+"""Margin of a limit from the nearest good run, as a multiple of good runs' mean distance."""
 _FINEST: Final = 0.01
 """Least margin, as a fraction of the value."""
 _SURE: Final = 4.0
-"""Distance from the good runs, in margins, at which a bad run is fully distinguished."""
+"""Distance from the good runs at which a bad run is fully distinguished, as a multiple of the margin."""
 _MOST_EVENTS: Final = 40
 _STILL: Final = 1e-3
-"""Least movement, as a fraction of the greatest distance."""
+"""Greatest variation of a length that is ignored, as a fraction of `FittedLimits.scale`."""
 _STAYS: Final = 0.05
 """Greatest displacement of a landmark, as a fraction of the farthest displacement of an object."""
 _SCORED_RUNS: Final = 10
@@ -266,7 +266,7 @@ class FittedLimits:
         """Fit limits to the runs.
 
         A limit keeps a margin from the lowest value of the good runs. The margin is three times the mean
-        distance between their values, and at most half of the distance to the nearest bad run.
+        distance between good runs' values, and at most half of the distance to the nearest bad run.
 
         A bad run that no limit distinguishes moves one limit: the limit with the greatest gap, in margins,
         between that run and the good runs. The limit moves to the middle of the gap.
@@ -417,8 +417,8 @@ class FittedLimits:
     def bits(self) -> Floats:
         """(3, 2, Q), information of each line, bits.
 
-        It is higher for a line with `F` that holds in fewer samples. It is higher for a line with `G` that
-        comes closer to failing, relative to its variation.
+        A line with `F` has more information if it holds in fewer samples. A line with `G` has more
+        information if it comes closer to failing, relative to its variation.
         """
         scored_runs = self.good[:_SCORED_RUNS]
         holding_shares = np.mean(
@@ -452,7 +452,10 @@ class FittedLimits:
         ]
 
     def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
-        """Return the first samples in which relations certainly hold, and may hold: (F, R) each."""
+        """Return the first samples in which relations certainly hold, and in which they may hold.
+
+        Both arrays are (F, R) for F relations and R runs.
+        """
         first_times = [
             [
                 [run.first_time(fact.quantity, fact.direction, fact.limit, surely=surely) for run in runs]
@@ -521,7 +524,7 @@ def _leave_out(is_valid: Booleans, quantities: Sequence[Quantity], lowest: Float
 
 
 def _short(limit: float, margin: float, lowest: float) -> float:
-    """Return a limit rounded down to two digits of its margin, at most the lowest value."""
+    """Return a limit rounded down to the second digit of its margin; at most the lowest value."""
     if margin <= 0.0:
         return limit
     exponent = floor(log10(margin)) - 1

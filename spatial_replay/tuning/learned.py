@@ -38,18 +38,24 @@ from spatial_replay.tuning.tuned import require_comparable
 # -------------------------------------------------------------------------------------------------- selection
 
 _LEAST_BITS: Final = 0.25
+"""Least information of a line, bits."""
 _LEAST_BITS_NEAR: Final = 1.5
-"""Least information of a line, bits: in general, and for lines such as "always near" or "always inside"."""
+"""Least information of a line such as "always near" or "always inside", bits."""
 _ALIKE: Final = 1.25
+"""Greatest ratio between similar limits of a class's members, in lines about the end."""
 _ALIKE_ALWAYS: Final = 2.0
-"""Greatest ratio of similar limits of a class's members: in lines about the end, and in lines with `G`."""
+"""Greatest ratio between similar limits of a class's members, in lines with `G`."""
 _NEXT_LINE: Final = 0.6
 """Factor of the weight of a line for each earlier line with the same object."""
 _LEAST_GAIN: Final = 0.25
+"""Least total weight of the bad runs that a further line distinguishes."""
 _LESS: Final = 0.5
-"""Least number of bad runs that a further line distinguishes; loss of weight of a distinguished run."""
+"""Fraction of its weight that a bad run loses for each line that distinguishes the run."""
 _NEVER: Final = 0.3
-"""Weight of a bad run in an order whose first event never happens; a line about the end says more."""
+"""Weight of a bad run in a line about an order, if the first event never happens in the run.
+
+A line about the end says more about such a run.
+"""
 _DISTANCES: Final = 2
 """Maximum number of distances from landmarks for one object; two leave two possible places in the plane."""
 _LEAST_BITS_PLACED: Final = 2.0
@@ -57,8 +63,9 @@ _LEAST_BITS_PLACED: Final = 2.0
 _SHARE_OF_ALWAYS: Final = 1 / 3
 """Greatest share of lines with `G`, and of lines about orders, if there are no bad runs."""
 _PLAIN_BEFORE: Final = 0.8
+"""Weight of a distinguished bad run in lines with the pattern "before"; see `_plainness`."""
 _PLAIN_UNTIL: Final = 0.6
-"""Weight of a distinguished bad run in lines about orders; see `_plainness`."""
+"""Weight of a distinguished bad run in lines with the pattern "until"; see `_plainness`."""
 _DIRECTIONS: Final = frozenset({"leftof", "below", "prec"})
 
 
@@ -242,7 +249,9 @@ def _centre(fit: FittedLimits) -> Party | None:
 def _places(
     fit: FittedLimits, quantity: Quantity, distance_counts: Counter[Party], centre: Party | None
 ) -> bool:
-    """Return whether a landmark distance helps to define the place of a moved object; if so, count it.
+    """Return whether a landmark distance helps to define the place of a moved object.
+
+    If it does, the number of the object's distances in `distance_counts` grows by 1.
 
     An object needs at most `_DISTANCES` distances. The distance from the centre is always used.
     """
@@ -295,7 +304,8 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
     """Yield distances at the end as weight and index.
 
-    With landmarks, the weight is nearness; otherwise it says how well a distance defines a place.
+    With landmarks, the weight is nearness. Without landmarks, it measures how well a distance defines a
+    place.
     """
     for index, quantity in enumerate(fit.quantities):
         lower_limit, negated_upper_limit = fit.limits[FINALLY, :, index]
@@ -771,7 +781,7 @@ def _check_folds(
     bad: Sequence[LabelledRun],
     learn: Callable[[Sequence[LabelledRun]], _Written | None],
 ) -> Iterator[CheckedRun]:
-    """Yield each run with its verdict under the lines that are learned without its fold."""
+    """Yield each run with its verdict under the lines that are learned without the run's fold."""
     if len(good) < _FEWEST_SAMPLES:
         return
     fold_count = min(_FOLDS, max(len(good), len(bad)))

@@ -476,7 +476,7 @@ def _place(file: LogFile) -> str:
 
 
 class Robustness(NamedTuple):
-    """Ends of the interval of a specification's least robustness over one run."""
+    """Least lower end and least upper end of the robustness of some results over one run."""
 
     lower: float
     upper: float
@@ -489,8 +489,8 @@ class _Result(NamedTuple):
         order: leaves of the formula in the order of their numbers.
         formula: compiled formula.
         regions: regions of the specification.
-        same_measurements: whether the specification with the values in the text has all measurements of the
-            formula, in the same regions.
+        same_measurements: whether the formula has only measurements of the specification as written, and the
+            regions are unchanged.
     """
 
     order: Sequence[Atom | Quantified]

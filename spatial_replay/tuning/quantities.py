@@ -32,12 +32,15 @@ from spatial_replay.text import TEXTS, plural
 from spatial_replay.trace.trace import ABSENT, Trace
 
 MOST_OBJECTS: Final = 60
+"""Maximum number of compared objects."""
 MOST_PAIRS: Final = 400
+"""Maximum number of compared pairs of objects."""
 MOST_MEMBERS: Final = 30
-"""Limits of the comparison: objects, pairs of objects, members of a class."""
+"""Maximum number of members of a compared class."""
 MOST_MEASURED: Final = 1 << 26
 """Maximum number of measurements, pairs times samples; two pairs are always measured."""
 MOST_SIGNALS: Final = 50
+"""Maximum number of compared signals."""
 _SAMPLED: Final = 33
 """Number of samples of the first run that order the pairs; the nearest pairs are measured first."""
 
@@ -90,7 +93,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], lis
     """Return the quantities that all runs have, and phrases for the objects and signals that are left out.
 
     Objects are compared by name. A class is compared as a whole, too, as in `forall a, b in class "block"`.
-    This requires two objects of the class in every run, or different objects of the class in the runs.
+    A class needs two objects in every run, or an object of the first run that another run lacks.
 
     Args:
         profile: profile of the relations.
@@ -255,19 +258,19 @@ def _atom(relation: str, a: TrackedName | Variable, b: TrackedName | Variable, p
 # ---------------------------------------------------------------------------------------------------- one run
 
 _AT_ONCE: Final = 1 << 22
-"""Maximum count of a run's numbers in memory at once."""
+"""Maximum number of a run's values in memory at once."""
 _SAMPLED_OF_A_RUN: Final = 64
 """Samples of a run that estimate how often a relation holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Numbers of a run with lower and upper ends, which differ for unknown or uncertain positions.
+    """Measured quantities of a run. The lower and upper ends differ if positions are unknown or uncertain.
 
     Attributes:
         trace: samples of the run.
         least, greatest, first, last: (2, 2, Q) for Q quantities. The first axis is the direction: the
-            quantity or its negative. The second axis is the end.
+            quantity or its negative. The second axis has the lower and the upper end.
         sampled: (2, Q, S), lower ends in S samples, by direction.
         travel: (Q,), difference between the greatest and the least value of each quantity.
         shifts: displacement of each object from the first to the last sample; infinite if the
@@ -316,7 +319,9 @@ class Observed:
         return cls(trace, least, greatest, first, last, sampled, travel, shifts)
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
-        """Return the first sample in which a quantity, or its negative, reaches a limit; T if it never does.
+        """Return the first sample in which a quantity, or its negative, reaches a limit.
+
+        The result is the number of samples if the limit is never reached.
 
         Args:
             direction: 0 for the quantity, 1 for its negative.

@@ -62,7 +62,12 @@ def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
 
 
 def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
-    """Return the last number that holds, by bisection between `inside` (holds) and `outside` (fails)."""
+    """Return the last number at which a condition holds, by bisection.
+
+    Args:
+        inside: number at which the condition holds.
+        outside: number at which the condition fails.
+    """
     while abs(outside - inside) > 1:
         middle = (inside + outside) // 2
         if holds(middle):
@@ -122,7 +127,8 @@ class Feasibility(NamedTuple):
 
     Attributes:
         looseness: looseness of each constant at a common point; None if no point was found.
-        is_proven: without a point, whether none exists; with the widest margin, whether no margin is wider.
+        is_proven: without a point, whether it is proven that none exists. In a result of `widest` with a
+            point, whether it is proven that no margin is wider.
     """
 
     looseness: tuple[int, ...] | None
@@ -241,7 +247,10 @@ class ExactSearch:
     def _contract(
         self, runs: Sequence[int], corner: list[int], opposite: Sequence[int], level: float
     ) -> None:
-        """Move a corner of a box past numbers that fail even with the opposite corner's other numbers."""
+        """Move a corner of a box inwards, axis by axis.
+
+        A number on an axis is skipped if a run fails at the opposite corner with this number.
+        """
         for axis in self._joint.axes:
             corner_number, opposite_number = corner[axis], opposite[axis]
             if corner_number == opposite_number or self._may_fit(
@@ -299,7 +308,7 @@ def _with(numbers: Sequence[int], axes: Sequence[int], number: int) -> list[int]
 
 
 _PARTS: Final = 1 << 20
-"""Steps in which all constants are tightened together."""
+"""Number of steps in which all constants are tightened together."""
 _ROUNDS: Final = 6
 """Maximum number of rounds of adding runs to the deciding runs."""
 _MOST_LINES, _SECANTS = 64, 24
@@ -316,7 +325,8 @@ class Found:
         point: last point of the search.
         is_held: whether every run has the right verdict at the point.
         conflict: runs for which no common point was found; empty if `is_held`.
-        is_proven: whether no point exists for the conflict; if `is_held`, whether no point is better.
+        is_proven: if `is_held`, whether it is proven that no point is better. Otherwise, whether it is proven
+            that the conflict has no common point.
         alone: runs of the conflict that have the right verdict at no point, even without other runs.
     """
 
@@ -430,7 +440,9 @@ class Search:
         return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
 
     def _crossing(self, first_looseness: int, last_looseness: int, at: Callable[[int], Point]) -> int:
-        """Return the least looseness at which good runs have the wider margin, else `last_looseness`.
+        """Return the least looseness at which good runs have at least the margin of bad runs.
+
+        Without such a looseness, the result is `last_looseness`.
 
         The interval is bisected. Runs that cannot have the least margin in the interval are dropped.
         """
@@ -507,7 +519,10 @@ class Search:
         return Found(self._centre(point), is_held=True, is_proven=False)
 
     def _worst(self, point: Point, known_runs: Sequence[int]) -> list[int]:
-        """Return the good and the bad run with the least margin, if it is below all known runs' margins."""
+        """Return the good run and the bad run with the least margin.
+
+        A run is left out if the margin of some known run is not wider.
+        """
         margin = self._margins.margin
         least_margin = min((margin(run, point) for run in known_runs), default=np.inf)
         worst_runs = [
@@ -522,7 +537,7 @@ class Search:
     def _optimise(self, runs: Sequence[int], start: Point) -> Point:
         """Return the best point for some runs, by a search of all grid lines or else by evolution.
 
-        A grid line follows an axis with a direction, on which secants find the best number.
+        A grid line follows one axis with a direction. Secants find the best number on a line.
         """
         directed_axes = [
             axis for axis, direction in enumerate(self._margins.directions) if direction is not None
@@ -551,9 +566,9 @@ class Search:
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
         """Return the best point on a line along an axis, with its margin.
 
-        Towards looser values, margins of good runs rise and margins of bad runs fall. The least
-        margins of both are equal at the best point. Margins are often linear in a threshold, so few secants
-        find the point.
+        Towards looser values, margins of good runs rise and margins of bad runs fall. At the
+        best point, the least margin of good runs equals the least margin of bad runs. Margins are often
+        linear in a threshold, so few secants find the point.
         """
         if axis is None:
             return self._sides(runs, point)[0], point
@@ -682,8 +697,9 @@ class Search:
 
 
 MOST_RUNS: Final = 10_000
+"""Maximum number of runs."""
 MOST_SAMPLES: Final = 1 << 25
-"""Limits of memory: runs, and samples of all runs."""
+"""Maximum number of samples of all runs, which are in memory."""
 MOST_CONSTANTS: Final = 10
 _MOST_NAMED: Final = 5
 """Maximum number of conflicting runs in one sentence."""
