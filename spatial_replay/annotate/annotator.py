@@ -60,7 +60,7 @@ from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_RECENT: Final = 20
-"""Limit of events in a message on recent events."""
+"""Limit of events in the message that lists recent events."""
 
 
 class _Result:
@@ -262,7 +262,7 @@ class Annotator:
         return self._events([encoded_occurrence(time_ns, what, sentence)])
 
     def pass_over(self, trace: Trace, blocks: Sequence[SeriesBlock], most_changes: int = 0) -> list[Messages]:
-        """Add the next samples, and return only their events and the standing at its last changes.
+        """Add the next samples, and return only the events and the last changes of the standing.
 
         Args:
             most_changes: limit of changes with a message; see `StandingEncoder.encode_changes`.

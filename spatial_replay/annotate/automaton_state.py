@@ -38,7 +38,7 @@ from spatial_replay.spec.walks import nodes_of, rates_of
 from spatial_replay.text import listing
 
 _NOW = 1
-"""Index of `now` among the numbers of a node."""
+"""Index of `now` in a node's numbers: value, now, lower, upper."""
 
 _MOST_TEMPLATES = 512
 """Limit of cached steps; a step has a message and words for up to `MAX_STATES` states."""
@@ -56,7 +56,7 @@ class AutomatonRun:
     The messages do not depend on the cut of samples into blocks.
 
     Attributes:
-        propositions: id of each proposition's node or, for a proposition that tests a rate, of the rate's
+        propositions: node id of each proposition. A proposition that tests a rate has the id of the rate's
             atom.
     """
 
@@ -268,7 +268,7 @@ def states_of_result(
 
 
 def _node_of(proposition: Formula, formula: Formula, node_ids: Mapping[int, int]) -> int:
-    """Return the id of a proposition's node or, for a proposition that tests a rate, of the rate's atom."""
+    """Return the node id of a proposition, or the id of the rate's atom if the proposition tests a rate."""
     if id(proposition) in node_ids:
         return node_ids[id(proposition)]
     if isinstance(proposition, Boolean):
@@ -298,7 +298,7 @@ def _members(states: NDArray[np.bool_] | Integers) -> Integers:
 def _alike(
     states_before: NDArray[np.bool_] | Integers, states_after: NDArray[np.bool_] | Integers
 ) -> Iterator[Integers]:
-    """Yield the samples of each distinct pair of states before and after."""
+    """Group the samples by their states before and after; yield the indices of each group."""
     if states_before.ndim == 1:
         return equal_places(combined_code([states_before, states_after], len(states_before)))
     # each row becomes one opaque value, so that np.unique compares values instead of columns

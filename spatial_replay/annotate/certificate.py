@@ -113,7 +113,7 @@ class SampleHash:
 class MessageHash:
     """SHA-256 of messages: the times and bytes of each topic's messages, in order.
 
-    The order of messages of different topics does not count. Several threads send messages to a
+    The order between topics does not change the hash. Several threads send messages to a
     recorder, which may write later messages of one topic before earlier messages of another topic.
     """
 
@@ -175,7 +175,7 @@ class EvaluationHashes:
         self._results = [(_text(name) + _text(object), hashlib.sha256()) for name, object in names]
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
-        """Add the next samples and the log's own messages. Their results may be added in other blocks."""
+        """Add the next samples and the log's own messages. The samples' results may have other blocks."""
         self._samples.add(trace)
         self._messages.add(own)
 

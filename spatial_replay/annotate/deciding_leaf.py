@@ -79,7 +79,7 @@ class DecidingLeaf(NamedTuple):
         node: id of the leaf in the formula's tree; -1 if only the leaf's number was compared.
         bound: deciding end of the leaf's interval with uncertainty.
         missed: the failed implication that causes the violation, or None.
-        response: for a leaf of the condition, the leaf closest to fulfilling the response, or None.
+        response: for a missed response, the leaf that came closest to fulfilling the response, or None.
     """
 
     leaf: int
@@ -148,7 +148,7 @@ def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
 
 
 _RECENT: Final = 1024
-"""Length of the search before a change for a quantifier's deciding objects, samples."""
+"""Largest distance from a change to the sample with a quantifier's deciding objects, samples."""
 
 
 class NewestSamples:
@@ -175,7 +175,7 @@ class NewestSamples:
         """Return the deciding atom of a quantifier, with the deciding objects and the atom's own number.
 
         Return None if the sample is not recent, the quantifier needs earlier samples, or no atom has the
-        number.
+        quantifier's number.
 
         Args:
             leaf: the quantifier, with the object in place of a template's parameter.
@@ -375,7 +375,7 @@ class LeafPairs(NamedTuple):
         pairs: pair of each leaf; None for a leaf without two terms in one sample.
         below: leaves below each requirement of the formula.
         regions: shapes by name.
-        divisors: divisor of each leaf's number by `scale`; 1 without `scale`.
+        divisors: number by which `scale` divides each leaf's robustness; 1 without `scale`.
         texts: text of each leaf in the language.
         relations: names of relations that texts may use.
     """

@@ -41,13 +41,15 @@ LASTING: Final = 3
 """Debounce of a change of sign, samples in a row."""
 
 START, HOLDING, FAILING, UNKNOWN, SATISFIED, VIOLATED = 0, 1, 2, 3, 4, 5
-"""States of a node.
+"""States of a node, in the order of the names.
 
-Nothing known yet; pending with a value of at least 0; pending with a value below 0; unknown again; and the
-final states."""
+Nothing is known yet; pending with a value of at least 0; pending with a value below 0; unknown after a known
+state; permanently satisfied; permanently violated."""
 
 OF_CURRENT, OF_CANDIDATE = -1, -2
-"""Places of a worst sample before the block, for the current state and for the candidate."""
+"""Values of `Period.place` if the worst sample is in an earlier block.
+
+`OF_CURRENT` is for the node's current state, `OF_CANDIDATE` for the candidate for its next state."""
 
 _CODE, _SINCE, _UNTIL, _NEXT, _COUNT, _NEXT_SINCE = range(6)
 
@@ -59,7 +61,8 @@ class Period(NamedTuple):
         code: the state.
         start_ns, end_ns: times of the first and the last sample.
         worst: least value in the period; for a final verdict, the deciding end of the interval.
-        place: first sample of the block with `worst`, or `OF_CURRENT`, `OF_CANDIDATE`.
+        place: index in the block of the first sample with `worst`; `OF_CURRENT` or `OF_CANDIDATE` if this
+            sample is in an earlier block.
     """
 
     code: int
@@ -124,8 +127,8 @@ class TrackedChanges(NamedTuple):
 
     Attributes:
         changes: changes by node, then by time.
-        places: (K, 2) int64, source of each number of `states.worst`: a sample of the block, or `OF_CURRENT`,
-            `OF_CANDIDATE`.
+        places: (K, 2) int64, index in the block of the sample with each number of `states.worst`, or
+            `OF_CURRENT`, `OF_CANDIDATE`.
     """
 
     states: NodeStates
@@ -336,7 +339,7 @@ class EncodedEvent(NamedTuple):
 
     @property
     def facts(self) -> EventFacts:
-        """The facts of the event that a list of events needs."""
+        """The event's facts for a list of events."""
         event = Event.FromString(self.event)
         facts = EventFacts(start_time=event.start_time, end_time=event.end_time)
         for entry in event.metadata:
@@ -346,7 +349,7 @@ class EncodedEvent(NamedTuple):
 
 
 _LISTED: Final = frozenset({"specification", "object", "node", "verdict", "sign", "witness_node", "vacuous"})
-"""Keys of the facts that a list of events needs."""
+"""Keys of an event's facts for a list of events."""
 
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
@@ -600,9 +603,9 @@ class EventReporter:
     def _settling_words(
         self, settling_leaf: DecidingLeaf | None, verdict: Verdict, since_ns: int, now_ns: int
     ) -> tuple[str, str]:
-        """Return the deciding leaf in words, and a longer text with its condition and its time.
+        """Return the deciding leaf in words, and a longer text with a missed response and the leaf's time.
 
-        Both texts are "" for None.
+        Both texts are "" if `settling_leaf` is None.
         """
         if settling_leaf is None:
             return "", ""
@@ -663,7 +666,7 @@ class EventReporter:
 def _reported_nodes(
     tree: ReportedTree, leaves_by_node: Sequence[LeavesBelow], file: Specification, units: Mapping[str, str]
 ) -> list[ReportedNode]:
-    """Return the root, and the first node of each named spec that later samples can change.
+    """Return the root, and the first node of each named spec that depends on later samples.
 
     Args:
         leaves_by_node: leaves below each node of the tree.

@@ -43,15 +43,19 @@ from spatial_replay.text import Instant, clock_text, cut, number_text, time_text
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
+"""Limit of curves in a plot; viewers cannot distinguish more."""
+
 _MOST_STRIPS: Final = 8
-"""Limits of curves in a plot and of strips of named specs. Viewers cannot distinguish more."""
+"""Limit of strips of named specs; viewers cannot distinguish more."""
 
 _MOST_PLOTS: Final = 3
+"""Limit of plots; each unit has its own plot."""
+
 _MOST_INDICATORS: Final = 6
-"""Limits of plots, one for each unit, and of lights in their row."""
+"""Limit of lights in the row of lights."""
 
 _LEGEND_PIXELS: Final = 240
-"""Width of a legend with the values at the cursor, pixels. It is next to the curves and hides none."""
+"""Width of a legend with the values at the cursor, pixels. The legend covers no curve."""
 
 _LONGEST_LABEL: Final = 24
 """Limit of a label that fits into a legend, characters."""

@@ -3,8 +3,8 @@
 A formula without temporal operators concerns only the present sample. The *requirements* of a specification
 are its largest subformulas without temporal operators. Each requirement has a sign: the sign in which the
 specification needs the requirement's robustness. Under a negation, or left of an implication, the
-specification needs low robustness. A requirement counts until its *obligation*, the largest temporal
-subformula around it, is permanently fulfilled.
+specification needs low robustness. A requirement applies until its *obligation* is permanently fulfilled. The
+obligation is the largest temporal subformula around the requirement.
 
 A requirement that fails now is violated only if two formulas around the requirement are permanently violated:
 its obligation, and the conjunct of the specification. A goal that is not reached yet is pending.
@@ -72,7 +72,7 @@ class Obligation(NamedTuple):
 class Standing(IntEnum):
     """The state of a requirement in a sample.
 
-    `FULFILLED`: the obligation is permanently met, so the requirement no longer counts. `HOLDING`: the
+    `FULFILLED`: the obligation is permanently met, so the requirement no longer applies. `HOLDING`: the
     requirement holds now. `VIOLATED`: the requirement fails now, and later samples cannot repair that.
     `PENDING`: the requirement fails now, and later samples can repair that. `UNKNOWN`: not observed.
     """

@@ -149,7 +149,7 @@ def _curves(unit: str, rows: Sequence[BlueprintRow]) -> Any:
 
 
 def _lane(row: BlueprintRow) -> Any:
-    """Return a lane. Rerun names lanes after their topic, so the words of states have the result's name."""
+    """Return a result's lane. Rerun names lanes after topics, so the label of each state names the result."""
     import rerun
 
     names, words, colours = zip(*state_words(), strict=True)

@@ -25,10 +25,10 @@ from spatial_replay.text import shortened_formula
 LOST: Final = "lost"
 """Name of the stage in which acceptance is lost."""
 UNKNOWN: Final = "unknown"
-"""Name of the stage after samples for which several stages are possible."""
+"""Name of the stage if several stages are possible after a sample."""
 
 _MOST_WAYS: Final = 1_000_000
-"""Size limit of an automaton with stages, pairs of a decision and a following state."""
+"""Limit of pairs of a decision and a following state in an automaton with stages."""
 
 _MOST_HELD: Final = 1024
 """Limit of cached sets of states with their stages."""
@@ -233,7 +233,7 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
         return tables[entry] if entry >= 0 else {~entry: ()} if ~entry in live_states else {}
 
     def requires(entry: int) -> frozenset[int] | None:
-        """Return the propositions without which a move loses acceptance; None if every move loses it."""
+        """Return the propositions without which a move loses acceptance; None if all moves lose it."""
         return required_sets[entry] if entry >= 0 else frozenset() if ~entry in live_states else None
 
     entry_count = 0
@@ -269,7 +269,7 @@ def _cheapest_moves(automaton: Automaton) -> list[dict[int, tuple[int, ...]]]:
 def _ways(
     automaton: Automaton, moves: Sequence[Mapping[int, Sequence[int]]]
 ) -> tuple[dict[int, int], dict[int, tuple[int, ...]]]:
-    """Return the number of owed propositions of each state that can accept, and these propositions in order.
+    """For each state that can accept, return the number of owed propositions, and the propositions in order.
 
     Dijkstra's algorithm runs backwards from the accepting states.
     """

@@ -91,7 +91,7 @@ class FinalStanding(NamedTuple):
     Attributes:
         standing: number of `Standing`: satisfied, violated or unknown.
         by: magnitude of the interval's deciding end; NaN if unknown.
-        at: time at which the interval's upper end was least.
+        at: time at which the upper end of the robustness interval reached its minimum.
         unit: unit of the robustness.
     """
 
@@ -203,7 +203,7 @@ class StandingEncoder:
         return self._messages(shown_ns, series, automaton_words, np.array([since_ns, least_ns]), over)
 
     def _numbers(self, tree_index: int, block: SeriesBlock, sample_counts: Integers) -> Floats:
-        """Return (N, 4, S), the numbers of a result after some counts of samples (S,) in a block.
+        """Return (N, 4, S), a result's numbers after the first `sample_counts` (S,) samples of a block.
 
         A count of 0 gives the numbers of the last sample before the block.
         """
@@ -229,7 +229,7 @@ class StandingEncoder:
                 self._automaton_words[tree_index] = run.latest_words
 
     def _violated_since(self, tree_index: int, block: SeriesBlock) -> Integers:
-        """Return (T,), the start of the violation at each sample of a block; `LATEST_NS` without one."""
+        """Return (T,), the start of the violation at each sample of a block; `LATEST_NS` if not violated."""
         is_violated = block.series[0, 3] < 0.0
         is_begin = is_violated & ~np.append(self._violated_since_ns[tree_index] < LATEST_NS, is_violated)[:-1]
         last_begins = np.maximum.accumulate(np.where(is_begin, np.arange(len(is_begin)), -1))
@@ -237,7 +237,7 @@ class StandingEncoder:
         return np.where(is_violated, since_ns, LATEST_NS)
 
     def _became_least(self, tree_index: int, block: SeriesBlock) -> Integers:
-        """Return (T,), the time of the least upper end of a result so far, at each sample of a block."""
+        """Return (T,), at each sample of a block, the time at which a result's upper end was least so far."""
         upper = np.append(self._least_ends[tree_index], block.series[0, 3])
         is_less = upper[1:] < np.fmin.accumulate(upper)[:-1]
         return np.maximum.accumulate(np.where(is_less, block.times_ns, self._least_ns[tree_index]))
@@ -279,7 +279,7 @@ class StandingEncoder:
     def _descriptions(
         self, tree_index: int, block: SeriesBlock, sample_counts: Integers
     ) -> tuple[list[str], Integers]:
-        """Return the states of an automaton in words, and (S,) the index of words by count of samples."""
+        """Return an automaton's states in words, and (S,), the index of the words after `sample_counts`."""
         run = self._runs[tree_index]
         if run is None or not len(block.times_ns):
             return [self._automaton_words[tree_index]], np.zeros(len(sample_counts), np.int64)

@@ -28,7 +28,7 @@ from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, nodes_of
 from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
-"""Limit of bindings with numbers of their own. Above it, all members get the worst member's number."""
+"""Limit of a quantifier's bindings; above the limit, all bound objects have the worst number."""
 
 _NO_NUMBERS: Final[Mapping[str, Floats]] = MappingProxyType({})
 
@@ -39,7 +39,7 @@ class Shade:
 
     Attributes:
         requirement: the part.
-        bound: numbers (T,) in a block, by object that the part's quantifier binds; NaN where the part holds.
+        bound: numbers (T,) of each object that the part's quantifier binds; NaN where the part holds.
         least: least number of the part so far.
         is_known: whether the part was known in all samples.
         least_bound: least number of each bound object so far.
@@ -195,7 +195,7 @@ class EvaluatedResult(NamedTuple):
         block: numbers of nodes and leaves.
         leaf_pairs: pairs that an arrow can point at; None for a result without arrows.
         since_ns: (R,), start of each conjunct's certain violation, by requirement (see `violated_since`);
-            None for equal times.
+            None if all conjuncts have the same start.
         settled: the formula's violation, if it is certain before the end of the log; else None.
         is_final: whether the block is the last sample with intervals over the finished log.
         shades: parts of the requirements that colour objects; None if whole requirements colour objects.
@@ -239,8 +239,8 @@ class Violations(NamedTuple):
         robustness: (S,), robustness of the requirement or of the settling atom, at most 0, in the unit of the
             log: a division by `scale` is undone.
         holds: (S,), whether the atom holds but must not.
-        moment_ns: (S,) int64, time of the sample of `robustness`, if an earlier sample settled the violation;
-            -1 for this sample.
+        moment_ns: (S,) int64, time of the earlier sample that has this robustness; -1 if the sample itself
+            has this robustness.
         atom: (S,) int64, index in `atoms` of the atom that decides a quantifier; else -1.
         atoms: atoms of quantifiers with their bound objects.
     """
@@ -288,8 +288,8 @@ def worst_robustness(
 ) -> tuple[Floats, Floats]:
     """Return the least robustness of the requirements on each object and region, times their signs.
 
-    From a conjunction or quantifier, only the part about the object itself counts. The numbers are outcomes
-    of obligations for a finished log, and present numbers otherwise.
+    For a conjunction or quantifier, only the part about the object itself is used. For a finished log, the
+    robustness is the outcome of the obligation. Otherwise, it is the robustness in the sample.
 
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
@@ -332,9 +332,9 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 
     The arrow is at the requirement's deciding atom. It joins the two points that attain the terms' signed
     distance, or shows the protrusion of an enclosure. In the sample that settled the formula's
-    violation, the arrow is at the settling atom. A requirement with a deadline or in response to a condition
-    keeps the arrow, its ends and its number after that sample. Conditions of implications have no arrow,
-    because the missing response is the fault.
+    violation, the arrow is at the settling atom. If the requirement has a deadline or is a response, this
+    arrow stays in all later samples. Conditions of implications have no arrow, because the missing response
+    is the fault.
 
     Args:
         samples: (S,) int64, indices of samples.
@@ -390,7 +390,7 @@ def _shows_settling_leaf(result: EvaluatedResult, times_ns: Integers) -> NDArray
 
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
-    """Return the requirement that contains a node; requirements are in the order of their ids."""
+    """Return the requirement that contains a node; the requirements are sorted by node id."""
     candidates = [requirement for requirement in result.requirements if requirement.node <= node]
     return candidates[-1] if candidates else None
 
@@ -504,7 +504,7 @@ def _deciding(
 def _locate(
     result: EvaluatedResult, trace: Trace, samples: Integers, positions: Integers, violations: Violations
 ) -> None:
-    """Set the ends of arrows and the atoms of quantifiers at `positions` (H,), whose leaves are set."""
+    """Set the ends of arrows and the atoms of quantifiers at `positions` (H,); the leaves are set before."""
     if result.leaf_pairs is None:
         return
     is_past = violations.moment_ns[positions] >= 0

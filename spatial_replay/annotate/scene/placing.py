@@ -19,14 +19,18 @@ _SIDES.flags.writeable = False
 """The eight positions around a box in the order of preference: above, below, right, left, corners."""
 
 _NAME_PLACES: Final = len(_SIDES)
+"""Number of candidate positions for a name."""
+
 _LABEL_PLACES: Final = 2 * len(_SIDES) + 2 * len(_FAR) + 2 * (len(_FAR) + 1)
-"""Numbers of candidate positions for a name and for a label."""
+"""Number of candidate positions for a label."""
 
 _NOWHERE: Final = 4
 """Rank of a position on a blocked box. Rank 2 is outside the view, 1 is on another object, 0 is free."""
 
 _FEW: Final = 0.7
-"""Fraction of scenes without a free position. Below this fraction, only these scenes are copied."""
+"""Fraction of the open scenes.
+
+If fewer scenes still lack a free position, a copy of these scenes replaces the open scenes."""
 
 Box = tuple[Floats, Floats]
 """Low and high corners (..., 2, K) of boxes in K scenes; NaN for no box."""
@@ -227,7 +231,7 @@ def _overlaps(lows: Floats, highs: Floats, boxes: Box) -> Booleans:
 
 
 def _candidate(candidate_index: int, text: _Text) -> tuple[Floats, Booleans]:
-    """Return a candidate position (2, K) for each text by its number, and (K,) whether it is possible."""
+    """Return the candidate positions (2, K) with an index, and (K,), whether each position is possible."""
     half, nearest, arrow, around = text
     gap, view_centre = _GAP * around.line, (around.scene[0][0] + around.scene[1][0]) / 2.0
     reach = np.maximum(around.margin - half[0], 0.0)

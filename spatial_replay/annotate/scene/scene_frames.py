@@ -90,7 +90,7 @@ class ArrowTexts(NamedTuple):
     Attributes:
         causes: distinct causes of violations, in words.
         cause: (S,), index of each arrow's cause.
-        numbers: number of each arrow with its unit; empty for messages without an arrow.
+        numbers: robustness at each arrow with its unit, as text; empty for messages without an arrow.
     """
 
     causes: tuple[CauseText, ...]
@@ -105,7 +105,7 @@ class ArrowTexts(NamedTuple):
 def arrow_texts(
     results: Sequence[EvaluatedResult], found: Violations, first_ns: int, unit: str
 ) -> ArrowTexts:
-    """Return the causes of violations in words, and their numbers.
+    """Return the causes of violations in words, with the robustness at each arrow.
 
     Args:
         first_ns: zero of times in texts.
@@ -209,7 +209,7 @@ SHADES: Final = _shades()
 SHADES.flags.writeable = False
 
 ABSENT, DELETED, FIRST_FORM = -1, 0, 1
-"""State of an object in a message: absent, deleted, or from `FIRST_FORM` on the number of its form."""
+"""Code of an object in a message: absent, deleted, or `FIRST_FORM` plus the index of its form."""
 
 
 class DrawnEntity(NamedTuple):
@@ -239,8 +239,8 @@ class DrawnViolation(NamedTuple):
         node: id of the violated requirement, or of the atom that settled the violation.
         robustness: robustness of the requirement or of the settling atom, times its sign.
         leaf: index of the deciding leaf in the result's program.
-        moment_ns: time of the sample of `robustness`, if an earlier sample settled the violation; None for
-            this sample.
+        moment_ns: time of the earlier sample that has this robustness; None if the message's own sample
+            has this robustness.
         holds: whether the atom holds but must not.
         atom: deciding atom of a quantifier with its objects; "" for other leaves.
         dashes: outlines at an earlier sample, see `CauseText`.
@@ -390,7 +390,7 @@ class SceneContent(NamedTuple):
     Attributes:
         names: objects in these messages, in the previous message, or with a last outline.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
-        forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
+        forms: (S, names), `ABSENT`, `DELETED`, or `FIRST_FORM` plus the index of the object's form.
         styles: (S, names), -1 where an object is absent. Bit 0: has a label. Bit 1: has violated a result.
             Higher bits: level.
         missing: (S, names), index in `last` of a missing object's outline; else -1.
@@ -399,9 +399,9 @@ class SceneContent(NamedTuple):
         middles: (R, 2), centres of names.
         violations: violations in the S samples.
         label: (S, 2), centre of the arrow's label.
-        arrow: (S,), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the index in `causes` of the arrow.
+        arrow: (S,), `ABSENT`, `DELETED`, or `FIRST_FORM` plus the index of the arrow's cause in `causes`.
         causes: distinct causes of violations, in words.
-        numbers: number of each arrow with its unit.
+        numbers: robustness at each arrow with its unit, as text.
         spots: (S, 2, 2), centres of the names at an arrow.
     """
 

@@ -337,8 +337,10 @@ def lying_at(z: float) -> Pose:
 
 
 OBJECT_OPACITY: Final = 0.55
+"""Opacity of an object's faces, greater than the opacity of the region around it."""
+
 REGION_OPACITY: Final = 0.3
-"""Opacity of faces: objects are more opaque than the regions around them."""
+"""Opacity of a region's faces."""
 
 OBJECT: Final = "object/"
 REGION: Final = "region/"

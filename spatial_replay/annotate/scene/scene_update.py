@@ -94,7 +94,7 @@ class SceneNumbers:
             self._object_columns.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
 
     def of_messages(self, layout: SceneLayout, samples: Integers) -> Words:
-        """Return (K, N), the numbers that fill a layout's template in K messages, each number once."""
+        """Return (K, N), a template's numbers in K messages, in the order of `make_template`."""
         columns = [self._stamps[samples], self._region_colours[samples]]
         content, object_count = self._content, len(layout.objects)
         if object_count:
@@ -184,7 +184,13 @@ def scene_start(trace: Trace, regions: Mapping[str, Outline], zero_ns: int) -> S
 
 
 class SceneMessages(NamedTuple):
-    """Encoded messages with their times (S,) int64, the state after them, and their content or None."""
+    """Encoded messages.
+
+    Attributes:
+        times_ns: (S,) int64, times of the messages.
+        state: state after the messages.
+        frames: content of the messages; None if there is no message.
+    """
 
     times_ns: Integers
     payloads: Sequence[bytes]
@@ -518,10 +524,9 @@ def _content(
 
 
 _ARROW_BOX, _THEN_BOX, _BLOCKED = 2, 3, 6
-"""Indices of the boxes of the arrow and of earlier outlines among the blocked boxes, and number
-of blocked boxes.
+"""Index of the arrow's box, index of the box around earlier outlines, and number of blocked boxes.
 
-The boxes of the objects come first, and the boxes of names last."""
+Two boxes of objects come before the arrow's box. Two boxes of names come last."""
 
 
 class _DecidingBoxes(NamedTuple):
@@ -661,7 +666,7 @@ def _name_places(low: Floats, high: Floats, name_lengths: Integers, line_heights
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:
-    """Return the level of each size: half the size has the next level. An unknown size has level 0."""
+    """Return the level of each size. Half the size gives a level higher by 1; an unknown size gives 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         levels = np.round(LEVELS / 2.0 - np.log2(sizes / scale))
     # fmax takes the 0 where the level is NaN
