@@ -34,7 +34,7 @@ _LOOSE: Final = 0.02
 """Largest relative standard deviation of the focal length; above it, the views are too similar."""
 
 _WRONG: Final = 8.0
-"""Largest root mean square error of corners, pixels. A larger error means that the sheet is another one.
+"""Largest root mean square error of corners, pixels. A larger error means that the frames show another sheet.
 
 The error of a bent sheet is far smaller.
 """
@@ -175,8 +175,10 @@ PAPERS: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
 
 MOST_TAGS: Final = 1000
 _MARGIN: Final = 12.0
+"""Free margin around a page, millimetres."""
+
 _FOOT: Final = 14.0
-"""Free margin around a page, and free height above its lower margin for the ruler, millimetres."""
+"""Height above the lower margin that is free for the ruler, millimetres."""
 
 _CAPTION: Final = 5.0
 _RULER: Final = 100.0

@@ -120,7 +120,7 @@ class ImageTopic:
         self.faults += self._reader.take_faults()
 
     def _frames(self) -> Iterator[tuple[int, Frame | LogError, bool]]:
-        """Yield the log time of each message, its frame or fault, and whether the frame is true."""
+        """Yield each message's log time, its frame or fault, and whether the frame is true (see `video`)."""
         decoder = H264Decoder() if self._is_video else None
         detections_field = _DETECTIONS.get(self._type)
         for message in self._reader.iter_messages({self.topic}):
@@ -244,7 +244,7 @@ def _h264(message: Any) -> bytes:
 
 
 def _frame(shown: Shown) -> tuple[int, Frame, bool]:
-    """Return the log time of a video message, its frame, and whether the frame is true."""
+    """Return a video message's log time, its frame, and whether the frame is true (see `video`)."""
     log_ns, time_ns, payload = shown.of
     return log_ns, Frame(time_ns, shown.image, payload), shown.is_true
 
@@ -342,7 +342,7 @@ def open_frames(
 
 
 class CameraFrames:
-    """Frames of a camera until it is unplugged, for one iteration. Times count from the first frame.
+    """Frames of a camera until it is unplugged, for one iteration. The first frame has the time 0.
 
     Attributes:
         name: name, such as "camera 0".

@@ -72,7 +72,7 @@ def poses_on_plane(
     Args:
         corners: (N, 4, 2), corners of one tag of each object, pixels.
         tags: the N tags.
-        sigmas: deviation of a tag's size in the image from which its pose has a doubt, standard deviations.
+        sigmas: largest deviation of a tag's size in the image without a doubt, standard deviations.
     """
     if not tags:
         return []
@@ -650,7 +650,7 @@ class TagObserver:
     Attributes:
         tags: the tags file.
         hold_ns: time that a hidden object is held.
-        frames: number of samples.
+        frames: number of samples so far.
     """
 
     def __init__(self, tags: TagsFile, *, hold_ns: int | None = None, cameras: Sequence[str] = ("",)) -> None:
@@ -689,8 +689,8 @@ class TagObserver:
     def observe(self, *frames: Frame | None) -> Observation:
         """Return the observation of the frames of one time.
 
-        The sample has the stamp of the first frame. Other frames may be earlier or later. An object that only
-        other frames show is less certain by its possible motion between the stamps.
+        The sample has the stamp of the first frame. Other frames may be earlier or later. If another
+        frame locates an object, the object's possible motion between the stamps adds to its uncertainty.
 
         Args:
             frames: one frame or None for each camera; at least one frame.

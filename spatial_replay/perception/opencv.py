@@ -1,8 +1,8 @@
 """Frames, detection of tags, camera poses and geometry; only this module imports OpenCV.
 
 Pixel coordinates are as in OpenCV: the centre of the first pixel of an image is (0, 0), y points down.
-Other AprilTag detectors count from that pixel's outer corner, so their coordinates are half a pixel larger.
-`corners_from_apriltag` converts their corners.
+In other AprilTag detectors, (0, 0) is the outer corner of that pixel, so coordinates are half a pixel larger.
+`corners_from_apriltag` converts the corners of other detectors.
 """
 
 from __future__ import annotations
@@ -183,8 +183,10 @@ _CELLS: Final = 0.6
 """Search range across an edge, cells of the tag; other edges are further away."""
 
 _WIDEST: Final = 3.0
+"""Largest search range across an edge, pixels."""
+
 _SECOND: Final = 0.5
-"""Largest search range, pixels, and fraction of the range in the second pass, which starts near the edge."""
+"""Fraction of the search range in the second pass, which starts near the edge."""
 
 
 def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:

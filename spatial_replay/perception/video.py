@@ -50,7 +50,7 @@ class Decoded(NamedTuple):
     """A decoded frame.
 
     Attributes:
-        of: object that was passed with its packet.
+        of: object that the caller passed with the frame's packet.
         frame: frame of PyAV.
         is_true: whether no frame on which this frame depends is missing or damaged.
     """
@@ -64,7 +64,7 @@ class Shown(NamedTuple):
     """A decoded image.
 
     Attributes:
-        of: object that was passed with its message.
+        of: object that the caller passed with the image's message.
         image: image of the frame; black if the frame is not true.
         is_true: whether no frame on which this frame depends is missing or damaged.
     """
@@ -331,7 +331,7 @@ _MOST_BOXES: Final = 1000
 
 
 class VideoFile:
-    """Frames of a video file, for one iteration. Stamps count from the first frame.
+    """Frames of a video file, for one iteration. The first frame has the stamp 0.
 
     Attributes:
         name: name of the file.
@@ -410,7 +410,7 @@ class VideoFile:
     def remark(self) -> str | None:
         """Remark that the given rate replaces the file's stamps, or None.
 
-        There is no remark without a rate, without stamps, and for stamps that go back.
+        The remark is None if no rate is given, if the file has no stamps, or if its stamps go back.
 
         The remark is final after all frames are read.
         """
