@@ -53,7 +53,10 @@ Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 
 
 class _Below(NamedTuple):
-    """Threshold of a robustness. A condition compares the upper end; a possible condition the lower end."""
+    """Threshold of a robustness interval.
+
+    The upper end must be below the threshold. With `is_possible`, the lower end is enough.
+    """
 
     threshold: float
     is_possible: bool
@@ -372,7 +375,7 @@ class ClipLog(RecorderLog):
 
         Args:
             sample_ns, message_ns: times of the newest queued sample and message, -1 for none. The clip is
-                around the later time or, without one, around the next sample or message.
+                around the later of both times. If both are -1, the next sample or message is taken.
         """
         self._manual_triggers.append(_ManualTrigger(reason, sample_ns, message_ns))
 
@@ -512,7 +515,7 @@ class ClipLog(RecorderLog):
             clip.put(entry)
 
     def _begin(self, reason: str, at_ns: int) -> None:
-        """Open a clip around a time, or extend the open clip if the ring has all entries between."""
+        """Open a clip around a time, or extend the open clip if the ring has all entries since its end."""
         if self._open is not None:
             until_ns = self._open.until_ns
             if self._evicted_ns > until_ns or (at_ns > until_ns and self._is_past(until_ns)):

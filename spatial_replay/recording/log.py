@@ -117,7 +117,7 @@ class Recording:
         Args:
             files: specifications to evaluate and to store in the log.
             about: further metadata, such as the origin of the samples, a seed, or the time zero of a clip.
-            known: automata of specs in these files that are compiled already.
+            known: compiled automata of specs in these files.
 
         Raises:
             UsageError: a specification has a template, whose objects are not yet known.
@@ -537,7 +537,8 @@ _WORDS: Final = {
 class VerdictChange(NamedTuple):
     """A change of a spec's verdict or, while the spec is pending, of its robustness' sign.
 
-    A changed verdict counts at once. A changed sign counts after three samples, as in the events of a log.
+    A changed verdict is reported at once. A changed sign is reported after three samples,
+    as in the events of a log.
 
     Attributes:
         time_ns: time of the sample that confirms the change.

@@ -53,7 +53,7 @@ class SampleWriter:
     """Samples and messages from the caller's threads that wait for the writing thread.
 
     Attributes:
-        dropped: number of samples that were dropped because the queue was full, or given to `miss`.
+        dropped: number of samples not recorded, because the queue was full or `miss` received them.
         doubts: assumptions that the source contradicts, which are written at the end of the log.
     """
 
@@ -65,9 +65,9 @@ class SampleWriter:
         Args:
             name: name of the log, for errors.
             waiting: maximum number of waiting samples, and maximum number of waiting messages.
-            block: whether `write` waits at that limit or at `most_lost_s`, instead of dropping and counting
-                new samples.
-            most_lost_s: maximum time of samples that a kill may lose, s.
+            block: whether `write` waits while the queue is full or `most_lost_s` is reached. Otherwise,
+                `write` drops and counts new samples.
+            most_lost_s: largest age of an unflushed sample, s; a kill loses unflushed samples.
         """
         self._log, self.name = log, name
         # a SimpleQueue is reentrant: an interruption never leaves it locked, unlike a Queue with a limit
@@ -297,7 +297,7 @@ class Recorder(SampleWriter):
     closing is delayed until the log is closed.
 
     With a trigger, samples wait in memory until the trigger fires. Each firing writes one log of the time
-    around it.
+    before and after the firing.
     With a planner, the log also has its decisions. Samples, decisions and outcomes then go through the
     recorder in their order, as in `plan(planner, robot, recorder)`.
 
@@ -472,7 +472,8 @@ class Recorder(SampleWriter):
             topic: name such as "/joint_states". Topics under /spatial and the topics of a planner are
                 reserved.
             schema: a JSON schema (dict or text), a protobuf class, or the encoding's kind of definition (text
-                or bytes). json, cbor and msgpack need none. Messages are not checked against it.
+                or bytes). The encodings json, cbor and msgpack need no schema. Messages are not checked
+                against the schema.
             encoding: "json", "protobuf", "ros1", "cdr", "cbor", "msgpack" or "flatbuffer". The default is
                 "protobuf" for a protobuf class, else "json".
             schema_name: type of the messages. The default is the name of a protobuf class, or the title of a
@@ -489,7 +490,8 @@ class Recorder(SampleWriter):
     def trigger(self, reason: str = "by hand") -> None:
         """Fire the trigger now, regardless of its condition; any thread or signal handler may call it.
 
-        The clip is around the newest sample or message at the call; before any, around the first to arrive.
+        The clip is around the newest sample or message at the call. If there is none yet, the clip is around
+        the first one that arrives.
 
         Raises:
             UsageError: the recorder has no trigger.
