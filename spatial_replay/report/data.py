@@ -62,7 +62,7 @@ _MOST_MARKED: Final = 200
 MOST_DRAWN: Final = 24
 """Limit of results with explanation, tree and curves; the worst results come first.
 
-All results have a verdict.
+The page shows the verdicts of all results.
 """
 
 
@@ -139,7 +139,7 @@ class RunReport:
     Attributes:
         axes: axes of the source; samples are always y-up.
         results: the results of `replayed`.
-        gaps: sentences about gaps of unknown results before or after a time.
+        gaps: sentences about gaps in the samples that make results unknown; a smaller window avoids each gap.
         redone: decisions of `plan --redo` that differ from the recorded decisions.
         pictures: pictures of the camera, see `pictures_of`.
         planned_for: specification file of the decisions, if the report evaluates another file; else "".
@@ -343,7 +343,7 @@ def _room(results: Sequence[ReportedResult], sample_count: int) -> int:
 
 
 def _places(report: RunReport) -> Mapping[tuple[int, int], tuple[int, int]]:
-    """Return the indices on the page of (result, node), for all drawn results and shown nodes."""
+    """Map (result, node) to their indices on the page, for all drawn results and shown nodes."""
     return {
         (result_number, node): (page_index, node_index)
         for page_index, result_number in enumerate(report.drawn_numbers)

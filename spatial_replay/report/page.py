@@ -280,7 +280,7 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
 
 
 def chip(verdict: str, *, is_sound: bool = True) -> Html:
-    """Return a verdict on its colour; a verdict that is not sound has a neutral colour."""
+    """Return a verdict on a background of its colour; an unsound verdict has a neutral background."""
     return element("span", verdict, **{"class": f"chip is-{verdict if is_sound else 'vacuous'}"})
 
 

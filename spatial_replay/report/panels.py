@@ -195,7 +195,10 @@ def shown_nodes(formula: Formula) -> tuple[int, ...]:
 
 
 def initial_nodes(formula: Formula) -> frozenset[int]:
-    """Return the ids of nodes without a temporal operator above, which count only at the first sample."""
+    """Return the ids of nodes without a temporal operator above.
+
+    Only the values of these nodes at the first sample affect the result.
+    """
     initial: set[int] = set()
     formulas: list[Formula] = []
     for identifier, parent, node in iter_nodes(formula):
@@ -296,8 +299,8 @@ class StatePath:
 
     Attributes:
         times_ns: times of the messages.
-        codes: the number in `sets` of each message's states.
-        sets: numbers by the set of states that the run may be in.
+        codes: code of the states in each message, see `sets`.
+        sets: code of each set of states that the run may be in.
     """
 
     def __init__(self) -> None:
@@ -675,7 +678,7 @@ def _entity_value(
 MOST_CELLS: Final = 1_500_000
 """Limit of cells in all maps of a page together; maps of chosen targets come first."""
 _MOST_LAYERED: Final = 50_000
-"""Limit of cells of a map with layers of limits and causes on the page."""
+"""Limit of cells of a map whose limiting conjuncts and blocking causes are on the page."""
 
 
 class ReportedDecisions:

@@ -191,7 +191,7 @@ def _results(
 
 
 def _gaps(replayed: Replayed) -> tuple[str, ...]:
-    """Return a sentence for each gap of an unknown result that a smaller window of the log avoids."""
+    """Return a sentence for each gap that makes a result unknown and that a smaller window avoids."""
     unknown = [result for result in replayed.results if result.verdict is Verdict.UNKNOWN]
     gaps = (gap for result in unknown for gap in result.gaps() if gap.window is not None)
     return tuple(dict.fromkeys(gap_sentence(gap, replayed.first_ns) for gap in gaps))
@@ -390,7 +390,7 @@ def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dic
 
 
 _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
-"""By title of a result: the result's index on the page, and the indices of the shown nodes by id."""
+"""Map from a result's title to its index on the page, and to the indices of its shown nodes by id."""
 
 
 def _places(report: RunReport) -> _Places:
