@@ -199,8 +199,9 @@ def _size(results: Sequence[NamedSpec]) -> int:
 
 
 _MOST_ROWS: Final = 40
+"""Limit of objects in a table."""
 _MOST_POINTS: Final = 2_000
-"""Limits of objects in a table, and of points in a trail."""
+"""Limit of points in a trail."""
 
 _MOST_LABELS: Final = 25
 _NAME_SIZE: Final = 8.0
@@ -434,7 +435,7 @@ def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
 
 
 def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
-    """Return the `most` worst results; if there are no more results, return all in their order."""
+    """Return the `most` worst results. At most `most` results are returned unchanged."""
     if len(results) <= most:
         return results
     return [results[place] for place in worst_first(results)[:most]]
@@ -593,8 +594,9 @@ def _title(result: SpecResult) -> str:
 
 
 _MOST_STATES: Final = 40
+"""Limit of states of an automaton that a cell's output draws."""
 _MOST_CUBES: Final = 100
-"""Limits of states and of cubes on arrows; a cell's output does not draw a larger automaton."""
+"""Limit of cubes in all guards of an automaton that a cell's output draws."""
 _MOST_LINES: Final = 200
 """Limit of lines in the list of transitions."""
 _ARROW: Final = hexadecimal(NEUTRAL)
