@@ -31,25 +31,29 @@ LARGEST_FRAME: Final = 64 * 2**20
 """Largest frame, bytes; a server that sends a larger frame is disconnected."""
 
 MOST_WAITING: Final = 8_192
+"""Limit of messages that wait for evaluation; the oldest messages are dropped first."""
+
 MOST_WAITING_BYTES: Final = 64 * 2**20
-"""Maximum number of messages, and of bytes, that wait for evaluation; the oldest are dropped first."""
+"""Limit of the messages that wait for evaluation, bytes; the oldest messages are dropped first."""
 
 MOST_WARNINGS: Final = 1_000
 """Maximum number of shown warnings of a server in one run."""
 
 _MOST_CHANNELS: Final = 100_000
 _MOST_DEFINITION_BYTES: Final = 64 * 2**20
-"""Maximum number of bytes of the definitions of all channels."""
+"""Limit of all channels' definitions together, bytes."""
 _FRAMES: Final = 4
 """Maximum number of frames of up to `LARGEST_FRAME` bytes that wait to be decoded."""
 _LONGEST_TURN_S: Final = 0.02
 _OPEN_S: Final = 10.0
+"""Timeout of a connection attempt, seconds."""
 _ALIVE_S: Final = 10.0
-"""Timeout of a connection attempt; interval and timeout of pings, seconds."""
+"""Interval of pings and timeout of each ping, seconds."""
 
 _FIRST_PAUSE_S: Final = 0.25
+"""Pause before the first reconnect, seconds; each later pause is twice as long as the previous pause."""
 _LONGEST_PAUSE_S: Final = 8.0
-"""First and longest pause before a reconnect, seconds; each pause is twice as long as the previous pause."""
+"""Longest pause before a reconnect, seconds."""
 
 
 class Received(NamedTuple):
@@ -78,7 +82,7 @@ Arrival: TypeAlias = Received | Connected | Offered | Disconnected | Warned
 
 
 class Inbox:
-    """Unread items in order of arrival; see `MOST_WAITING`.
+    """Unread items in order of arrival; `MOST_WAITING` limits the messages.
 
     Attributes:
         dropped: number of messages that were dropped for lack of room.

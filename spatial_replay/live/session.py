@@ -246,7 +246,7 @@ _USUAL: Final = 9
 """Number of latest intervals between messages of a topic, whose median is the topic's usual interval."""
 
 _GRACE_TURNS: Final = 5
-"""Maximum number of turns of the event loop in which arrived messages reach the inbox."""
+"""Maximum number of iterations of the event loop that a deadline waits for arrived messages."""
 
 _TURN_S: Final = 0.02
 """Time of evaluation between two polls of the inbox, seconds."""
@@ -334,7 +334,7 @@ class LiveSession:
         self.doubts: tuple[Doubt, ...] = ()
         """Assumptions that the run contradicts; known after `close`, or at the end of `updates`."""
         self.failure: LogError | None = None
-        """Error that ended the run: time jumped back. None for a run without a jump."""
+        """Error that ended the run because time jumped back; None for a run without a jump."""
 
     @property
     def status(self) -> SessionStatus:
@@ -611,7 +611,7 @@ class LiveSession:
         return trace
 
     def _lose(self, topics: Sequence[str], event_name: str) -> Trace | None:
-        """Make the objects of some topics unknown; report an event with the newest note."""
+        """Make the objects of some topics unknown; report an event whose sentence is the newest note."""
         if self._assembler is None:
             return None
         trace = self._assembler.lose(topics, time.monotonic())
@@ -622,7 +622,7 @@ class LiveSession:
         return trace
 
     def _silent_topics(self, now_s: float) -> list[str]:
-        """Return the topics that exceeded the timeout since the last call."""
+        """Return the topics that exceed the timeout and are not yet noted as silent."""
         if self._topic_timeout_s is None or self._assembler is None or not self._is_connected:
             return []
         watched_topics = [topic for topic in self._assembler.topics if topic not in self._silent_since_s]
@@ -717,7 +717,7 @@ class LiveSession:
             inbox.put(arrival._replace(arrived_s=now_s) if isinstance(arrival, Received) else arrival)
 
     def _sampled_by_default(self) -> str | None:
-        """Return the sampled topic; None if a bag of the same topics is sampled at this topic, too."""
+        """Return the topic at which samples are taken; None if a bag is surely sampled there, too."""
         if self._mapping is None or self._mapping.sampling != Sampling():
             return None
         entries = [entry for entry in self._mapping.topics if entry.topic in self._planned_channels]
@@ -760,9 +760,10 @@ class LiveSession:
             yield self._update(sample, arrived_s)
 
     def _relevant_samples(self, trace: Trace, remaining: Callable[[], list[Trace]] | None) -> Trace:
-        """Return the samples of the run.
+        """Return the samples that are ready for evaluation.
 
-        The run begins when all needed topics can be judged, and stops where the run may have ended.
+        The run begins once all needed topics can be judged. While a needed topic cannot be judged, samples
+        wait, because the run may have ended.
         """
         self._members.add(trace)
         run_ends = self._ends
