@@ -41,14 +41,14 @@ from spatial_replay.logs.topics import (
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
 
 MOST_LATE_S: Final = 0.15
-"""Longest playing time of one turn, seconds; viewers lose messages in larger bursts."""
+"""Longest playing time of one turn of the player's loop, s; viewers lose messages in larger bursts."""
 
 
 class Pace:
-    """The playing time of a log, counted turn by turn.
+    """The playing time of a log, measured in turns of the player's loop.
 
-    A turn counts for at most `MOST_LATE_S`. After a longer turn the playback lags behind the clock, so that
-    no turn sends more than viewers can read.
+    A turn adds at most `MOST_LATE_S`. After a longer turn the playback lags behind the clock, so that no turn
+    sends more than viewers can read.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -160,7 +160,9 @@ _Answer = TypeVar("_Answer")
 
 @dataclass
 class PendingRequests:
-    """Requests that the player has not performed yet. Except for topics, the last request of a kind counts.
+    """Requests that the player has not performed yet.
+
+    A new request replaces the earlier request of its kind. Only topics are collected.
 
     Attributes:
         edited: changed specifications or constants; None for no change.
@@ -198,7 +200,7 @@ class Questions:
         self._is_over = False
 
     def ask(self, work: Callable[[Evaluated], _Answer]) -> _Answer:
-        """Return `work` of the present evaluation, once earlier questions are answered.
+        """Return the result of `work` on the present evaluation, once earlier questions are answered.
 
         Raises:
             UsageError: too many questions are open, or the session is over.
@@ -246,8 +248,8 @@ def session_over() -> UsageError:
 PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
 """Parameters of the playback for viewers without controls.
 
-The time in seconds after the log's zero, whether the log plays, the seconds of the log per second, and
-whether the log starts again at its end."""
+Their values are the time in seconds after the log's zero, whether the log plays, the seconds of the log per
+second, and whether the log starts again at its end."""
 
 ARROW: Final = "scene.arrow"
 """Name of the parameter that chooses the arrow: a result's title, or "" for the first violated result."""
@@ -267,7 +269,7 @@ class Session:
     """Requests of viewers. Any thread adds requests, and the player's thread performs them.
 
     Only `wait_for_evaluation` waits for the player. If requests arrive faster than the player performs them,
-    the last request of a kind counts.
+    a request replaces an earlier request of its kind.
 
     Attributes:
         edited: the specifications with the constants as viewers set them.
@@ -458,7 +460,8 @@ class Session:
         """Wait for requests, and return the pending requests.
 
         Args:
-            patience_s: longest wait in seconds while the log plays or work is due; otherwise without limit.
+            patience_s: longest wait while the log plays or work is due, seconds. Otherwise the wait has no
+                limit.
             is_due: whether the player has work that needs no request.
         """
         with self._condition:
@@ -494,7 +497,7 @@ class Session:
     def continue_from(self, time_ns: int) -> None:
         """Continue at the time that was just shown, unless a seek is pending.
 
-        The duration of showing a time is not played.
+        While the player shows a time, the playback does not advance.
         """
         with self._condition:
             if self._pending.seek_ns is None:
@@ -554,7 +557,9 @@ MOST_DRAWN_A_SECOND: Final = 50
 It equals the rate of the scene in annotated logs, so that playback at speed 1 sends every message."""
 
 _MOST_AT_ONCE: Final = math.ceil(MOST_DRAWN_A_SECOND * MOST_LATE_S) + 1
-"""Burst allowance, messages: the messages of the longest turn at speed 1, and one more by its phase."""
+"""Burst allowance, messages: the messages of the longest turn at speed 1.
+
+One message more than the rate allows may be in a turn, depending on when the turn begins."""
 
 _NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
 _DRAWN: Final = (
@@ -633,7 +638,7 @@ def _is_drawn(channel: Channel) -> bool:
 
 
 def _with_deletions(payloads: Sequence[bytes], places: Integers, is_kept: Booleans) -> dict[int, bytes]:
-    """Return the kept scenes that follow dropped scenes, by place, with the dropped scenes' deletions."""
+    """Return the kept scenes after dropped scenes, by index, with the deletions of the dropped scenes."""
     scene_by_index = {}
     missed_deletions = SceneUpdate()
     for place in places.tolist():
@@ -657,7 +662,7 @@ class Note(NamedTuple):
 CONSTANTS = "constants"
 LOG = "log"
 SPECIFICATION = "specification"
-"""The subjects of notes."""
+"""The subjects of notes: `CONSTANTS`, `LOG` and `SPECIFICATION`."""
 
 PERIOD_S: Final = 1 / 30
 """Time between two turns, seconds."""

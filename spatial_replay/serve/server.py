@@ -224,8 +224,9 @@ def asset(evaluated: Evaluated, uri: str) -> bytes | None:
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
 
 _LONGEST_TEXT: Final = 64
+"""Limit of a parameter's text and of a trigger's reason, characters."""
 _LONGEST_NOTE: Final = 2_000
-"""Limits of a parameter's text and of a note, characters."""
+"""Limit of a note, characters."""
 
 _REJECTED: Final = "rejected"
 """Name of the parameter with the last rejected value and the reason; "" after an accepted value."""
@@ -352,7 +353,7 @@ class PublishingServer:
 
     @property
     def _server(self) -> protocol.WebSocketServer:
-        """The SDK's server. A fast viewer may send a request before `start_server` returns it."""
+        """The SDK's server; waits for `start_server`, because a viewer may send a request earlier."""
         return self._sdk_server.result()
 
     def _options(self) -> dict[str, Any]:
