@@ -180,7 +180,7 @@ class McapLog(MessageReader):
         first_ns: int,
         end_ns: int,
     ) -> MessageColumns:
-        """Return the wanted messages in a place; report messages of channels that the index lacks."""
+        """Return the wanted messages of a chunk; report messages of channels that the index lacks."""
         self._read_count += len(messages)
         unknown_channels = np.setdiff1d(messages.channel, self._numbers)
         if len(unknown_channels):
@@ -355,7 +355,7 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _first_channels(self) -> tuple[int, ...]:
-        """Dense number of each file's first channel."""
+        """Number of each file's first channel, if all files' channels are numbered from 0 on."""
         return tuple(accumulate((len(file._channels) for file in self._files[:-1]), initial=0))
 
     def _count(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:

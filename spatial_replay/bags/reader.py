@@ -99,7 +99,12 @@ def in_pieces(columns: Columns) -> Columns:
 
 
 def places_in(part: int, within: Integers) -> Integers:
-    """Return the places of messages in a log of several parts; places increase from part to part."""
+    """Return places of messages in a log of several parts; places increase from part to part.
+
+    Args:
+        part: index of the part.
+        within: places in the part.
+    """
     return (np.int64(part) << 28) + within
 
 
@@ -137,7 +142,7 @@ def in_order(
 
 
 _Active = list[tuple[int, int, MessageColumns, Columns]]
-"""Heap of open files: time of the first message, number of the file, messages, and later messages."""
+"""Heap of open files: time of the next message, index of the file, read messages, unread messages."""
 
 
 def merge_files(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
@@ -221,7 +226,7 @@ def without_jumps(
 
 
 class _PlaceHistory:
-    """Stores the greatest place of recording up to each message of the last `disorder_ns`."""
+    """For each message of the last `disorder_ns`, the greatest place of recording so far."""
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
@@ -229,7 +234,9 @@ class _PlaceHistory:
         self._place_before = self._furthest_place = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
-        """Return the first jump: a message recorded before a message earlier by more than the disorder.
+        """Return the first message that jumps.
+
+        Such a message was recorded before another message whose time is earlier by more than `disorder_ns`.
 
         Args:
             times_ns, places: (M,) times and places of at least one message, sorted by time, later than the
@@ -274,7 +281,7 @@ class MessageReader(ABC):
 
     @property
     def profile(self) -> str:
-        """Profile of an MCAP log with the messages of this log."""
+        """MCAP profile of this log's messages, such as "ros2"; "" for none."""
         # https://mcap.dev/spec/registry#well-known-profiles
         return {"ROS 1 bag": "ros1", "ROS 2 bag": "ros2"}.get(self.kind, "")
 
@@ -369,7 +376,9 @@ class MessageReader(ABC):
     def iter_messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Yield the messages of some topics by log time; a message before its chunk's start comes late.
+        """Yield the messages of some topics by log time.
+
+        A message before the start time of its chunk is yielded late.
 
         Args:
             start_ns, end_ns: window of log times, [start_ns, end_ns).

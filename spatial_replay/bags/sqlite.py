@@ -158,7 +158,7 @@ _PIECE = 2**20
 _PACKED_PIECE = 2**12
 """Size of one read of compressed data, bytes; small, because one byte may decompress to 32,000 bytes."""
 _LEFT_FREE = 2**26
-"""Disk space that is left free, bytes; a tenth of the free space is enough if that is less."""
+"""Disk space that stays free, bytes, but at most a tenth of the free space."""
 
 
 def temporary_folder(owner: object) -> Path:
@@ -269,7 +269,7 @@ _STEPS_A_BYTE = 20
 _MOST_ROWS, _BATCH_BYTES = 512, 2**21
 
 _MOST_PROBES = 10_000
-"""Maximum number of queries for parts of a damaged table; parts without a query count as lost."""
+"""Maximum number of queries for parts of a damaged table; the remaining parts are reported as lost."""
 
 Row = tuple[int, int, Any, Any]
 """Id, topic, time and content of a message."""
