@@ -463,7 +463,7 @@ class _Progression:
         raise ValueError(kind)
 
     def _after(self, node: int) -> int:
-        """Return the diagram that maps propositions to the state after the state `node`."""
+        """Return the diagram that maps propositions to the next state after the state `node`."""
         if node not in self._moves:
             chain = self._obligations.chain(self._diagrams[node].variable)
             *cases, (_, function) = self._obligations.cases(chain, node)

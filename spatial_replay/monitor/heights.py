@@ -42,7 +42,7 @@ class _Comparison:
 
 
 class HeightComparisons:
-    """Counts the samples in which a comparison has another truth value without heights, block by block."""
+    """Counts the samples in which a comparison would have the opposite result without heights."""
 
     def __init__(self, specifications: Sequence[Specification]) -> None:
         """Start before the first sample."""

@@ -605,7 +605,7 @@ class Violation:
 
     @property
     def sentences(self) -> tuple[Sentence, ...]:
-        """The deciding atom and the change that would flip it, as in `SpecResult.explain`."""
+        """The deciding atom and the change that would flip the verdict, as in `SpecResult.explain`."""
         return () if self.witness is None else sentences_of(self.witness, first_ns=self.first_ns)
 
     def __str__(self) -> str:

@@ -53,8 +53,8 @@ class ThresholdRange:
 
     Attributes:
         atom: an atom with one distance or signal.
-        bound: quantifiers that bind the atom's variables, outermost first. A template parameter counts as a
-            variable with a quantifier.
+        bound: quantifiers that bind the atom's variables, outermost first. A template parameter is treated
+            as a variable with a quantifier.
         least, greatest: range of the quantity over all objects that the variables stand for. The range is
             empty (least > greatest) for a comparison with a text, and for a quantity that is never known.
         known: number of samples in which the quantity is known.

@@ -358,7 +358,7 @@ class SpecResult(Displayed):
 
     @property
     def least(self) -> LeastPart | None:
-        """The conjunct with the least robustness; None if that is the conjunct of the first cause."""
+        """The conjunct with the least robustness; None if the first cause has the same conjunct."""
         return self._least(0, self.causes)
 
     @property
@@ -380,7 +380,7 @@ class SpecResult(Displayed):
 
     @cached_property
     def vacuous(self) -> tuple[UntestedPart, ...]:
-        """The parts that decided nothing, by node.
+        """The parts that decided nothing, in the order of the text.
 
         The log is read again if the leaves were not stored.
         """
@@ -515,8 +515,8 @@ class SpecResult(Displayed):
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one per line, as the command `explain` prints them.
 
-        A result that is not satisfied lists each cause, its deciding atom, and the change that would flip it.
-        A satisfied result names its deciding atom. Remarks follow (see `remarks`).
+        A result that is not satisfied lists each cause, its deciding atom, and the change that would flip
+        the verdict. A satisfied result names its deciding atom. Remarks follow (see `remarks`).
 
         Args:
             first_ns: reference time of the sentences; by default the time of the log's first sample.

@@ -43,7 +43,7 @@ class PaperMemory(NamedTuple):
 
     Attributes:
         stamps: (room,), times of the samples in ns; only the first time if there are no columns.
-        columns: (K, room), stored numbers at each sample, on the samples so far.
+        columns: (K, room), numbers of the K stored nodes at each sample, on the samples so far.
         value: (N,), value of each node at the first sample.
         now: (N,), value of each node at the newest sample.
         left: (N,), running minimum of an until's left operand, for the until at the first sample.

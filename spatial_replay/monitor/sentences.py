@@ -173,7 +173,7 @@ def find_causes(
 def find_least(
     conjuncts: Sequence[Conjunct], values: Floats, final: Floats, first: Cause, whole: str
 ) -> LeastPart | None:
-    """Return the conjunct with the least robustness; None if that is the conjunct of the first cause.
+    """Return the conjunct with the least robustness; None if the first cause has the same conjunct.
 
     Args:
         whole: name of the whole formula.
@@ -232,13 +232,13 @@ def sentences_of(
     has_ended: bool = False,
     least: Witness | None = None,
 ) -> tuple[Sentence, ...]:
-    """Return sentences on the verdict of a node: the deciding atom, and the change that would flip it.
+    """Return sentences on a node's verdict: the deciding atom, and the change that flips the verdict.
 
     Args:
         first_ns: reference time of the sentences.
         requirement: requirement of the node's spec in words (see `requirement_text`).
         is_open: whether the verdict is pending, so that later samples decide it.
-        has_ended: whether the verdict was pending until the end of the log, and is violated because of that.
+        has_ended: whether the end of the log turned a pending verdict into a violation.
         least: witness of a lower robustness after a violation had settled.
     """
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
@@ -290,7 +290,7 @@ def sentences_of(
 
 
 def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -> tuple[Sentence, ...]:
-    """Return sentences on one cause: its time, its deciding atom, and the change that would flip it."""
+    """Return sentences on a cause: its time, its deciding atom, and the change that flips the verdict."""
     requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
         has_ended = cause.settled_ns is None and cause.verdict is Verdict.VIOLATED
@@ -327,8 +327,8 @@ def verdict_sentence(
         ends: ends of the robustness interval on the finished log.
         unit: declared unit of the robustness, or "".
         certain_since: time at which the verdict became certain.
-        has_ended: whether the verdict was pending until the end of the log, and is violated because of that.
-        least: conjunct with the least robustness, if that is not the first cause's conjunct.
+        has_ended: whether the end of the log turned a pending verdict into a violation.
+        least: conjunct with the least robustness, if it differs from the first cause's conjunct.
         least_at: time of the first cause's least robustness, if the cause had settled earlier.
     """
     since_parts = (", certain since ", certain_since) if certain_since is not None else ()
@@ -688,7 +688,7 @@ def _is_overlap(deciding: DecidingAtom, threshold: Threshold) -> bool:
 
 
 def _limit(threshold: Threshold) -> str:
-    """Return a phrase on the numbers that would flip a verdict instead of the written number."""
+    """Return a phrase on the numbers that flip a verdict when they replace the written number."""
     flip_text, written_text = format_number(threshold.flips_at), format_number(threshold.value)
     is_more = threshold.flips_at > threshold.value
     if threshold.is_exact:
@@ -699,7 +699,7 @@ def _limit(threshold: Threshold) -> str:
 
 
 def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
-    """Return a phrase on the place of the written number: a constant or an atom."""
+    """Return a phrase that names the constant or the atom with the written number."""
     return f"for `{threshold.constant}`" if threshold.constant else f"in `{deciding.text}`"
 
 

@@ -16,7 +16,7 @@ from spatial_replay.trace.trace import Trace
 _LEAST_REPORTS: Final = 20
 """Minimum number of reports of an object without changes."""
 _MOSTLY: Final = 0.95
-"""Minimum fraction of reports in which each other object changes.
+"""Minimum fraction of reports in which every other object changes.
 
 With 20 reports and 95 %, 151 recorded logs have no remark.
 """

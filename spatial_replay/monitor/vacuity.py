@@ -87,12 +87,12 @@ class UntestedPart:
     Attributes:
         node: node id of the part; None for a template without instances.
         text: canonical text of the part.
-        reason: "empty window": the operator's window has no sample wherever the result depends on it.
-            "antecedent never held": the part is an implication, in any spelling. "no members": an open group
-            is empty. "past the end": the result is infinite, because the deciding part looks beyond the log.
-            "no rate": the result is infinite, because the deciding part leaves all samples or members out.
-            "no instances": no object fits a template. "cut window": the part decides at a sample whose window
-            ends after the log.
+        reason: "empty window": the operator's window has no sample wherever the result depends on the
+            operator. "antecedent never held": the part is an implication, in any spelling. "no members": an
+            open group is empty. "past the end": the result is infinite, because the deciding part looks
+            beyond the log. "no rate": the result is infinite, because the deciding part leaves all samples
+            or members out. "no instances": no object fits a template. "cut window": the part decides at a
+            sample whose window ends after the log.
         message: a sentence.
         time_ns: time of the sample at which the part decides; None without such a sample.
     """

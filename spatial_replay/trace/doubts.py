@@ -26,7 +26,7 @@ class Doubt:
         topic: topic whose messages contradict the assumption; "" for a log without topics.
         text: sentence with the topic, the measurement, and the mapping key that settles the doubt.
         objects, signals: names whose values depend on the assumption.
-        is_accepted: whether the mapping accepts the doubt. Verdicts are not doubtful then.
+        is_accepted: whether the mapping accepts the doubt. An accepted doubt makes no verdict doubtful.
     """
 
     assumption: str

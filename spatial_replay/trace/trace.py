@@ -204,7 +204,7 @@ _BYTES = 1 << 30
 
 
 class MeasurementCache:
-    """Cache of arrays computed from one frozen trace. Above 1 GiB, the least recently used are evicted.
+    """Cache of arrays of one frozen trace. Above 1 GiB, the least recently used arrays are evicted.
 
     Each trace has its own cache, so traces never share results. Keys are compared by equality, never by hash
     alone. Several threads may use the cache at once.

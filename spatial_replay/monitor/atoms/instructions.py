@@ -114,7 +114,7 @@ def number_of_closest(formula: Quantified) -> tuple[ClosestPair, Expression] | N
 def _leaves(expression: Expression, sign: int) -> Iterator[tuple[int, Expression]]:
     """Iterate over the leaves of an expression, with the sign of their effect.
 
-    A minimum or maximum counts as a leaf. It is not monotone, because one unknown operand makes it unknown.
+    A minimum or maximum is treated as a leaf. One unknown operand makes it unknown, so it is not monotone.
     """
     match expression:
         case Sum(first, second):
@@ -197,7 +197,7 @@ def run_instructions(
 
     Args:
         code: operation, a, b and c of each instruction.
-        values, spreads, signals, closest, members: rows of T numbers each; four rows per closest pair.
+        values, spreads, signals, closest, members: rows of T numbers each; a closest pair has four rows.
         outputs: (A,), number of the instruction that computes each leaf.
         leaves: (C, A, T), output.
     """

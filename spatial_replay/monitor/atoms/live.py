@@ -152,7 +152,7 @@ class PackedPlan(NamedTuple):
         whole: the fields of `PlanPlaces`, then the integer arrays.
         real: the float arrays.
         room: size of the work space of `measure_sample`, entries. The space that depends on the sample's
-            objects, three entries per number, is not included.
+            objects, three entries per packed number, is not included.
     """
 
     whole: Integers
@@ -195,7 +195,7 @@ class PlanPlaces(NamedTuple):
     """Begins and ends of a plan's arrays in `PackedPlan.whole` and `PackedPlan.real`, and counts.
 
     The begin of an array has the array's name, and its end has the suffix `_end`. Kernels get these numbers
-    instead of a tuple of arrays, because kernels count references to each array.
+    instead of a tuple of arrays, because kernels manage a reference count for each array.
 
     Attributes:
         samples, regions, places, signals, coded: the plan's extent.

@@ -35,7 +35,7 @@ _NEVER = 1 << 62
 """Position beyond all samples."""
 
 SETS = 3
-"""Number of sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. Columns of a table's corner follow."""
+"""Number of sets of columns: `OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`. The next set is for a table's corner."""
 SEEN = SETS + 1
 """Index of the first set with copies of operands' columns, which windows compare with the new columns."""
 EXTRA = SEEN + SETS
@@ -315,7 +315,7 @@ def _changing_windows(
     is_greatest: bool, columns: Floats, operand_column: int, column: int, seen_column: int,
     change_begin: int, change_end: int, begin: int, end: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Skip windows whose number beats all changed numbers, old and new.
+    """Skip windows whose extremum is better than all changed numbers, old and new.
 
     Returns:
         the first window among begin … end - 1 that may change, and the last such window plus one.

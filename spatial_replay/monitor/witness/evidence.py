@@ -135,7 +135,7 @@ class Evidence:
         """Return the gaps of all objects and signals in a formula that are ever missing.
 
         Args:
-            time_ns: a pause that contains this time counts as the longest.
+            time_ns: a pause that contains this time is reported as the longest pause.
         """
         formula_parts = named_parts(formula)
         missing_blocks: list[NDArray[np.bool_]] = []

@@ -197,7 +197,7 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
 
 
 RESIDUE: Final = 1e-12
-"""Relative difference of two numbers that counts as rounding error."""
+"""Largest relative difference of two numbers that is attributed to rounding."""
 _PRECISION: Final = 60
 _FAR = 1e300
 _STEPS = 8.0
