@@ -67,7 +67,7 @@ class _Assembling:
         decoder: function from a topic to its decoder.
         start_ns, end_ns: half-open window of the samples. Messages outside the window may be added, because
             they may affect samples in the window.
-        on_time_jump: effect of a jump back by more than the plan's `late_ns`: an error or the end of the log.
+        on_time_jump: whether a jump back by more than the plan's `late_ns` is an error or ends the log.
     """
 
     _is_live = False
@@ -222,7 +222,7 @@ class _Assembling:
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
 
     def find_doubts(self) -> tuple[Doubt, ...]:
-        """Return doubts about the messages so far, without doubts that the mapping accepts."""
+        """Return doubts about the messages so far, except doubts that the mapping accepts."""
         doubts = contradictions(self._tracker.evidence, self._plan.mapping)
         return tuple(doubt for doubt in doubts if isinstance(doubt, Doubt) and not doubt.is_accepted)
 

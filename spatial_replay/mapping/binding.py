@@ -327,7 +327,7 @@ class Binding:
         frame: getter of a frame's name, and whether it reads the message instead of the object; None if
             objects have no frame.
         outer_frame: getter of the message's frame, for objects with an empty frame.
-        own_stamp: getter of an object's stamp, for objects with a stamp next to the message's stamp.
+        own_stamp: getter of an object's own stamp; None if only messages have stamps.
     """
 
     style: Style

@@ -368,8 +368,8 @@ class Detections:
         solids: solids of the objects.
         height: (R, 2) bottom and top above each object's origin; None if solids give the heights.
         uncertainty: (R,) radii.
-        covariance: (R, 3, 3) covariances of positions, times the squared number of standard deviations; None
-            if the mapping reads none.
+        covariance: (R, 3, 3) covariances of positions, multiplied by the square of the mapping's `sigmas`;
+            None if the mapping reads no covariances.
         lifetime_ns: (R,) lifetimes, 0 for no limit; None if the topic has no lifetimes.
         is_locked: (R,) whether an object moves with its frame; None if no object does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.
@@ -434,8 +434,8 @@ class DetectionChunk:
         places: index of each message in the batch.
         deleted, message: as in `Detections`, with messages as indices into `places`.
         numbers: (R, W) all numbers that the binding reads from an object.
-        noted_stamps: (index in the batch, stamp) of each message; only the first message if frames are not
-            read.
+        noted_stamps: (message index in the batch, stamp) of messages or objects; only the first stamp if
+            frames are not read.
         outline_counts: (R,) number of polygons of each object.
         corner_counts: number of corners of each polygon.
         corners: (V, 3) corners of all polygons.
@@ -607,7 +607,7 @@ def radii_from_numbers(binding: Binding, numbers: Floats, count: int) -> Floats:
 
 
 def covariances(layout: MessageLayout, binding: Binding, objects: list[Any]) -> Floats | None:
-    """Return the covariances (R, 3, 3) of positions, times the squared number of standard deviations."""
+    """Return the covariances (R, 3, 3) of positions, multiplied by the square of the mapping's `sigmas`."""
     if binding.covariance is None or layout.uncertainty is None:
         return None
     covariance_rows = np.array([list(binding.covariance(element)) for element in objects], np.float64)

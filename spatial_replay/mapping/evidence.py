@@ -255,7 +255,7 @@ class Motions:
         jump_s: duration of the longest step.
         comeback: longest step over an absence. In an absence, messages lack the object for a second or more.
         comeback_s: duration of the step in `comeback`.
-        zeros: number of leaps to (0, 0) without an absence, by more than five sizes of the object.
+        zeros: number of steps to (0, 0), without an absence, that are longer than five sizes of the object.
         turn_step: greatest change of the raw angle that is read as yaw.
         chances: number of reports that follow at least two earlier reports of the same object.
         returns: number of reports in which an object is back at its position of two to four reports earlier.

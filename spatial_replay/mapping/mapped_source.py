@@ -335,7 +335,7 @@ class _TreeLog:
 def _first_ns(
     open_reader: Callable[[], MessageReader], topics: Iterable[str | None], log_ns: int | None = None
 ) -> int | None:
-    """Return the log time of the first message of some topics at or after a time; None without a message."""
+    """Return the log time of the first message on the topics, at or after `log_ns`; None if none follows."""
     topic_names = [topic for topic in topics if topic is not None]
     messages = open_reader().iter_messages(topic_names, log_ns) if topic_names else ()
     return next((message.log_time_ns for message in messages), None)

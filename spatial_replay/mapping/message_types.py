@@ -49,8 +49,8 @@ class MessageLayout:
         sizes: alternatives, each the paths of length, width and maybe height of a box.
         frame, stamp: alternative paths in the object or, with `$.`, in the message. An object with an empty
             frame has the message's frame.
-        own_stamp: path of an object's stamp for transforms, next to the message's stamp; "" without such a
-            stamp.
+        own_stamp: path of an object's own stamp; transforms are looked up at this stamp instead of the
+            message's stamp. "" if objects have no own stamp.
         solids: kind of message that lists an object's solids; "" for objects with a single shape.
         is_generic: whether the fields are guesses for an unknown type.
         origin: latitude and longitude of (0, 0) for positions in degrees; None for other positions.

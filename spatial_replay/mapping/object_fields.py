@@ -153,7 +153,7 @@ class Guess:
 
     @property
     def score(self) -> int:
-        """Number of fields of an object; a position, an outline or bounds counts ten."""
+        """Number of known properties of the object, such as size and name, plus ten if its place is known."""
         part_fields = (
             self.polygon or self.bounds,
             self.size,

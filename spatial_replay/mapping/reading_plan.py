@@ -86,8 +86,8 @@ class ReadingPlan:
 
     Attributes:
         topics: topics to read: mapped topics, and topics of transforms if frames are needed.
-        by_log_time: whether times of samples are log times. Otherwise a window's messages are known only
-            after decoding all messages.
+        by_log_time: whether times of samples are log times. Otherwise all messages must be
+            decoded to find the messages of a window.
         late_ns: largest disorder of messages, nanoseconds. Samples wait for late messages for this time.
         wait_ns: waiting time of samples for messages that affect them, nanoseconds.
         margin_ns: time after a window's end in which messages still affect the window, nanoseconds.

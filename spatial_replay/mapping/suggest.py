@@ -70,7 +70,7 @@ EXAMPLES = 20
 _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
 _ONE_CLOCK_S, _EXACT_S = 5.0, 0.05
-"""Greatest difference of median delays on one clock, and greatest delay that does not matter, seconds."""
+"""Limits, seconds: difference of median delays on one clock, and difference of delays that is ignored."""
 _NO_TIMES: Mapping[str, Sequence[int]] = MappingProxyType({})
 _MOST_SIGNALS = 12
 _MOST_LISTS = 6

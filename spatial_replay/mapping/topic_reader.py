@@ -130,7 +130,8 @@ class Extractor:
         self._scene_stamps_ns: dict[int, int] = {}
         """Timestamps of existing scene entities, by name code."""
         self.boxes, self.leftward, self.downward = 0, 0, 0
-        """Numbers of bounds: all, with a second corner left of the first, with a second corner below it."""
+        """Numbers of bounds: of all bounds, of bounds with the second corner left of the first corner, and of
+        bounds with the second corner below the first corner."""
         self.corner_low, self.corner_high = np.full((2, 2), np.inf), np.full((2, 2), -np.inf)
         """Least and greatest coordinates of bounds: one row for first corners, one row for second corners."""
         self.differences = 0
@@ -425,7 +426,7 @@ class Extractor:
     def _fill_stamps(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
-        """Read the stamps of objects if frames are needed; otherwise only the first stamp, for clocks."""
+        """Read the stamps of objects if frames are needed; otherwise only the first stamp of the chunk."""
         if self._time is None:
             return
         from_message = self._time.path.from_message

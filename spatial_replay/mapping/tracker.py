@@ -783,7 +783,7 @@ class Tracker:
         return np.flatnonzero(False if detections.is_locked is None else detections.is_locked)
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
-        """Return for each time whether it is in a pause of the topic longer than `max_gap`."""
+        """Return for each time whether the topic pauses around this time for longer than `max_gap`."""
         max_gap_ns, reported_ns = self.plan.mapping.max_gap_ns, self._reported_ns.get(topic)
         planned = self.readers[topic].planned
         if max_gap_ns is None or reported_ns is None or planned.is_lasting or planned.is_latched:
@@ -817,7 +817,7 @@ class Tracker:
     def _signal_columns(
         self, times_ns: Integers, newest_ns: int
     ) -> tuple[dict[str, Floats], dict[str, Integers]]:
-        """Return the signals, and the report times of signals that are older than a sample."""
+        """Return the values of signals, and the report times of signals that some sample carries forward."""
         values_by_signal: dict[str, Floats] = {}
         report_times_ns: dict[str, Integers] = {}
         stale_signals: list[tuple[str, str, Booleans, Booleans]] = []
