@@ -55,7 +55,7 @@ class ReadOptions:
         mapping: path of a mapping file, which assigns topics of an external log to objects.
         on_time_jump: "error", or "split" to end an external log where its clock jumps back.
         rate: frames per second of annotations that count frames; 30 by default.
-        lost: "drop" or "keep" annotations that are marked as lost.
+        lost: "drop" or "keep" annotations that are marked as out of the picture.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
             default, y points down in drone annotations, and up in all other files.
         max_lateness: largest lateness of messages in an external log, such as "2s"; "all" sorts the whole log

@@ -254,7 +254,7 @@ class TrackSource(FileSource):
 
 @dataclass(frozen=True)
 class SourceOf(Source):
-    """A derived source, which has the attributes of its original but other blocks."""
+    """A source derived from another source, with the same attributes and attachments, but other blocks."""
 
     source: Source
 

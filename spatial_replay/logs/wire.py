@@ -145,7 +145,7 @@ class Payloads(Sequence[bytes]):
 
     @classmethod
     def of(cls, payloads: Sequence[bytes]) -> Payloads:
-        """Convert messages: small messages are joined into one buffer, large messages keep a buffer each."""
+        """Convert messages. Messages are joined into one buffer, unless their mean size is large."""
         if isinstance(payloads, Payloads):
             return payloads
         message_count = len(payloads)
@@ -246,11 +246,11 @@ def stretches(buffer: Bytes, size: int) -> NDArray[np.void]:
 _CACHED_BYTES: Final = 2**17
 """Size of the parts in which rows are written, bytes: half the cache of a processor core."""
 _LARGE_BYTES: Final = 2**12
-"""Mean message size, bytes, above which joining messages costs more than a buffer each."""
+"""Mean message size, bytes, above which each message keeps a buffer, because joining would cost more."""
 _JOINED_BYTES: Final = 2**20
 """Size below which buffers are merged, bytes."""
 _FEW: Final = 4
-"""Number of messages of one size below which messages are copied one by one."""
+"""Least number of messages of one size to copy together; fewer messages are copied one by one."""
 
 
 def rows_of(payloads: Sequence[bytes]) -> Bytes:

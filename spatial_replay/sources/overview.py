@@ -38,7 +38,7 @@ _STEP = 10_000
 _ENOUGH = 1024
 """Number of messages per topic that is enough for a survey."""
 _LOOKED_AT = frozenset({*range(1, EXAMPLES + 1), *(2**n for n in range(5, 20))})
-"""Numbers of each topic's decoded messages: the first messages, then powers of two."""
+"""Messages of a topic that are decoded, by their number from 1: the first messages, then powers of two."""
 _EXAMPLE_BYTES = 2**22
 """Size limit of a topic's decoded messages after the first, bytes, because images and point clouds are
 large."""
@@ -154,8 +154,8 @@ class Regularity:
     Attributes:
         count: number of samples or messages.
         rate: rate in hertz with two decimals, rounded down.
-        max_gap: longest pause in seconds with three decimals, rounded up. Pauses before the first and after
-            the last sample or message count.
+        max_gap: longest pause in seconds with three decimals, rounded up. Pauses before the first and
+            after the last sample or message are included.
     """
 
     count: int

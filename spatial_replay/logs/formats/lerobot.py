@@ -213,7 +213,7 @@ class _LeRobot(DataSet):
 
 
 def _lacks_files(path: Path) -> bool:
-    """Return whether the tables of episodes lack the column with the numbers of data files."""
+    """Return whether the episode tables lack the column with file numbers."""
     tables = sorted((path / "meta" / "episodes").glob("chunk-*/file-*.parquet"))
     return bool(tables) and "data/file_index" not in arrow().parquet.read_schema(tables[0]).names
 

@@ -29,7 +29,7 @@ from spatial_replay.text import plural
 
 
 class _Steps(DataSet):
-    """A data set of arrays of all steps.
+    """A data set whose arrays cover the steps of all episodes.
 
     Attributes:
         qpos: name of the array of joint positions, which a model needs.

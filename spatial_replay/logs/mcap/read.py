@@ -349,8 +349,8 @@ class McapSource(FileSource):
     """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
 
     Attributes:
-        keep: patterns of the other topics in its blocks, see `is_kept`. Chunks without these topics are
-            skipped if the index lists the channels of chunks.
+        keep: patterns of other topics whose messages are in the blocks, see `is_kept`. Chunks without these
+            topics are skipped if the index lists the channels of chunks.
     """
 
     kind: str = "MCAP"
