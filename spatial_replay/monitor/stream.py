@@ -192,7 +192,7 @@ class SeriesBlock:
     Attributes:
         times_ns: (T,) int64; T may be 0.
         series: (N, 4, T): value, now, lower and upper of each node.
-        leaves: (C, A, T), `leaf_values` of these samples, from which the series is computed.
+        leaves: (C, A, T), leaves from which the series is computed (see `leaf_values`).
     """
 
     times_ns: Integers

@@ -239,9 +239,9 @@ class _Implications(NamedTuple):
 def _implications_of(formula: Formula, node: int = 0, sign: int = 1) -> _Implications:
     """Write `->` for each implication of a formula.
 
-    `not a or b` and `not (a and not b)` become `a -> b`. In `not (a and b)`, each operand is a condition for
-    the other operand, so the formula becomes `(a or b) -> not (a and b)`. `not F p` is treated like
-    `G not p`.
+    `not a or b` and `not (a and not b)` become `a -> b`. `not (a and b)` becomes
+    `(a or b) -> not (a and b)`, because each operand is a condition for the other operand. `not F p` is
+    treated like `G not p`.
 
     Args:
         node: id of the original formula.

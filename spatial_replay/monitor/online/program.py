@@ -10,9 +10,9 @@ A formula becomes three tables, each with operands first:
 
 `OnlineRun` evaluates samples by these tables. docs/design/monitor.md explains the tables with an example.
 
-Some bounds of a part follow from its rows alone. A root that joins by the minimum, such as `G`, cannot exceed
-the least value of its closed positions, and later samples may always be worse. The reverse holds for a root
-that joins by the maximum, such as `F`.
+Some bounds of a part follow from its rows alone. A root that joins by the minimum, such as `G`, is at most
+the least value of its closed positions. The lower bound of `G` is -inf, because later samples may always be
+worse. The reverse holds for a root that joins by the maximum, such as `F`.
 """
 
 from __future__ import annotations
@@ -470,9 +470,9 @@ def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
 def known_bounds(rows: tuple[Row, ...]) -> int:
     """Return the bounds that follow from a part's table regardless of open positions, one bit per bound.
 
-    Later samples may always violate `G x`, so the lower bound of `G x` is -inf. The upper bound depends on
-    closed positions alone if later samples can satisfy x at every open position, as for `F y` and `F y or z`.
-    The table has this upper bound if all its variables fulfil this condition.
+    Later samples may always violate `G x`, so the lower bound of `G x` is -inf. Its upper bound depends on
+    closed positions alone if later samples can satisfy x at every open position. This is so for x = `F y`
+    and x = `F y or z`. All variables of the table have to fulfil this condition.
     """
     direction = _direction_of(rows)
     if direction is None:

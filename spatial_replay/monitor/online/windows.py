@@ -7,9 +7,9 @@ stored.
 
 Positions of the root whose windows have all closed are absorbed into a table (see `signals`). The *base* is
 the first position of the root that is not absorbed. The table gives the root's value at the first sample. It
-is a function of each variable's value at the end of the table, the variable's *boundary*. If the operand of a
-past operator looks ahead, the past operator has a table, too. This table gives the past operator's value at
-one position, its *state*.
+is a function of each variable's value at the variable's *boundary*, the first position beyond the table. If
+the operand of a past operator looks ahead, the past operator has a table, too. This table gives the past
+operator's value at one position, its *state*.
 
 Columns exist in up to three sets: for a run that ends with the newest sample, for the lowest later values,
 and for the highest later values. The *mode* of a set is `OPEN_END`, `OPEN_LOW` or `OPEN_HIGH`. Positions are
@@ -755,7 +755,7 @@ def _reach(
 ) -> bool:
     """Find, for each node, the first and the last position that the root needs at root_low … root_high.
 
-    The positions are written to `LOW` and `HIGH`. `PLAIN` is `LOW` before boundaries and states are included.
+    The positions are written to `LOW` and `HIGH`. `PLAIN` is `LOW` without boundaries and states.
 
     Returns:
         whether all windows between these positions and the root have closed.

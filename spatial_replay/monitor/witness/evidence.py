@@ -29,9 +29,10 @@ class Gap:
         missing: number of samples without the object or signal; for pauses, number of samples that fill them.
         samples: number of all samples.
         first_ns, last_ns: times of the first and the last of the missing samples.
-        window: start and end (not included) of the samples with the object or signal, if it is missing only
-            at the ends of the log; else None. It is also None for an object with a class, if the object is
-            absent from a sample.
+        window: start and end (not included) of the samples with the object or signal. The start is
+            None if the first sample is not missing. The end is None if the last sample is not missing. The
+            window is None if missing samples are not all at the ends of the log, or all samples are missing.
+            It is also None for an object with a class, if the object is absent from a sample.
         longest_ns: times of the first sample of the longest gap, and of the first sample after the gap.
         is_filled: whether the longest gap is filled to its end, as by `max_gap`. A lost connection adds a
             sample only at the beginning of a gap.
