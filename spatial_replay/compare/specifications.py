@@ -161,7 +161,7 @@ def find_cause(
 
 
 def minimise(parts: Sequence[int], holds: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Return a minimal subset of parts for which a condition holds. All parts together must fulfil it.
+    """Return a minimal subset of parts for which a condition holds; it must hold for all parts together.
 
     No single part of the subset can be left out. The method is delta debugging, which removes larger pieces
     first (Zeller and Hildebrandt 2002, https://doi.org/10.1109/32.988498).

@@ -452,7 +452,7 @@ class Evaluated:
         edited: the specifications with edited constants.
         selection: selection of the samples in memory.
         evaluation: the evaluation after the last sample.
-        stretches: numbers of all samples, one stretch for each tree of `evaluation`.
+        stretches: values of all nodes in all samples, one stretch for each tree of `evaluation`.
     """
 
     loaded: LoadedLog

@@ -455,7 +455,7 @@ class Selection:
         """Return a block's messages in the window. Samples are encoded if no message contains them.
 
         Args:
-            first: number of samples in the window before the block.
+            first: number of the window's samples in earlier blocks.
         """
         messages = block.messages
         window_messages = messages.within(self.window.start_ns, self.window.end_ns)

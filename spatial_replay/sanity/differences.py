@@ -58,7 +58,7 @@ class Distinction(Printed):
         only_first: shortest run that only the first accepts; None if none was found.
         only_second: shortest run that only the second accepts; None if none was found.
         rates_hz: sample rates of the comparison, Hz; empty if no bound is in seconds.
-        reason: reason why the relation is "same", or why a direction is undecided; "" otherwise.
+        reason: reason why the relation is "same", or why a search for a run is undecided; else "".
     """
 
     first: str

@@ -65,7 +65,7 @@ def around(outline: Outline) -> tuple[tuple[float, float], ...]:
 
 
 def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
-    """Return the largest of the boxes in the parts of a footprint (see `_box_in`)."""
+    """Return the largest box that lies inside one part of a footprint (see `_box_in`)."""
     boxes = [_box_in(part) for part in footprint.parts]
     return max(boxes, key=lambda box: math.prod(high - low for low, high in box))
 

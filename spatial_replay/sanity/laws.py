@@ -251,7 +251,7 @@ def _nesting(
     inside_protrusions: dict[Protrusion, None],
     regions: Mapping[str, Outline],
 ) -> Iterator[Inequality]:
-    """Yield: a nested term overlaps its outer term, and is at least as far from any third term."""
+    """Yield: a nested term overlaps its outer term; a third term is at most as near to the nested term."""
     protrusions_by_term: dict[Term, list[Protrusion]] = {}
     for protrusion in inside_protrusions:
         if is_solid(protrusion.inner) and is_solid(protrusion.outer):

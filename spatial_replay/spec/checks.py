@@ -325,7 +325,7 @@ def check_names(
     Args:
         known: names of the log's objects.
         signals: names of the log's numeric signals.
-        where: source of the names, for messages.
+        where: word for the source of the known names in messages, such as "log".
         during: part of the source that was read, such as "in its first 5.000 s"; "" for the whole source.
         classes: classes of the log's objects.
         each: objects by template parameter: "all", "class:NAME" or the name of one object.
@@ -433,7 +433,7 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
 
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:
-    """Return a hint that an unknown object name is a class; "" if it is not."""
+    """Return a hint that an unknown object name is a class; "" if no class has the name."""
     class_name = next((label for label in classes if label.casefold() == name.casefold()), None)
     if kind != "object" or class_name is None:
         return ""

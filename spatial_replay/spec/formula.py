@@ -541,8 +541,8 @@ class Temporal:
     """Temporal operator: U, R, W and S have two operands, other operators one; X, WX and Y have no bound.
 
     Attributes:
-        expansion: formula that defines R, W, WX, an operator over a rate (see `judged_operands`), or U and S
-            with `true` on the left; None for other operators (see `expand`).
+        expansion: formula that defines the operator (see `expand`), for R, W, WX, operators over a rate (see
+            `judged_operands`), and U and S with `true` on the left. Other operators have None.
     """
 
     operator: TemporalOperator
@@ -569,7 +569,7 @@ class Quantified:
     Several variables are bound to ordered tuples of distinct members. The body has no temporal operator.
 
     Attributes:
-        group: open `Group`, or `Earlier` with the members of an earlier sample.
+        group: open `Group`; `Earlier` of a group for its members in an earlier sample.
         judged: evaluated body, which skips members without a rate (see `judged_operands`).
     """
 

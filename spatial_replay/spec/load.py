@@ -289,7 +289,7 @@ class QuantifierBuilder:
         return Truth(True)
 
     def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
-        """Report the faults of a body that is not expanded over members."""
+        """Report the faults of a body if the quantifier has no members to expand over."""
         values = dict(scope.values) | {name.text: TrackedName(name.text) for name in written.variables}
         self.elaborate(written.body, replace(scope.deeper(), values=values))
 

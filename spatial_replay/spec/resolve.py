@@ -198,7 +198,7 @@ class Namespace:
         signals: plug-ins by the names of the signals that they compute.
         definitions: statements by name; the first statement if a name is defined twice.
         regions, groups: values of region and group definitions by name.
-        used: names with a reference.
+        used: names that formulas refer to.
         entangled: names that constants, regions or scales refer to.
         constants: values of constants by name; None for a constant with a fault.
         scales: divisors from `scale` lines.

@@ -270,7 +270,7 @@ def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, 
 
 
 def _spread(scored_lines: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
-    """Return lines by their bits; each earlier line about the same moved object reduces the bits."""
+    """Return lines sorted by bits; each earlier line about the same moved object reduces the bits."""
     party_counts = Counter[Party]()
     ordered_lines = []
     remaining_lines = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored_lines]

@@ -321,7 +321,7 @@ def direction(before: Specification, after: Specification) -> Direction | None:
 
 
 def _common(directions: Iterable[Direction | None]) -> Direction | None:
-    """Return the direction of a value that increases with each of its parts; None if directions differ."""
+    """Return the common direction of several parts; None if directions differ or a direction is unknown."""
     signs = set(directions) - {0}
     if not signs:
         return 0
@@ -371,7 +371,7 @@ def _alike(old: Boolean | Temporal, new: Boolean | Temporal) -> bool:
 
 
 def _of_bound(old_bound: Bound | None, new_bound: Bound | None) -> Direction | None:
-    """Return 1 if the window of an operator such as F grew, so that it is looser; -1 if it shrank."""
+    """Return 1 (looser) if the window of an operator such as F grew; -1 if the window shrank."""
     if old_bound == new_bound:
         return 0
     if old_bound is None or new_bound is None or old_bound.unit != new_bound.unit:

@@ -42,7 +42,7 @@ MOST_MEASURED: Final = 1 << 26
 MOST_SIGNALS: Final = 50
 """Maximum number of compared signals."""
 _SAMPLED: Final = 33
-"""Number of samples of the first run that order the pairs; the nearest pairs are measured first."""
+"""Number of samples of the first run whose distances order the pairs, the nearest pairs first."""
 
 Relation: TypeAlias = Literal["dist", "oriented", "signal", "enclosedin", "ovlp", "leftof", "below", "prec"]
 _EITHER_WAY: tuple[Relation, ...] = ("dist", "ovlp", "oriented")
@@ -69,7 +69,7 @@ class Quantity:
         signal: name of a signal, or "".
         formula: formula of the number: the signed distance for "dist", the negated misalignment for
             "oriented", the signal for "signal". Over classes it is the minimum over all members.
-        reach: over classes, the minimum of the negated number over all members; else `formula`.
+        reach: over classes, formula of the least negated number of all members; else `formula` itself.
     """
 
     relation: Relation
@@ -260,7 +260,7 @@ def _atom(relation: str, a: TrackedName | Variable, b: TrackedName | Variable, p
 _AT_ONCE: Final = 1 << 22
 """Maximum number of a run's values in memory at once."""
 _SAMPLED_OF_A_RUN: Final = 64
-"""Samples of a run that estimate how often a relation holds."""
+"""Number of samples of a run that estimate how often a relation holds."""
 
 
 @dataclass(frozen=True, eq=False)

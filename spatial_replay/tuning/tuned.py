@@ -49,7 +49,7 @@ def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
 
     Args:
         inside: number at which the condition holds; it is not evaluated.
-        end: last number to evaluate, on either side.
+        end: last number to evaluate, above or below `inside`.
         holds: condition; after its first failure it is assumed to fail up to the end.
     """
     step = 1
@@ -462,13 +462,16 @@ class Search:
         return first_looseness
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
-        """Return the least number from which on every run has the right verdict; `most` always has it."""
+        """Return the least number from which on every run has the right verdict, at most `most`."""
         return least_for_all(runs, most, lambda run, number: self._margins.holds(run, at(number)))
 
     # ------------------------------------------------------------------------------------ several constants
 
     def _widest_by_boxes(self) -> Found:
-        """Search exactly over deciding runs, and add the worst other runs until no other run is worse."""
+        """Search exactly over deciding runs.
+
+        The worst other runs become deciding runs until no other run has a smaller margin.
+        """
         unfit_runs = self._alone(self._at(_PARTS), self._at(0))
         if unfit_runs:
             return Found(self._margins.start, is_held=False, conflict=unfit_runs, alone=unfit_runs)
@@ -504,7 +507,10 @@ class Search:
         return tuple(self._number_at(axis, number) for axis, number in enumerate(looseness))
 
     def _widest_of_several(self) -> Found:
-        """Optimise over deciding runs, and add the worst other runs until no other run is worse."""
+        """Optimise over deciding runs.
+
+        The worst other runs become deciding runs until no other run has a smaller margin.
+        """
         start = self._margins.start
         deciding_runs = self._worst(start, [])
         point = start
