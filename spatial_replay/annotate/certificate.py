@@ -141,7 +141,7 @@ class MessageHash:
 
 
 PLAN_SHA256 = "plan_sha256"
-"""The entry of a certificate for the settings of a planned run."""
+"""Name of a certificate's entry with the hash of a planned run's settings."""
 
 
 def plan_sha256(plan: Mapping[str, str]) -> str:

@@ -294,7 +294,7 @@ class ReportedNode(NamedTuple):
         line: line of the spec in the file, from 1; 0 for a spec that is not in the file.
         below: leaves below the node.
         requirement, sentence: id and title of the spec's requirement, or None.
-        is_needed: whether the root needs the node to hold: only conjunctions are above the node.
+        is_needed: whether the root needs the node to hold, because only conjunctions are above the node.
         unit: declared unit of the node's number, or "".
     """
 

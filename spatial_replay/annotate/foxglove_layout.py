@@ -69,7 +69,7 @@ _STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
         for code in (SATISFIED, HOLDS_SO_FAR, PENDING, VIOLATED, UNKNOWN)
     }
 )
-"""Words and colour of each number of `Standing`, in panels that accept a colour."""
+"""Words and colour of each value of `Standing`, in panels that accept a colour."""
 
 Config = dict[str, Any]
 

@@ -108,8 +108,8 @@ class Requirement(NamedTuple):
         conjunct: the conjunct of the formula around the requirement.
         can_violate: whether a failure of the requirement can be a violation. False for a goal whose
             obligation also has invariants, and for all goals under a semantics without final verdicts.
-        is_condition: whether the requirement is left of an implication, which also holds if the condition
-            fails.
+        is_condition: whether the requirement is left of an implication. The implication also holds if the
+            requirement fails.
         is_invariant: whether the obligation needs the requirement in every sample, without an alternative.
     """
 

@@ -91,7 +91,7 @@ def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], 
 
 
 def standing_codes(series: Floats, *, final: bool = False) -> Codes:
-    """Return (N, T), the standing of some nodes as numbers of the enumeration `Standing` in messages.
+    """Return (N, T), the standing of some nodes as values of the messages' enumeration `Standing`.
 
     Args:
         series: (N, 4, T): value, now, lower, upper.

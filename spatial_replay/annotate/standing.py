@@ -32,7 +32,7 @@ _RANKS: Final = np.full(256, 2, np.uint8)
 for _rank, _code in enumerate(STANDING_WORDS):
     _RANKS[_code] = _rank
 _RANKS.flags.writeable = False
-"""Rank of each number of `Standing`; 0 is the worst."""
+"""Rank of each value of `Standing`; 0 is the worst."""
 
 
 def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
@@ -42,7 +42,7 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     compared, because units may differ.
 
     Args:
-        codes: (R, S), numbers of `Standing`.
+        codes: (R, S), values of `Standing`.
         violated_ns: (R, S), start of each result's violation, or `LATEST_NS`.
     """
     ranks = _RANKS[codes]
@@ -89,7 +89,7 @@ class FinalStanding(NamedTuple):
     """Outcome of a result over the finished log.
 
     Attributes:
-        standing: number of `Standing`: satisfied, violated or unknown.
+        standing: value of `Standing` for satisfied, violated or unknown.
         by: magnitude of the interval's deciding end; NaN if unknown.
         at: time at which the upper end of the robustness interval reached its minimum.
         unit: unit of the robustness.

@@ -227,7 +227,7 @@ class Presence(NamedTuple):
 
 
 class Violations(NamedTuple):
-    """The violation with the arrow in each of S samples, and the ends of the arrow.
+    """For each of S samples, the violation that has the arrow, and the ends of the arrow.
 
     Attributes:
         result: (S,) int64, index of the result; -1 without a violation.
@@ -326,7 +326,7 @@ def worst_robustness(
 
 
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
-    """Return the violation with the arrow in some samples of a trace.
+    """Return the violation that has the arrow, for some samples of a trace.
 
     Among the violations in a sample, the violation that was certain first has the arrow.
 
@@ -559,7 +559,7 @@ def _point_at_past(
 def _iter_deciding(
     result: EvaluatedResult, pairs: LeafPairs, leaf: int, scene: TraceScene, samples: Integers
 ) -> Iterator[tuple[Formula, Integers]]:
-    """Yield a quantifier's body for each deciding binding, with the indices (k,) in `samples`."""
+    """Yield the body of each deciding binding, with the indices (k,) in `samples` where it decides."""
     shades = [shade for shade in result.shades or () if shade.leaf == leaf]
     if not shades:
         return

@@ -196,7 +196,7 @@ _BEFORE_MARK = (4, 17, 23, 24, 36, 37)
 """Possible offsets of the opcode field in a chunk's record, bytes; other fields may come first."""
 _CHUNK_HEAD_BYTES = range(20, 80)
 _MOST_GAPS, _MOST_MARKS = 1_000, 100_000
-"""Numbers of damaged parts, and of possible chunks, after which the rest of a file is not searched."""
+"""Limits of damaged parts, and of possible chunks. Beyond a limit, the rest of a file is not searched."""
 
 
 @dataclass(frozen=True, slots=True)

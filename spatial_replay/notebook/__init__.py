@@ -29,7 +29,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.tuning.tuned": "study_view",
     }
 )
-"""Views, relative to this package, by the module whose types the view registers.
+"""Modules of views, relative to this package, by the module whose types the view registers.
 
 Packages that import this package register their own views."""
 

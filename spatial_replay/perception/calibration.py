@@ -118,7 +118,7 @@ def calibrate_camera(
 def _is_new(
     corners_by_id: dict[int, Floats], views: Sequence[dict[int, Floats]], least_shift_px: float
 ) -> bool:
-    """Return whether no earlier view has the tags at the same places."""
+    """Return whether the tags are at other places than in each earlier view."""
     for earlier_view in views:
         shared_ids = [tag_id for tag_id in corners_by_id if tag_id in earlier_view]
         shifts_px = [

@@ -50,7 +50,7 @@ class ObjectPose(NamedTuple):
         yaw: orientation, radians.
         spread: (4, 4), covariance of x, y, z, yaw from the errors of corners.
         shared: (2, 2), covariance of x, y from the plane's error, which nearby objects have in common.
-        parallax: largest error of the place from the unresolved height of the tag.
+        parallax: largest error of the place that the unknown height of the tag can cause.
         doubt: reason to distrust the pose, or None.
         misfit: distance of the corners from the fitted tag, pixels per degree of freedom.
     """

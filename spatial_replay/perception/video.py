@@ -52,7 +52,7 @@ class Decoded(NamedTuple):
     Attributes:
         of: object that the caller passed with the frame's packet.
         frame: frame of PyAV.
-        is_true: whether no frame on which this frame depends is missing or damaged.
+        is_true: False if the frame depends on a missing or damaged frame.
     """
 
     of: Any
@@ -66,7 +66,7 @@ class Shown(NamedTuple):
     Attributes:
         of: object that the caller passed with the image's message.
         image: image of the frame; black if the frame is not true.
-        is_true: whether no frame on which this frame depends is missing or damaged.
+        is_true: False if the frame depends on a missing or damaged frame.
     """
 
     of: Any
@@ -159,7 +159,7 @@ class Decoder:
             self._pending.append(pending)
 
     def _skipped_frames(self, pts: int | None) -> Iterator[Decoded]:
-        """Yield empty frames for the pending packets before `pts`, or for all pending packets if it is None.
+        """Yield empty frames for the pending packets before `pts`; None is for all pending packets.
 
         Some decoders skip frames after a loss.
         """

@@ -193,7 +193,7 @@ _MOST_EVENTS: Final = 256
 _MOST_MISSED: Final = 2**18
 """Maximum number of dropped samples whose times are in memory; dropped messages have the same limit."""
 _STATIC: Final = "tf_static"
-"""Last part of the topics of static transforms; every clip needs these transforms regardless of their age."""
+"""Last part of the name of a topic with static transforms, which every clip needs regardless of their age."""
 
 
 @dataclass(frozen=True, slots=True)

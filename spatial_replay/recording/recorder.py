@@ -290,11 +290,11 @@ class SampleWriter:
 class Recorder(SampleWriter):
     """Record samples into an MCAP log, with the robustness of specifications.
 
-    The log is written in place. If the process is killed, less than a second of samples is lost, counted from
-    the call of `write`, also on a busy machine. The end of the `with` block closes the log. After an error or
-    Ctrl-C the closed log is marked as interrupted. SIGTERM has the same effect: in a `with` block of the main
-    thread it raises SystemExit(143), unless the program handles SIGTERM. A signal that arrives during the
-    closing is delayed until the log is closed.
+    The log is written in place. If the process is killed, samples are lost only if `write` received them less
+    than a second before, also on a busy machine. The end of the `with` block closes the log. After an error
+    or Ctrl-C the closed log is marked as interrupted. SIGTERM has the same effect: in a `with` block of the
+    main thread it raises SystemExit(143), unless the program handles SIGTERM. A signal that arrives during
+    the closing is delayed until the log is closed.
 
     With a trigger, samples wait in memory until the trigger fires. Each firing writes one log of the time
     before and after the firing.

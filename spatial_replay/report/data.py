@@ -208,7 +208,7 @@ def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) 
 
     First come evenly spaced samples, a quarter of `most`, and the first and the last sample of each curve.
     Samples around changes of sign follow, up to five eighths of `most`. The extrema of each curve in equal
-    stretches come last. A group that exceeds the limit is thinned evenly.
+    stretches come last. Samples above the limit are thinned evenly.
 
     Args:
         times_ns: (T,) int64, times of all samples.
@@ -244,7 +244,7 @@ def _choose(is_chosen: NDArray[np.bool_], samples: Integers, limit: int) -> None
 
 
 def _turns(series: Floats) -> Integers:
-    """Return the samples on both sides of each change of sign of a value, `now`, or end of an interval."""
+    """Return the samples before and after each change of sign, of `value`, `now`, `lower` or `upper`."""
     change_samples = [np.empty(0, np.int64)]
     for numbers in series.reshape(-1, series.shape[-1]):
         signs = np.where(np.isnan(numbers), 0, np.where(numbers >= 0.0, 1, -1))

@@ -480,7 +480,7 @@ class Session:
         The first turn after a pause still plays the stretch up to the time of the pause.
 
         Args:
-            reach_ns: latest time that one turn can reach. Playback then lags behind the clock.
+            reach_ns: latest time that one turn can reach. If the clock is later, playback lags behind.
         """
         with self._condition:
             elapsed_s = self._pace.next_turn()

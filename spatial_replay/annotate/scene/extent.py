@@ -57,8 +57,8 @@ class SceneExtent(NamedTuple):
 
     Attributes:
         bounds: box of the footprints; None before any footprint.
-        size: longer side of the box around footprints and regions, in steps: the first such length times
-            a power of `_STEP`.
+        size: longer side of the box around footprints and regions, rounded up. Sizes are the first length
+            times powers of `_STEP`.
     """
 
     bounds: SceneBounds | None = None
