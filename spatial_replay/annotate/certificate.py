@@ -175,7 +175,7 @@ class EvaluationHashes:
         self._results = [(_text(name) + _text(object), hashlib.sha256()) for name, object in names]
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
-        """Add the next samples and the log's own messages. The samples' results may have other blocks."""
+        """Add the next samples and the log's own messages. Results of the samples may be in other blocks."""
         self._samples.add(trace)
         self._messages.add(own)
 

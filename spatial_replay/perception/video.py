@@ -331,7 +331,7 @@ _MOST_BOXES: Final = 1000
 
 
 class VideoFile:
-    """Frames of a video file, for one iteration. The first frame has the stamp 0.
+    """Frames of a video file, for one iteration. The first true frame has the stamp 0.
 
     Attributes:
         name: name of the file.
