@@ -285,7 +285,7 @@ class ClipSearch:
         self._known_windows: dict[tuple[int, int], bool] = {}
 
     def reasons(self, start_ns: int, end_ns: int) -> Iterator[Sentence]:
-        """Yield sentences on why the window cannot begin later or end earlier; times count from 0."""
+        """Yield sentences on why the window cannot begin later or end earlier; times are absolute."""
         first_index, last_index = np.searchsorted(self._times_ns, [start_ns, end_ns]).tolist()
         for verb, edge_index, shorter_window in (
             ("begins", first_index, (first_index + 1, last_index)),

@@ -122,7 +122,7 @@ class TextPlace(NamedTuple):
 
 
 class DeclarationChange(NamedTuple):
-    """Declaration that differs between two versions; `old` or `new` is None if it is missing there."""
+    """Declaration that differs between two versions; `old` or `new` is None if that version lacks it."""
 
     kind: DeclarationKind
     name: str

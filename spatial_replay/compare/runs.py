@@ -105,7 +105,7 @@ def align_runs(
 
     Args:
         times_ns: times of the samples of A and of B, at least one each.
-        zeros_ns: times of A and B that texts count from.
+        zeros_ns: zeros of times in texts about A and about B.
         results: pairs of results of both runs.
         align: "time", "progress", "progress:NAME", or the name of a spec, whose first change of sign is the
             event.
@@ -467,8 +467,8 @@ def _object_diff(a: Trace, a_rows: Integers, b: Trace, b_rows: Integers) -> tupl
     """Compare pairs of observations.
 
     Returns:
-        For each pair: whether it differs, the squared displacement of the mean of the vertices, and the
-        signed distance of the footprints, which is NaN without a difference.
+        For each pair: whether the observations differ, the squared displacement of the mean vertex, and the
+        signed distance of the footprints. The distance is NaN without a difference.
     """
     footprints_a, footprints_b = a.footprints.select(a_rows), b.footprints.select(b_rows)
     is_moved = ~_are_equal(footprints_a, footprints_b)
@@ -579,7 +579,7 @@ class RunSpecDiff:
         return not EditOutcome.of(self.a).same_as(EditOutcome.of(self.b))
 
     def sentences(self, zeros_ns: tuple[int, int]) -> Iterator[Sentence]:
-        """Yield sentences on the differences. Times of a run count from the run's zero."""
+        """Yield sentences on the differences. Times of a run are relative to the run's zero."""
         yield Sentence(" | ".join(map(outcome_text, (self.a, self.b))) + difference_text(self.a, self.b))
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, zeros_ns[0]))
@@ -787,7 +787,7 @@ class LogDiff(Printed, Displayed):
     Attributes:
         a, b: names of the logs.
         samples: number of compared samples of each log.
-        zeros_ns: times that sentences count from, one per log.
+        zeros_ns: zeros of times in sentences, one per log.
         alignment: correspondence of the samples.
         objects: differences of objects, sorted by `apart_ns` (see `compare_objects`).
         signals: differences of signals, in the order of their names.

@@ -251,7 +251,7 @@ class SpecDiff(Displayed):
         return title if self.name == self.old_name else f"{title} (was {self.old_name})"
 
     def sentences(self, first_ns: int, shown: Collection[DeclarationChange] = ()) -> Iterator[Sentence]:
-        """Yield one sentence for each change; times count from `first_ns`.
+        """Yield one sentence for each change; times are relative to `first_ns`.
 
         Args:
             shown: declarations whose lines are not repeated.
@@ -371,7 +371,7 @@ class SpecificationDiff(Printed, Displayed):
     Attributes:
         log: name of the log.
         samples: number of evaluated samples.
-        first_ns: time that sentences count from.
+        first_ns: zero of times in sentences.
         old, new: specifications.
         specs: differences of specs that are results in either version, in the new order. Renamed specs are
             last.

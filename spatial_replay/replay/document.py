@@ -117,7 +117,7 @@ def _untested_part(part: UntestedPart, first_ns: int) -> dict[str, Any]:
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
-    """Return the witness of a node's verdict as JSON. Times in its sentences count from `first_ns`."""
+    """Return the witness of a node's verdict as JSON. Times in its sentences are relative to `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
     document: dict[str, Any] = {
         **json_fields(witness, "node", "verdict", "lower", "upper", "time_ns", "obstacle"),

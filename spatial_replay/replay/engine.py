@@ -120,8 +120,8 @@ class Replayed:
     Attributes:
         log: base name of the log.
         samples: number of evaluated samples, without the samples that fill pauses.
-        first_ns: time that texts count from: the log's first sample (evaluated or not), or the zero that a
-            cut log records.
+        first_ns: zero of times in texts: the log's first sample (evaluated or not), or the zero that a cut
+            log records.
         start_ns, end_ns: times of the first and the last evaluated sample.
         faults: losses while reading, each with its place.
         remarks: remarks on the samples apart from losses; doubts come first.
@@ -239,7 +239,7 @@ class LogAccount:
             raise selection.nothing_to_evaluate(self._faults)
 
     def doubts(self, first_ns: int) -> tuple[Doubt, ...]:
-        """Return the doubts about the log. Times in their sentences count from `first_ns`."""
+        """Return the doubts about the log. Times in their sentences are relative to `first_ns`."""
         return distinct_doubts(self._doubts, first_ns)
 
     def summary(
@@ -252,7 +252,7 @@ class LogAccount:
         """Return the results together with the collected facts about the log.
 
         Args:
-            first_ns: time that texts count from.
+            first_ns: zero of times in texts.
 
         Raises:
             SpecificationError: a name is missing, and names are strict.
@@ -393,7 +393,7 @@ class Replay:
         Args:
             write: function that receives the messages of the annotated log, block by block; None makes no
                 messages.
-            begin: function that is called before `write` with the time that texts count from.
+            begin: function that is called before `write` with the zero of times in texts.
             layer: whether the source's own messages are left out.
             advance: function that is called with the number of samples of each evaluated block.
 
@@ -630,7 +630,7 @@ def replayed_specs(
         trees: formula tree and reported name of each stream.
         blocks: all samples of each stream as one block; None if nothing was kept.
         traces: function that reads the samples again.
-        zero_ns: time that sentences count from.
+        zero_ns: zero of times in sentences.
         units: declared units, see `unit_of`.
         has_series, has_leaves: whether the blocks have series, and whether they have leaves.
         doubts: doubts about the log.

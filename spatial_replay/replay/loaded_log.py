@@ -176,7 +176,7 @@ class MessageCursor:
         self._is_exhausted = False
 
     def take_before(self, end_ns: int) -> Messages:
-        """Move to a time, and return the messages before it that are not returned yet.
+        """Move to a time, and return the earlier messages that were not returned yet.
 
         Raises:
             LogError: the log can no longer be read.
@@ -704,7 +704,7 @@ class Playback:
         return join([next_messages, self._end()])
 
     def reach_ns(self, samples: int) -> int:
-        """Return the time that is a number of samples ahead; the end of the log if it has fewer samples."""
+        """Return the time of the sample that is `samples` ahead; the log's end if fewer samples are left."""
         sample_index = self._next_sample + samples - 1
         return int(self._times_ns[sample_index]) if sample_index < len(self._times_ns) else self.end_ns
 

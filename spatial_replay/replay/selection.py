@@ -193,7 +193,7 @@ def named_zero_ns(source: Source) -> int | None:
 
 
 def zero_ns(source: Source) -> int:
-    """Return the time that texts about a log count from: the zero in its metadata, or its first sample.
+    """Return the zero of times in texts about a log: the zero in its metadata, or its first sample.
 
     Raises:
         LogError: the log has no sample.
@@ -239,7 +239,7 @@ def absolute_ns(point: TimePoint, source: Source) -> int:
     """Return a time on the clock of a log.
 
     Raises:
-        LogError: the time counts from a sample, and the log has no sample.
+        LogError: the time is relative to a sample, and the log has no sample.
     """
     if point.origin == "last sample":
         return point.absolute_ns(last_ns=last_sample_ns(source))
@@ -253,7 +253,7 @@ def window_from_points(
 
     Raises:
         UsageError: the window is empty.
-        LogError: a time counts from a sample, and the log has no sample.
+        LogError: a time is relative to a sample, and the log has no sample.
     """
     whole_log = Window()
     start_ns = whole_log.start_ns if start is None else absolute_ns(start, source)
@@ -310,7 +310,7 @@ class CheckedTrace(NamedTuple):
 
     Attributes:
         missing: a warning for each missing name.
-        zero_ns: time that texts about the log count from.
+        zero_ns: zero of times in texts about the log (see function `zero_ns`).
     """
 
     trace: Trace

@@ -19,7 +19,7 @@ from spatial_replay.spec.load import load_specification, load_specifications
 _MARK: Final = b"\xef\xbb\xbf"
 """Byte order mark of UTF-8, which some editors write."""
 _SETTLE_S: Final = 0.04
-"""Time without a change of size or times after which a file counts as saved, seconds."""
+"""Time without a change of size or times after which a file is treated as saved, seconds."""
 _ERROR_SETTLE_S: Final = 0.1
 """Further wait for a file that has errors or is missing, because an editor may be writing it, seconds."""
 _PATIENCE_S: Final = 1.0
@@ -31,7 +31,7 @@ _STEP_MS: Final = 10
 
 
 _State: TypeAlias = tuple[int, int, int, int]
-"""Inode, size (bytes), and times of modification and of status change (ns). A save changes at least one."""
+"""Inode, size (bytes), and times of modification and of status change (ns). A save changes some of these."""
 
 
 class SpecificationFiles:
@@ -89,8 +89,8 @@ class SpecificationFiles:
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
         """Yield the files after each save that changes their text, or the error if they cannot be read.
 
-        Between saves it yields None, about ten times a second. A file counts as saved after 0.04 s without a
-        change of size and times. After a further 0.1 s, an invalid or missing file counts as an error.
+        Between saves it yields None, about ten times a second. A file is treated as saved after 0.04 s
+        without a change of size and times. After a further 0.1 s, an invalid or missing file is an error.
 
         Raises:
             UsageError: the library that watches files is not installed.

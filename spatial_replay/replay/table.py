@@ -31,7 +31,7 @@ Quantity: TypeAlias = Literal["value", "now", "lower", "upper"]
 TIME = "time_ns"
 """The title of the column of times."""
 SECONDS = "seconds"
-"""The title of the column of seconds since the zero of the log."""
+"""The title of the column with the seconds since the log's zero."""
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 
 _LONGEST_TEXT: Final = 60

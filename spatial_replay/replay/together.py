@@ -36,7 +36,7 @@ class ShortLog:
     """A log in memory, with its account.
 
     Attributes:
-        zero_ns: time that sentences count from.
+        zero_ns: zero of times in sentences.
         samples: number of evaluated samples, including samples that fill pauses.
         nbytes: size of the samples, bytes.
     """

@@ -93,7 +93,7 @@ Tree: TypeAlias = Linear | LeastOrGreatest
 
 
 def tree_of(expression: Expression, regions: Mapping[str, Outline]) -> Tree | None:
-    """Return an expression as minima and maxima of sums; None if it has too many sums or no such form."""
+    """Return an expression as minima and maxima of sums; None if it has no such form, or too many sums."""
     try:
         return _build(expression, regions)
     except OverflowError:
@@ -580,7 +580,7 @@ def _compared_texts(weights: Weights, threshold: Fraction, signs: tuple[str, str
 
 
 def _relation_text(weights: Weights) -> tuple[str, bool] | None:
-    """Return the relation that compares a sum with 0, and whether it holds above 0; None if there is none."""
+    """Return the relation that compares a sum with 0, and whether it holds above 0; None without one."""
     match weights:
         case ((Protrusion() as quantity, _),):
             return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False

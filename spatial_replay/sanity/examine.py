@@ -1,4 +1,4 @@
-"""Faults of a specification that are found without a run: it cannot be satisfied, or checks nothing."""
+"""Faults that are found without a run: a specification cannot be satisfied, or checks nothing."""
 
 from __future__ import annotations
 

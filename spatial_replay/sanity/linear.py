@@ -152,7 +152,7 @@ class _Tableau:
         """Move all variables into their bounds.
 
         Returns:
-            None if all variables are in their bounds, else the indexes of conflicting inequalities. The set
+            None if all variables are in their bounds, else the indices of conflicting inequalities. The set
             is empty after `MAX_PIVOTS` steps.
         """
         for variable in range(len(self._values)):

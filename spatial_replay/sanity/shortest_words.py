@@ -40,7 +40,7 @@ Cube: TypeAlias = dict[int, bool]
 """Required values of facts in one sample, by number of the fact."""
 
 MAX_NODES: Final = 100_000
-"""Maximum number of nodes in the diagrams of runs of one length."""
+"""Maximum number of nodes in the diagrams for runs of one length."""
 
 MAX_CONFLICTS_OF_A_LENGTH: Final = 400
 """Maximum number of excluded combinations of facts before the search skips a length."""
@@ -361,7 +361,7 @@ class WordSearch:
         return self._short(_together(runs)) is not None
 
     def another(self, length: int, avoided: Sequence[Word], *runs: Runs) -> Word | None:
-        """Return a run of given length in the intersection of some sets of runs; None if none is found.
+        """Return a run of given length in the intersection of the sets `runs`; None if none is found.
 
         Args:
             avoided: words that the run must not contain, as in `word_of_length`.
@@ -762,7 +762,7 @@ def reading_of(
     not. A looser reading only adds runs, so a run that it excludes is excluded by the formula, too.
 
     Args:
-        rate_hz: sample rate for bounds in seconds, Hz; without it, such bounds have no automaton.
+        rate_hz: sample rate for bounds in seconds, Hz; without a rate, these bounds have no automaton.
     """
     reasons: list[str] = []
     satisfying: list[Side] = []

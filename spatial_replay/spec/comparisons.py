@@ -317,7 +317,7 @@ class ComparisonBuilder:
         return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
 
     def _is_constant(self, written: ArgumentSyntax, scope: Scope) -> bool:
-        """Return whether an argument is a constant; parameters of unused macros count as constants."""
+        """Return whether an argument is a constant; parameters of unused macros are treated as constants."""
         match written:
             case NumberSyntax():
                 return True

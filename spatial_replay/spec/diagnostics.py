@@ -118,7 +118,7 @@ class Faults:
         return len(self.found) + self.unreported
 
     def add(self, span: Span, message: str, hint: str = "") -> None:
-        """Add a fault unless its place already has one; only count it if the report is full."""
+        """Add a fault unless its place already has one. If the report is full, only `count` grows."""
         if span in self.found:
             return
         if self.is_full:

@@ -197,7 +197,7 @@ class Measurement(_Arithmetic):
 
     @property
     def radius_effects(self) -> tuple[int, ...]:
-        """Change of the number per unit of enlargement of each term: 1, 0 or -1."""
+        """Change of the number per unit of a term's enlargement, by term: 1, 0 or -1."""
         return (0,) * len(self.terms)
 
 

@@ -224,7 +224,7 @@ def order_line(first: LimitedRelation, later: LimitedRelation) -> Line:
 PATTERNS: Final[tuple[Pattern, ...]] = ("always", "finally", "eventually")
 ALWAYS, FINALLY, EVENTUALLY = range(3)
 _MARGIN: Final = 3.0
-"""Margin of a limit from the nearest good run, as a multiple of good runs' mean distance."""
+"""Margin of a limit from the nearest good run, divided by the mean distance between good runs' values."""
 _FINEST: Final = 0.01
 """Least margin, as a fraction of the value."""
 _SURE: Final = 4.0
@@ -440,7 +440,7 @@ class FittedLimits:
         return np.where(np.isfinite(self.limits), np.clip(bits, 0.0, _MOST_BITS), 0.0)
 
     def events(self) -> list[LimitedRelation]:
-        """Return relations that hold at the end of all good runs but at no beginning, the rarest first."""
+        """Return relations that hold at the end of every good run, but not at its beginning; rarest first."""
         greatest_starts = np.stack([run.first[:, 1] for run in self.good], axis=-1).max(axis=-1)
         limits = self.limits[FINALLY]
         is_event = np.isfinite(limits) & (greatest_starts < limits) & (self.bits[FINALLY] > 0.0)

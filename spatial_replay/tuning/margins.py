@@ -170,7 +170,7 @@ class VariedConstant:
 
     @property
     def is_whole(self) -> bool:
-        """Whether both ends are whole numbers, so that the constant may count samples."""
+        """Whether both ends are whole numbers, so that the constant may be a number of samples."""
         return self.written.duration_ns is None and all(end % 1 == 0 for end in (self.low, self.high))
 
     @cached_property
@@ -511,7 +511,7 @@ class Margins:
 
     Attributes:
         runs: evaluated runs; methods identify a run by its index.
-        varied: constants in the order of a point; constants that count samples have whole numbers.
+        varied: constants in the order of a point; numbers of samples are whole numbers.
         directions: for each constant, 1 if a greater value is looser, -1 if it is tighter, None if unknown.
         axes: indices of the constants that a result depends on, by name of the result.
         evaluations: number of evaluations of a result on a run.
@@ -611,7 +611,7 @@ class Margins:
         return margin >= least and (margin > 0.0 or self.runs[run].is_good or least < 0.0)
 
     def _fitting(self, constant: VariedConstant) -> VariedConstant:
-        """Return a constant with a grid of valid values: whole numbers if it counts samples."""
+        """Return a constant with a grid of valid values: whole numbers for a number of samples."""
         end_by_value = {constant.value(0): "least", constant.value(constant.steps): "greatest"}
         for value, end_name in end_by_value.items():
             try:

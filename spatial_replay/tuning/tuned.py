@@ -119,7 +119,7 @@ _MOST_BOXES: Final = 2_000
 _LEVELS, _PRECISION = 40, 1e-3
 """Maximum number of margins tried in one search, and relative precision of the widest margin."""
 _CONTRACTION: Final = 4
-"""Maximum number of bisections of one side of a box in one contraction."""
+"""Maximum number of bisections per side of a box in one contraction."""
 
 
 class Feasibility(NamedTuple):
@@ -934,8 +934,8 @@ def tune_runs(
     All constants are tightened together in proportion to their ranges, and then one by one.
 
     Args:
-        ranges: range to try by name of the constant; None for the range in the text. If it is empty, all
-            constants with a range in the text are tuned.
+        ranges: range to try by name of the constant; None for the range in the text. If `ranges` is
+            empty, all constants with a range in the text are tuned.
         each: objects by template parameter.
         seed: seed of the search over several constants; the same seed finds the same values.
         advance: function that is called with the number of runs prepared since its last call.
