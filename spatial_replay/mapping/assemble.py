@@ -42,7 +42,7 @@ from spatial_replay.trace.facts import TopicFacts
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, LONG_PAUSE, Trace
 
 _FIRST_STEP: Final = 256
-"""Limit of messages before the first trace, low for an early first sample. It doubles after each trace."""
+"""Limit of messages before the first trace, low for an early first sample; doubled after each trace."""
 _LONGEST_STEP: Final = 8_192
 """Limit of messages between two traces."""
 
@@ -386,7 +386,7 @@ class _Assembling:
     def _settle(self, upto_ns: int, *, is_last: bool = False) -> Trace:
         """Return the new final samples up to a time.
 
-        Messages that arrive later with earlier times are valid only after that time.
+        A message that arrives later, with a time up to `upto_ns`, is valid only after `upto_ns`.
 
         Args:
             is_last: whether the log ends here, so that no message waits.
@@ -757,7 +757,7 @@ class _Silences:
 
 
 _MOMENT_S: Final = 0.001
-"""Wait for further messages of the same time, seconds, if all messages arrive in the order of time."""
+"""Waiting time for messages of equal time, seconds, if all messages arrive in the order of time."""
 
 _MOST_HELD: Final = 4_096
 """Limit of observations that wait for transforms; further observations do not wait."""
@@ -930,9 +930,9 @@ class LiveAssembler(_Assembling):
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
         """Make objects and signals of lost topics unknown; return the new samples.
 
-        A last sample shows the loss. The objects and signals stay unknown until their topic
-        reports them again. A topic is lost when its connection ends, or after a silence. Messages of other
-        topics wait as before.
+        A last sample shows the loss. The objects and signals stay unknown until their topic reports them
+        again. A topic is lost when its connection ends, or after a silence. Messages of other topics wait as
+        before.
         """
         newly_lost_topics = self._names_of(topics) - self._lost
         if not newly_lost_topics:

@@ -99,7 +99,7 @@ def contradictions(log: Log, mapping: LogMapping) -> Iterator[Doubt | str]:
 
 
 def _group_topics(clauses: Mapping[str, str]) -> list[list[str]]:
-    """Return groups of topics, one per sentence: one group if topics are many, else by equal clauses."""
+    """Return groups of topics, one per sentence: a single group for many topics, else one per clause."""
     if len(clauses) >= _MANY_TOPICS:
         return [list(clauses)]
     groups: dict[str, list[str]] = {}

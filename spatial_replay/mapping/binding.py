@@ -322,7 +322,7 @@ class Binding:
         uncertainty: radius (float) or its column (int); None without a radius.
         polygon: getter of corners or rings; None without an outline.
         has_rings: whether `polygon` returns the holder of rings instead of corners.
-        class_names: names by number of a protobuf enum.
+        class_names: value names of a protobuf enum, by number.
         unset: (column, path, default) of numbers that a protobuf sender may leave unset.
         frame: getter of a frame's name, and whether it reads the message instead of the object; None if
             objects have no frame.
@@ -578,7 +578,7 @@ def _default(path: FieldPath, example: object) -> float:
 
 
 def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
-    """Return the names by number of the first protobuf enum at the paths; {} without an enum."""
+    """Return the value names of the first protobuf enum at the paths, by number; {} without an enum."""
     for path in paths:
         with suppress(FieldError):
             if names := enum_names(path, example):
@@ -587,7 +587,7 @@ def _enum_of(paths: Sequence[FieldPath], example: object) -> Table[object, str]:
 
 
 def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout:
-    """Return a layout without alternatives that a sparse object lacks, because they would read as 0."""
+    """Return a layout without alternatives that a sparse object lacks, because missing fields read as 0."""
 
     def is_there(paths: Alternatives | str) -> bool:
         alternatives = (paths,) if isinstance(paths, str) else paths

@@ -26,7 +26,7 @@ def jump_remark(trace: Trace, episode: str) -> Sentence | None:
     """Return a remark on the longest jump of an object between two frames; None without a jump.
 
     A thrown or pushed object moves for several frames. A jumping object is at rest, or much slower, before
-    and after the jump. Causes are exchanged ranges of frames, and frames from before a reset.
+    and after the jump. Usual causes are exchanged ranges of frames, and frames from before a reset.
     """
     # a jump is compared with the steps next to it, so it needs three frames
     if len(trace) < 3 or not len(trace.footprints.radius):

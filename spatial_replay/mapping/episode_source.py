@@ -38,7 +38,7 @@ from spatial_replay.trace.trace import Trace, class_order, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 Report: TypeAlias = Callable[[str, int, str], None]
-"""Receiver of invalid footprints: name of the object, frame number, and the rest of the sentence."""
+"""Receiver of invalid footprints: name of the object, frame number, and the sentence without its subject."""
 
 
 class ReadEpisode(NamedTuple):
@@ -60,7 +60,7 @@ class EpisodeSource(Source):
     Attributes:
         number: number of the episode.
         mapped_by: mapping of the episode; None for a data set that names its bodies.
-        episode: content read in advance; None if iteration reads it from the data set.
+        episode: content read in advance; None if iteration reads the data set.
     """
 
     data_set: DataSet

@@ -40,7 +40,7 @@ _MOST_LEAPS: Final = 4
 """Largest number of steps within which a return of an object to its place is detected."""
 
 _MOST_ROWS: Final = 32_768
-"""Limit of kept last reports of objects; the oldest reports are dropped."""
+"""Limit of reports that are kept for later steps and returns; the oldest reports are dropped."""
 
 FAR_LEAP: Final = 5.0
 """Least length of a suspicious step, in sizes of the object."""
@@ -485,8 +485,8 @@ class TopicEvidence:
         motions: motions of the topic's objects.
         objects: number of reports of objects.
         most_at_once: greatest number of objects in one message.
-        quaternion_length: lengths of quaternions other than zeros.
-        quaternions: number of quaternions other than zeros.
+        quaternion_length: lengths of quaternions, except quaternions of zeros.
+        quaternions: number of quaternions, except quaternions of zeros.
         upright: number of upright objects if quaternions have the mapping's order.
         upright_otherwise: number of upright objects if w is at the other end of quaternions.
         turned_otherwise: number of objects in `upright_otherwise` with a turn of more than 20 degrees.
@@ -502,7 +502,7 @@ class TopicEvidence:
         bottom, top: heights of the objects.
         uncertainty: radii of uncertainty.
         covariances: number of covariances.
-        zero_covariances: number of covariances of zeros.
+        zero_covariances: number of covariances with zeros only.
         signal_chances: number of messages with signals, except the first two messages.
         signal_returns: (S,) number of messages in which a signal is back at its value of two messages before.
     """
@@ -574,7 +574,7 @@ class TopicEvidence:
 
     @property
     def is_called_heading(self) -> bool:
-        """Whether the field of the yaw has the name of an angle from north."""
+        """Whether the name of the yaw's field means an angle from north, such as `heading`."""
         return bool(_HEADING.search(self.turn_path))
 
     @property
@@ -591,7 +591,7 @@ class TopicEvidence:
 
     @property
     def angle_path(self) -> str:
-        """Path of a coordinate with the name of an angle; "" without such a coordinate."""
+        """Path of a coordinate whose name means an angle; "" without such a coordinate."""
         position = None if self.planned.mapping is None else self.planned.mapping.position
         paths = position if isinstance(position, tuple) else ()
         return next((path for path in paths if _ANGLE.search(path)), "")

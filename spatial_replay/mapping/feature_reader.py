@@ -54,7 +54,7 @@ class NumberPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BoundObject:
-    """An object of a mapping's entry, with the places of its numbers.
+    """An object from an entry of a mapping, with the places of the object's numbers.
 
     Attributes:
         key: key of the entry, for errors.
@@ -111,7 +111,7 @@ class BoundObject:
 
 
 class BoundSignal(NamedTuple):
-    """A signal of a mapping's entry, with the place of its number."""
+    """A signal from an entry of a mapping, with the place of the signal's number."""
 
     name: str
     place: NumberPlace

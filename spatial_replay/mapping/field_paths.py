@@ -177,7 +177,7 @@ def _snake_case(key: str) -> str:
 
 
 def type_name(value: object) -> str:
-    """Return a description of the type of a message, or of a part of a message."""
+    """Describe the type of a message, or of a message's part, for errors."""
     if isinstance(value, dict):
         return "the JSON object"
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -444,7 +444,7 @@ def is_list(value: object) -> TypeGuard[Sequence[object]]:
 
 
 def enum_names(path: FieldPath, message: object) -> dict[object, str]:
-    """Return the names by number of a protobuf enum at a path; {} for other fields."""
+    """Return the value names of a protobuf enum at a path, by number; {} for other fields."""
     if not path.steps:
         return {}
     owner = walk(FieldPath(path.text, path.steps[:-1]), message)
@@ -618,9 +618,9 @@ class NameTemplate:
     """A template for the names of objects: literal text and fields in turn.
 
     Attributes:
-        parts: texts, and tuples of alternative fields. The first existing field with a value is used. Unless
-            a field has this name, `index` is the object's index in its list or its key in a JSON object, and
-            `topic` is its topic.
+        parts: texts, and tuples of alternative fields. The first existing field with a value is used. `index`
+            is the object's index in its list or key in a JSON object; `topic` is the object's topic. A field
+            of the object with this name takes precedence.
     """
 
     text: str

@@ -54,7 +54,7 @@ class MappedSource(FileSource):
 
     Attributes:
         keep: topics whose raw messages are in the blocks, for copies of the log: "mapped" for topics that the
-            mapping reads, "all", or patterns such as "/camera/*". Several values add up.
+            mapping reads, "all", or patterns such as "/camera/*". Several values can be combined.
     """
 
     _: KW_ONLY

@@ -528,8 +528,8 @@ def _box_at(bounds: str | tuple[str, ...], element: object) -> tuple[float, ...]
 def _have_size(guess: Guess, messages: Sequence[object]) -> bool:
     """Return whether bounds have width and height instead of a second corner.
 
-    Names decide. Without such names, bounds have a size if the second corner of a box would be left of or
-    below its first corner.
+    Field names such as `height`, `xywh` and `xyxy` decide. Without such a name, bounds have a size if the
+    second corner of any box would be left of or below the first corner.
     """
     bounds = guess.bounds
     if bounds is None or isinstance(bounds, tuple):

@@ -108,7 +108,7 @@ def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
 
 
 def _find_unsupported_feature(events: Iterable[yaml.Event], noun: str) -> tuple[int, str] | None:
-    """Return line and text of the first tag, alias, lone surrogate or deep nesting; None if there is none.
+    """Return line and text of the first tag, alias, lone surrogate or deep nesting; None without a fault.
 
     Aliases and deep nesting could expand a short text beyond memory.
     """
