@@ -175,7 +175,7 @@ def decode_objects(
 
     Args:
         payloads: T messages.
-        times_ns: (T,) int64, their log times, which increase.
+        times_ns: (T,) int64, log times of the messages, which increase.
         concave: how polygons that are not convex are handled; our own logs hold none.
 
     Returns:

@@ -54,7 +54,7 @@ class ReadOptions:
         concave: how polygons that are not convex are handled: "decompose" or "hull".
         mapping: path of a mapping file, which assigns topics of an external log to objects.
         on_time_jump: "error", or "split" to end an external log where its clock jumps back.
-        rate: frames per second of annotations that count frames; 30 by default.
+        rate: frames per second of annotations whose times are frame numbers; 30 by default.
         lost: "drop" or "keep" annotations that are marked as out of the picture.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
             default, y points down in drone annotations, and up in all other files.

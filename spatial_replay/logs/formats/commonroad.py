@@ -35,7 +35,7 @@ class Element:
     """An element with its content.
 
     Attributes:
-        line: line of its start tag, from 1.
+        line: line of the start tag, from 1.
         text: text of the element without its children; a text longer than `LONGEST_TEXT` is cut.
     """
 
@@ -398,7 +398,7 @@ def _moving_states(
 
 
 def _state_or_unknown(element: Element, outline: Sequence[OutlinePart], report: ReportFault) -> ObstacleState:
-    """Return a state; an invalid state is reported, and `UNKNOWN` is returned."""
+    """Return a state; for an invalid state, report the fault and return `UNKNOWN`."""
     try:
         return _state(element, outline)
     except ScenarioError as error:

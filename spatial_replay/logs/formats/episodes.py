@@ -152,7 +152,7 @@ class DataSet:
     Attributes:
         path: path of the folder or file.
         kind: name of the format with its version, such as `LeRobot v3.0`.
-        fps: frames per second; None if the data set does not name them.
+        fps: frames per second; None if the data set does not store them.
         has_times: whether frames have times, so that `fps` is not needed.
         robot: type of the robot; "" if the data set does not name it.
         features: columns that a mapping can use, in the data set's order.
@@ -313,7 +313,7 @@ class DataSet:
         """Return the frames per second from the mapping or, if the mapping lacks `fps`, from the data set.
 
         Raises:
-            UsageError: neither the mapping nor the data set names them.
+            UsageError: neither the mapping nor the data set has frames per second.
         """
         fps = self.fps if reading.fps is None else reading.fps
         if fps is None:
@@ -325,7 +325,7 @@ class DataSet:
 
 
 MOST_BYTES: Final = 8 * 2**30
-"""Maximum number of bytes of numbers that are read at once, uncompressed."""
+"""Maximum uncompressed size of the numbers that are read at once, bytes."""
 SECOND_RUN: Final = "more than one run is in the episode, so it is not judged; record each run as an episode"
 
 

@@ -42,7 +42,7 @@ class _Rows(NamedTuple):
     """Rows of an episode in a file.
 
     Attributes:
-        is_whole: whether the range has no rows of other episodes.
+        is_whole: whether no rows of other episodes are between `begin` and `end`.
     """
 
     file: Path

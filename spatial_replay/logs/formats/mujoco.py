@@ -35,7 +35,7 @@ RIM_CORNERS: Final = 32
 """Number of corners of each rim of a tilted cylinder."""
 ELLIPSE_CORNERS: Final = 64
 UPRIGHT_COSINE: Final = math.cos(math.radians(5.6))
-"""Cosine of the tilt below which a cylinder is drawn as a rounded segment.
+"""Cosine of the largest tilt at which a cylinder is drawn as a rounded segment.
 
 The segment is too long by at most 0.5 % of the radius.
 """
@@ -85,7 +85,7 @@ class SceneModel:
     """A compiled model.
 
     Attributes:
-        names: names of its free bodies.
+        names: names of the free bodies.
         nq, nv: lengths of qpos and qvel.
         remarks: remarks on meshes that are left out, and on mocap bodies.
     """
@@ -247,7 +247,7 @@ def _rotations(quaternions: Floats) -> Floats:
 
 
 def _projection(geom: _Geom, centres: Floats, turns: Floats) -> FootprintBatch:
-    """Return n footprints of one part: projections of a geom at centres (n, 3), rotated by (n, 3, 3)."""
+    """Return n footprints of one part each: projections of a geom at centres (n, 3), rotated by (n, 3, 3)."""
     from mujoco import mjtGeom
 
     size, height = geom.size, centres[:, 2]
@@ -482,7 +482,7 @@ def _element(text: str, place: str) -> ElementTree.Element:
 
 
 def _include(parent: ElementTree.Element, folder: _Folder, place: str, depth: int) -> None:
-    """Replace includes by the content of files of the folder, or remove them."""
+    """Replace each include by the content of its file; remove includes of missing files."""
     for index, child in reversed(list(enumerate(parent))):
         if child.tag != "include":
             _include(child, folder, place, depth)

@@ -1,4 +1,4 @@
-"""Data sets of arrays over all steps, which mark the ends of episodes: OGBench in npz files, D4RL in HDF5."""
+"""Data sets of arrays over all steps. Flags mark the ends of episodes: OGBench in npz files, D4RL in HDF5."""
 
 from __future__ import annotations
 

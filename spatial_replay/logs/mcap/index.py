@@ -69,7 +69,7 @@ class ChunkPlace(NamedTuple):
         start_ns, end_ns: log times of the first and the last message.
         compressed: whether the place is a chunk; False for messages outside chunks.
         channels: channels of the messages, from the index; None if the index lists no channels.
-        has_checksum: whether a chunk without a checksum is damaged, as in our own logs.
+        has_checksum: whether each chunk must have a checksum, as in our own logs.
         size: decompressed size of a chunk, from the index or its head, bytes; 0 outside chunks.
     """
 
@@ -141,7 +141,7 @@ _BEFORE_COMPRESSION = RECORD_HEAD.size + 28
 
 @dataclass(slots=True)
 class Directory:
-    """Places of records in a file, and its declarations outside chunks.
+    """Places of records in a file, and the declarations outside chunks.
 
     Attributes:
         header: header record; None for an unreadable header.

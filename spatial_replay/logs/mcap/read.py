@@ -151,7 +151,7 @@ def iter_records(
 ) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
     """Yield places in their order, each with its decompressed records or its damage.
 
-    Threads read ahead from the stream, so the caller must not read from it.
+    Threads read ahead from the stream, so the caller must not read from the stream.
     """
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
     stream_lock, is_over = RLock(), False
@@ -190,11 +190,11 @@ _HEAD_BYTES: Final = _HEAD.itemsize
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """Messages and declarations in the bytes of a chunk, in their order.
+    """Messages and declarations in the bytes of a chunk, in the chunk's order.
 
     Attributes:
         heads: (M,) heads of the messages.
-        payloads: bounds of each message's payload in the bytes.
+        payloads: slices of the bytes, one for the payload of each message.
         declarations: opcodes and bodies of schemas and channels.
         breaks_off: whether the last record is incomplete.
     """
@@ -305,7 +305,8 @@ class ChunkWalk:
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary.
 
-        Chunks are read in time order, but a channel may be declared only in a chunk that is later in time.
+        Chunks are read in time order, but the only declaration of a channel may be in a chunk that is later
+        in time.
         """
         for _, content in iter_records(self.stream, sorted(self.places, key=lambda place: place.offset)):
             # damage is reported when the chunk is read again for its messages

@@ -40,7 +40,7 @@ CHUNK_NS = 10**9
 WHOLE_CHUNK_NS = 10 * CHUNK_NS
 """`CHUNK_NS` for a log that appears only when it is complete: fewer chunks are faster and smaller."""
 REPEAT_NS = 5 * 10**9
-"""Time after which a channel is declared again, nanoseconds; its first two chunks declare it, too.
+"""Time after which a channel is declared again, nanoseconds. A channel's first two chunks declare it, too.
 
 Declarations in every chunk would make an annotated log 15 % larger; at this interval, at most 5 %.
 """
@@ -70,7 +70,7 @@ _HEAD_BYTES: Final = _HEAD.itemsize
 # records MessageIndex and Chunk, field by field: https://mcap.dev/spec
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 _INDEX_ENTRY: Final = 16
-"""Size of an entry, bytes: log time and offset in the chunk, 8 bytes each."""
+"""Size of a message-index entry, bytes: log time and offset in the chunk, 8 bytes each."""
 _ZSTD: Final = "zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 
