@@ -72,7 +72,7 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
     Raises:
         UsageError: `path` is not a path, an option does not apply to the format, or the format is unknown.
         MissingFileError: there is no such file, or it cannot be opened.
-        LogError: the file has the ending of a log, but not its content.
+        LogError: the file has the ending of a log, but not the content of a log.
         RemoteError: an address does not answer.
     """
     argument: object = path
@@ -380,7 +380,7 @@ class Format(NamedTuple):
     Attributes:
         recognise: function that returns whether a file with the given first bytes has this format.
         open: function that opens a file, given the name of the format and options.
-        options: names of the `ReadOptions` that apply to the format, besides `concave`, which always applies.
+        options: names of the `ReadOptions` that apply to the format, except `concave`, which always applies.
     """
 
     recognise: Callable[[bytes], bool]
@@ -395,7 +395,7 @@ def _track_source(
     iter_traces: IterTraces,
     usual_axes: Axes = OUR_AXES,
 ) -> Source:
-    """Return the source of a track file; option `y_down` overrides the usual axes of its format."""
+    """Return the source of a track file; option `y_down` overrides the usual axes of the format."""
     axes = usual_axes if options.y_down is None else replace(usual_axes, y="down" if options.y_down else "up")
     return TrackSource(path, format_name, options, iter_traces=iter_traces, axes=axes)
 

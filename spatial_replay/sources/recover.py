@@ -119,13 +119,13 @@ def recover_log(
     Metadata and attachments are copied, too. Our own samples are left out if they cannot be decoded or repeat
     a time.
 
-    The result, and a metadata record of the output, list the losses. Without losses there is no record.
-    Recovering such an output again gives the same bytes.
+    The result, and a metadata record of the output, list the losses. Without losses, the output has no such
+    record. Recovering the output again gives the same bytes.
 
     Args:
         log: our own or an external MCAP log, a ROS 1 bag, or a file or folder of a ROS 2 bag.
         output: path of the output, which replaces an existing file once it is complete.
-        advance: function that is called with the number of messages of each step.
+        advance: function that is called with the number of messages read since the last call.
 
     Raises:
         UsageError: the log is a text file, or the output is an input.
