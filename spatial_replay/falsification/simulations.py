@@ -53,7 +53,7 @@ class Parameter:
         rest: value in the run without variations; None if the parameter has no value in that run.
         group: name of a group of parameters, which a search resets to rest together.
         unit: "m", "rad", "s", or "".
-        is_drawn: whether values are drawn instead of optimised, because they have no order: seeds.
+        is_drawn: whether values are drawn instead of optimised. Seeds are drawn, because they have no order.
     """
 
     name: str
@@ -332,7 +332,8 @@ class ScenarioRuns:
 
     Attributes:
         spec_options: options of `record` for the specifications: files, constants.
-        is_planned: whether the planner acts instead of the script. Its goal is the scenario's specification.
+        is_planned: whether the planner acts instead of the script. The planner's goal is the scenario's
+            specification.
     """
 
     name: str

@@ -124,7 +124,7 @@ class Replayed:
             log records.
         start_ns, end_ns: times of the first and the last evaluated sample.
         faults: losses while reading, each with its place.
-        remarks: remarks on the samples apart from losses; doubts come first.
+        remarks: remarks on the samples, without the losses in `faults`; doubts come first.
         missing: a warning for each name that the log lacks; objects and signals of these names are unknown.
         dropped: samples that the recorder dropped.
         unreadable: number of observations without a usable value: not finite, or too old.

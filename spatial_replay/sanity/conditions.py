@@ -580,7 +580,7 @@ def _compared_texts(weights: Weights, threshold: Fraction, signs: tuple[str, str
 
 
 def _relation_text(weights: Weights) -> tuple[str, bool] | None:
-    """Return the relation that compares a sum with 0, and whether it holds above 0; None without one."""
+    """Return the relation that compares a sum with 0, and whether it holds above 0; None if none does."""
     match weights:
         case ((Protrusion() as quantity, _),):
             return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False

@@ -71,7 +71,7 @@ def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
 
 
 def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
-    """Return the largest box in a part with the centroid and the proportions of the part."""
+    """Return the largest box in a part that has the centroid and the proportions of the part."""
     x, y = centre_of(Footprint((part,)))
     if len(part.vertices) < 3:
         half_side = part.radius / math.sqrt(2.0)

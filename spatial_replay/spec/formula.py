@@ -509,7 +509,7 @@ BooleanOperator: TypeAlias = Literal["not", "and", "or", "xor", "->", "<->", "sp
 `spec` has the value of its one operand. It stands for a spec that only repeats another spec under a new name.
 `given` and `with` occur only in expansions. They make an operator skip samples in which a rate has no value
 (see `judged_operands`). Their first operand is the condition that the rate has a value. Their last operand is
-the operand in the text.
+the operand as written.
 """
 
 

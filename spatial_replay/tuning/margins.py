@@ -414,7 +414,7 @@ def _of_term(old_term: Term, new_term: Term) -> Direction | None:
 
 
 Point: TypeAlias = tuple[int, ...]
-"""Index in the grid of each constant."""
+"""Grid index of each constant."""
 Parse: TypeAlias = Callable[[Mapping[str, Value]], Specification]
 
 _REMEMBERED: Final = 64
