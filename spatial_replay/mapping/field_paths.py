@@ -7,8 +7,8 @@
 
 A key in quotes may have dots, spaces and letters beyond ASCII: `'pose.x'`. A number below 0 counts from the
 end. `[*]` selects the elements of a list, or the values of a JSON object or a protobuf map. `[best]` selects
-the element with the highest score. `[index]`, in names, selects the element at the index, or key, of the
-object in its own list.
+the element with the highest score. In names, `[index]` selects an element of another list, at
+the object's index or key in the list of objects.
 
 `tracks[id=7]` is the last element of `tracks` whose field `id` is 7. `position[name=elbow]` is the element of
 `position` at the index of `elbow` in the neighbouring list `name`. Without a matching element the value is
@@ -288,7 +288,7 @@ def _score(result: object) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The step `[index]`: the element at the index, or the key, of an object in its own list."""
+    """The step `[index]`: the element of another list at an object's index or key in the list of objects."""
 
 
 Step: TypeAlias = str | int | Each | Keyed | Best | Place
@@ -485,7 +485,7 @@ def getter(path: FieldPath, example: object) -> Get:
     """Compile a path without `[*]` to a function from a message to the value at the path.
 
     The function is fast, but its errors (AttributeError, LookupError, TypeError) do not name the fields.
-    `walk` explains them.
+    `walk` explains these errors.
 
     Args:
         example: message of the type that the function reads.

@@ -42,7 +42,7 @@ from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 _WAITING_BYTES = 2**26
-"""Size limit of raw messages that wait for their samples, bytes. Above it, all messages are passed on."""
+"""Size limit of raw messages that wait for their samples, bytes. Above this size, no message waits."""
 
 _MOST_UNREAD = 20
 """Limit of undecodable topics listed one by one."""

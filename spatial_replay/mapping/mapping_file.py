@@ -223,7 +223,7 @@ class LogMapping:
         fixed_frame: frame into which coordinates are transformed; None for coordinates as they are.
         topics: entries of topics, in the file's order.
         max_gap_ns: pause of a topic, nanoseconds, beyond which its objects are unknown.
-        trims_ends: whether samples before the begin, and after the end, of a needed topic are left out.
+        trims_ends: whether samples before the start, and after the end, of a needed topic are left out.
         axes: axes of the fixed frame; without a fixed frame, axes of the messages.
         origin: latitude and longitude of the point (0, 0), degrees, for satellite fixes.
         accept: names of assumptions that the log may contradict.

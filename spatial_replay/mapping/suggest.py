@@ -526,7 +526,7 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
-    """Yield the frame of each object with a frame according to the layout."""
+    """Yield the frame of each object, at the layout's path; objects without a frame are skipped."""
     alternatives = [FieldPath.of(path) for path in layout.frame]
     for message, element in _iter_objects(layout, examples):
         roots = [(path, message if path.from_message else element) for path in alternatives]

@@ -1,8 +1,8 @@
 """Track objects and signals through a log: pending messages of all topics in, traces at given times out.
 
 `rows_from_detections` converts detections to checked observations in the fixed frame. `events_from_messages`
-arranges them in a timeline, together with the departures of objects. `Events.state` reads the timeline at
-the times of samples.
+arranges the observations in a timeline, together with the departures of objects. `Events.state` reads the
+timeline at the times of samples.
 
 The tracker holds the last state of every object and signal. So a log can be processed in parts.
 """
@@ -48,7 +48,7 @@ class Events:
     Attributes:
         name, time_ns, class_code: (E,) int64.
         row: (E,) int64, row number of the observation, or `LEFT`.
-        expires_ns: (E,) int64, time at which the object leaves without another event.
+        expires_ns: (E,) int64, time at which the object leaves if no other event follows.
     """
 
     name: Integers
@@ -312,7 +312,7 @@ def _transform_solids(solids: Solids, transforms: Transforms) -> Solids:
 def _radius(covariance: Floats) -> Floats:
     """Return the longer half axis (R,) of the ellipse in the plane of each covariance (R, 3, 3).
 
-    The result is NaN for a negative variance, because some programs mark an unknown covariance so.
+    The result is NaN for a negative variance, with which some programs mark an unknown covariance.
     """
     variance_x, covariance_xy, variance_y = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     # the larger eigenvalue of [[variance_x, covariance_xy], [covariance_xy, variance_y]]

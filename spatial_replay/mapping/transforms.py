@@ -92,7 +92,7 @@ def yaw_of(matrices: Floats) -> Floats:
 
 
 def is_upright(matrices: Floats) -> Booleans:
-    """Return for each rotation (N,) whether it keeps the z axis vertical, up or down."""
+    """Return for each rotation (N,) whether the z axis stays vertical, up or down."""
     return np.asarray(np.hypot(matrices[:, 0, 2], matrices[:, 1, 2]) <= _UPRIGHT)
 
 
@@ -222,7 +222,7 @@ class _Series(NamedTuple):
     """The transforms of one child frame, ordered by stamp or by clock.
 
     Attributes:
-        still: number of static transforms, which come first. They are not interpolated.
+        still: number of static transforms, which come first and are not interpolated.
         parents: names of parents.
         parent: index of each transform's parent in `parents`.
     """

@@ -187,7 +187,7 @@ MOST_FAULTS = 100
 
 
 def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> str:
-    """Read a text file from a path or an address; of a too large file, only the beginning.
+    """Read a text file from a path or an address; only the beginning of a file that is too large.
 
     Args:
         largest: size limit, bytes; at most one byte more is read.
