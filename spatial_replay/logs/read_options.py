@@ -55,7 +55,7 @@ class ReadOptions:
         mapping: path of a mapping file, which assigns topics of an external log to objects.
         on_time_jump: "error", or "split" to end an external log where its clock jumps back.
         rate: frames per second of annotations whose times are frame numbers; 30 by default.
-        lost: "drop" or "keep" annotations that are marked as out of the picture.
+        lost: whether to "drop" or "keep" annotations that are marked as out of the picture.
         y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
             default, y points down in drone annotations, and up in all other files.
         max_lateness: largest lateness of messages in an external log, such as "2s"; "all" sorts the whole log
@@ -220,7 +220,7 @@ class FaultList:
         self._moved_count = excess
 
     def take(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return the faults since the last call. With `last`, add a line that counts the later faults."""
+        """Return the faults since the last call. With `last`, add a line on the faults beyond the limit."""
         faults, self._pending = self._pending, []
         if last and self._fault_count > MOST_FAULTS:
             excess = self._fault_count - MOST_FAULTS

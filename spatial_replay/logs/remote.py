@@ -327,7 +327,8 @@ class FileVersion:
 class RemoteFile(PathLike[str]):
     """A file at an address, with its version and a cache of at most 256 MiB.
 
-    A change of the file after the first read is an error; two versions are never mixed. It is thread-safe.
+    A change of the file after the first read is an error; two versions are never mixed. All methods are
+    thread-safe.
     """
 
     def __init__(self, address: str) -> None:
@@ -788,7 +789,7 @@ _FILES_AT_ONCE: Final = 32
 class RemoteFolder:
     """A folder in a bucket. One request writes a whole file, so there are no partial files.
 
-    Names of files are relative to the folder. It is thread-safe.
+    Names of files are relative to the folder. All methods are thread-safe.
     """
 
     def __init__(self, address: str) -> None:
@@ -821,7 +822,7 @@ class RemoteFolder:
         return next(self._keys(""), None) is not None
 
     def names(self, below: str = "") -> list[str]:
-        """Return the sorted names of all files in the folder, or in its folder `below`.
+        """Return the sorted names of all files in the folder, or in its subfolder `below`.
 
         Raises:
             MissingFileError, RemoteError: the folder cannot be listed.

@@ -59,7 +59,7 @@ ORIGINAL_PREFIX = "/original"
 
 
 def copied_channel(channel: Channel) -> Channel:
-    """Return a copy's channel for messages of another program; on our topics, it gets `ORIGINAL_PREFIX`."""
+    """Return the channel of a copy for messages of another program; our topics get `ORIGINAL_PREFIX`."""
     is_ours = channel.topic == OBJECTS or channel.topic in DERIVED
     return replace(channel, topic=ORIGINAL_PREFIX + channel.topic) if is_ours else channel
 
@@ -113,7 +113,7 @@ ZERO = "zero_ns"
 """Key in `METADATA`: time zero of texts about the log; by default, the time of the first sample."""
 
 ENDING = "spatial_replay_ending"
-"""The metadata record at the end of a recording: number of samples, and how it ended."""
+"""The metadata record at the end of a recording: number of samples, and how the recording ended."""
 
 TRIGGER = "spatial_replay_trigger"
 """The metadata record of a clip: trigger and its time, and the requested and the available durations."""
@@ -156,7 +156,7 @@ _IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})
 
 
 def is_image_type(name: str) -> bool:
-    """Return whether messages of a type are images or frames of a video: of ROS or of Foxglove."""
+    """Return whether messages of a type are images or video frames of ROS or Foxglove."""
     # ROS writes sensor_msgs/msg/Image, Foxglove foxglove.RawImage
     package, _, short_name = name.replace(".", "/").rpartition("/")
     return short_name in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
