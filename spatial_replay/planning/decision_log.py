@@ -88,7 +88,7 @@ _FIELD_TYPES: Final[Mapping[str, PackedElementField.NumericType.ValueType]] = Ma
 
 
 class TurnedMap(NamedTuple):
-    """A candidate's map for one orientation of the object; `turn` is an index of the map's turns."""
+    """A candidate's map for one orientation of the object; `turn` is an index into the map's `turns`."""
 
     candidate: Candidate
     turn: int
@@ -123,7 +123,7 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers, ways: Ways |
     """Return a map as a message; viewers draw it below the scene. Blocked cells are NaN and transparent.
 
     Args:
-        ways: ways among which the push to the map's target was chosen.
+        ways: ways that were compared for the push to the map's target, or None.
     """
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
@@ -202,11 +202,11 @@ def explain(
     bans: Sequence[Ban],
     ways: Ways | None,
 ) -> None:
-    """Add to a candidate the relations of its map, the causes of blocked cells, and the rule of its target.
+    """Add to a candidate its map's relations, the causes of blocked cells, and the rule for the target.
 
     Args:
         bans: constraint set of the candidate's edge.
-        ways: ways among which the candidate's target was chosen.
+        ways: ways that were compared for a push to the candidate's target, or None.
     """
     target = candidate.target
     if candidate.rejected.startswith(NOWHERE):
@@ -487,7 +487,7 @@ def layers_of(candidate: Candidate, settings: Settings) -> MapLayers:
 
 
 def _ways_of(step: Step, planner: Planner) -> dict[Candidate, Ways]:
-    """Return the ways among which the chosen candidate's push was chosen; empty without a push."""
+    """Return the ways that were compared for the chosen candidate's push; empty without a comparison."""
     if planner.settings.skill != "push":
         return {}
     return {
@@ -682,7 +682,7 @@ def _heading(decision: PlanDecision) -> str:
 
 
 def _place_facts(candidate: PlanCandidate, edge: PlanEdge, margin: float) -> str:
-    """Return the robustness of a target, the relations that limit it, and the length of its path."""
+    """Return a target's robustness, tightest relations, path length, cost of room, and rule."""
     target = candidate.target
     # negations are left out: a negation is often one of several alternatives, which limits nothing
     relations = [conjunct for conjunct in candidate.conjuncts if not conjunct.text.startswith("not (")]
@@ -733,10 +733,10 @@ def joint_suffix(edge: PlanEdge) -> str:
 
 
 def _edge_lines(edge: PlanEdge, first_edges: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
-    """Yield lines on an edge; lines of a candidate that equal an earlier edge's lines are not repeated.
+    """Yield lines on an edge. A rejected candidate with the lines of an earlier edge refers to that edge.
 
     Args:
-        first_edges: first edge with the lines of a candidate; new lines are added.
+        first_edges: name of the first edge for the lines of each candidate; this function adds its edge.
     """
     route = _path(edge) + (edge.order and f"; {edge.order}")
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {route}"
@@ -798,7 +798,7 @@ def place_text(target: PlanTarget) -> str:
 
 
 def _some(texts: Sequence[str]) -> str:
-    """Return alternatives; from `_LONGEST` characters on, the number of further alternatives."""
+    """Return alternatives as text; a long text ends with the number of further alternatives."""
     text_ends = list(accumulate(map(len, texts)))
     listed_count = max(1, sum(end <= _LONGEST for end in text_ends))
     rest_text = f" or {len(texts) - listed_count} more" if listed_count < len(texts) else ""

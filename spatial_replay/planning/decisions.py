@@ -80,8 +80,8 @@ class Target:
         x, y: centre of the object at the target, footprint units.
         turn: angle by which the object is turned, radians.
         yaw: orientation of the object at the target, radians; None for an object without orientation.
-        waypoints: points (x, y) of the path, including its start and end. Only these two are given if the
-            robot may choose the path.
+        waypoints: points (x, y) of the path, including its start and end. The start and the end alone
+            are given if the robot may choose the path.
         robustness: robustness of the progress set with the object at the target.
     """
 
@@ -155,7 +155,7 @@ class Consideration:
             planner does not look ahead.
         is_joint: whether several objects are moved for the edge. The chosen candidate's map then has the
             other objects at the ends of their motions.
-        failed: number of failed motions for the edge that count as attempts.
+        failed: greatest number of failed motions that one object has for the edge.
         order: reason why the edge precedes edges of equally short paths; empty without such edges.
     """
 
@@ -211,7 +211,7 @@ class Step(Displayed):
         target: object to move and its target pose; None without a motion.
         pruned: all pruned edges with their reasons.
         reason: sentence on the decision.
-        ahead: states that a wait expects from time alone; empty for any other wait.
+        ahead: states that the automaton visits while only time passes, for a wait; otherwise empty.
         lost: time and cause of the loss of acceptance; None while the specification can be satisfied.
         search: search effort.
     """
@@ -234,7 +234,7 @@ class Step(Displayed):
         return self.considered[-1] if self.considered and not self.considered[-1].pruned else None
 
     def alternatives(self, count: int) -> tuple[Target, ...]:
-        """Return the best other places, the most robust first.
+        """Return the best places apart from the target, the most robust first.
 
         These places are centres of free cells for any candidate of the aim. They are at least two cells from
         the target and from each other. The paths to these places, and later motions, are not checked.

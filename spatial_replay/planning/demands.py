@@ -71,7 +71,7 @@ def ban_of(guard: str, bans: Iterable[Ban]) -> Ban:
 
 
 def rules_of(bans: Sequence[Ban]) -> tuple[str, ...]:
-    """Return the rules for the way; all bans of a single literal make up one or two rules."""
+    """Return the rules for the way; bans with a single literal share one "keep" and one "avoid" rule."""
     required = [ban.failing[0] for ban in bans if not ban.holding and len(ban.failing) == 1]
     avoided = [ban.holding[0] for ban in bans if not ban.failing and len(ban.holding) == 1]
     other_rules = [ban.rule for ban in bans if len(ban.holding) + len(ban.failing) > 1]
@@ -88,7 +88,7 @@ def demand_of(literal: str, bans: Iterable[Ban], *, is_required: bool = True) ->
     """Return a literal of a goal as a demand: a relation to reach, to keep or to avoid.
 
     Args:
-        bans: bans on the way; the relations that bans require are relations to keep.
+        bans: bans on the way to the goal; a relation that a ban requires is a relation to keep.
         is_required: whether the literal must hold; otherwise the literal is one of several alternatives.
     """
     if not is_required:

@@ -176,13 +176,13 @@ MOST_MOTIONS: Final = 100
 Six objects are sorted in at most 14 motions, if three motions in ten fail.
 """
 _TURNED: Final = math.radians(10.0)
-"""Turn up to which an object counts as standing, radians."""
+"""Turn up to which an object counts as unmoved, radians."""
 BESIDE: Final = 1.5
 """Distance up to which a neighbour may block the push of an object, in radii of the object."""
 _LISTED: Final = 4
-"""Maximum number of edges that a reason names; further edges are only counted."""
+"""Maximum number of edges that a reason names; the number of further edges follows."""
 _TRIED: Final = "tried "
-"""First word of each kind of reason that counts motions."""
+"""First word of the kinds of reasons that give a number of motions."""
 LATER: Final = "what has to come after it cannot be done"
 """Kind of the reason for an edge that can be taken now, but does not lead to acceptance."""
 
@@ -230,7 +230,7 @@ def unknown_reasons(
 
 
 def groups_without_members(formula: Formula, sample: Sample) -> list[Group]:
-    """Return the open groups of a proposition that lack members; none if any part has enough members."""
+    """Return a proposition's open groups that lack members; none if one of its relations lacks no members."""
     empty_groups: list[Group] = []
     for leaf in _leaves_of([formula]):
         least_members = 1
@@ -394,7 +394,7 @@ def _other_edges(
     """Iterate over the transitions that must not be taken before an edge.
 
     Raises:
-        NoAutomatonError: a guard is cut; a motion could not avoid the missing cubes.
+        NoAutomatonError: a guard has more than `MAX_CUBES` cubes, and a motion could not avoid all of them.
     """
     source = edge[0]
     allowed_targets = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}

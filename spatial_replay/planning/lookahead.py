@@ -83,13 +83,18 @@ _MOST_VISITS: Final = 200
 _MOST_SOLUTIONS: Final = 6
 """Maximum number of arrangements of one set of objects."""
 _WIDEST: Final = 360_000
-"""Maximum number of cells of a stencil, over all orientations; larger pairs are only compared at the end.
+"""Maximum number of cells of a stencil, over all orientations.
+
+A pair of objects that needs more cells has no stencil. Its demands are tested only in finished arrangements.
 
 Two objects on 300 x 300 cells need this number, if they are not turned. Without stencils, most placements
 fail.
 """
 _MISS: Final = 0.5
-"""Cost, in maps, of a placement that does not meet all demands; it checks all cells of the other objects."""
+"""Cost of a placement that does not meet all demands, maps.
+
+The search for a placement tests all cells of the other objects.
+"""
 _MOST_NAMED: Final = 3
 """Maximum number of objects that a sentence names."""
 _ENOUGH: Final = 0.5
@@ -498,7 +503,7 @@ class Arranger:
         other_domains: Mapping[str, Booleans],
         stencils: Mapping[tuple[str, str], Booleans],
     ) -> Iterator[Cell]:
-        """Yield some cells: the most robust, the one that leaves most cells to other objects, and corners."""
+        """Yield the most robust cell, the cell that leaves most cells to other objects, and corner cells."""
         score = self._score(name)
         shares = np.ones(domain.shape)
         for movable, cells in other_domains.items():
@@ -1073,10 +1078,10 @@ class Lookahead:
         return tuple(hopeless_literals)
 
     def why_not(self, state: int) -> str:
-        """Return the infeasible condition of every path to acceptance, and the objects in the way.
+        """Return a condition that no arrangement meets although every path to acceptance needs it.
 
-        Without an infeasible condition, return a sentence on objects whose motions have no possible order, or
-        "".
+        The text also names the objects in the way. Without such a condition, return a sentence on objects
+        whose motions have no possible order, or "".
         """
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:

@@ -32,9 +32,11 @@ _FRAME_DEPTH: Final = 0.5 * DEPTH
 """Depth of lines on a map, cells."""
 
 _PIXELS: Final = 3.0
+"""Width of a path on the screen, pixels."""
 _CASING_PIXELS: Final = 6.0
+"""Width of the white line below a path, pixels."""
 _THIN_PIXELS: Final = 1.5
-"""Line widths on the screen, pixels: path, white line below the path, axes and contour."""
+"""Width of axes and contours, pixels."""
 
 _OBSTACLE_OPACITY: Final = 0.6
 _BLOCKED_OPACITY: Final = 0.3

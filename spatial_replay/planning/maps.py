@@ -61,7 +61,7 @@ OCCUPIED: Final = 2
 OUT_OF_REACH: Final = 3
 UNKNOWN: Final = 4
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
-"""Reason why a cell is blocked, by its number in `GradientMap.blocked`."""
+"""Reasons why cells are blocked, by their numbers in `GradientMap.blocked`."""
 
 _AT_ONCE: Final = 1 << 20
 """Maximum number of values that are measured at once; they take about 60 MB."""
@@ -441,7 +441,7 @@ _KINDS: Final[tuple[CauseKind, ...]] = ("constraint", "object", "reach", "unknow
 _KIND_OF: Final = {CONSTRAINED: 0, OCCUPIED: 1, OUT_OF_REACH: 2, UNKNOWN: 3}
 _FAILED: Final = 4
 _NUMBERS: Final = 1 << 24
-"""Size of the range of codes of each kind of cause."""
+"""Number of codes for each kind of cause."""
 
 
 class BlockedBy(NamedTuple):

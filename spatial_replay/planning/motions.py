@@ -787,7 +787,10 @@ class MotionOrder:
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
     ) -> TrackedObject | None:
-        """Return an object with the area of its path, which ignores `others`; None without a path."""
+        """Return a copy of an object that covers its whole path; None without a path.
+
+        The path ignores `others`. An object that is carried covers only its place.
+        """
         settings, tracked = self.expected.settings, scene.sample.objects[name]
         pose = self._place_of(scene, name)
         if settings.skill == "place":

@@ -47,7 +47,10 @@ _MOST_BEGINNINGS: Final = 9
 _CORNER: Final = math.radians(2.0)
 """Least change of direction at which a pushing robot takes hold again, radians."""
 _UNSURE: Final = 2
-"""Maximum deviation of an object, which may turn back, from its predicted course; unit: steps of a sample."""
+"""Maximum uncertainty of a predicted place, as a multiple of the motion between two samples.
+
+The object may stop or turn back.
+"""
 _JITTER: Final = 1.0 / 30.0
 """Motion between two samples up to which an object counts as standing, cells."""
 _DIRECTIONS: Final = 16
@@ -179,8 +182,8 @@ class Timing(NamedTuple):
 
     Attributes:
         step: distance that the object moves between two samples.
-        rest: longest time until the object starts to move, or continues its motion.
-        approach: longest time from the beginning of a motion until its object moves.
+        rest: longest remaining time until the object starts or continues to move; 0 while it moves.
+        approach: longest time for which an object stood before it started or continued to move.
     """
 
     step: float
@@ -218,7 +221,7 @@ class MotionTimes:
         self._sample_count += 1
 
     def timing(self, cell_size: float) -> Timing:
-        """Return the expected timing of the current motion, or of the next one.
+        """Return the expected timing of the current motion, or of the next motion.
 
         Without an earlier motion, the expected step is one cell.
         """
@@ -483,7 +486,7 @@ def _numbers_ahead(way: Sequence[tuple[float, float]], timing: Timing, skill: Sk
 
 
 def _beginnings(way: Sequence[tuple[float, float]], timing: Timing, skill: Skill) -> list[float]:
-    """Return the tested start times of a motion, as shares of its longest rests."""
+    """Return the tested lengths of a motion's rests, as shares of the longest rests."""
     longest_rest = max(timing.rest, timing.approach if _stops(way, skill) else 0)
     start_count = min(1 + math.ceil(longest_rest / _BEGINNINGS), _MOST_BEGINNINGS)
     return np.linspace(0.0, 1.0, start_count).tolist() if longest_rest else [0.0]
@@ -505,7 +508,11 @@ def _places(
     sample_numbers: Sequence[int],
     skill: Skill,
 ) -> Floats:
-    """Return the places (N, 2) of an object on a path in predicted samples; each rest is cut to a share."""
+    """Return the places (N, 2) of an object on a path in predicted samples.
+
+    Args:
+        rest_share: length of each rest, as a share of the longest rest.
+    """
     points = np.array(way)
     path_lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     rests = np.zeros(len(way))
@@ -527,8 +534,8 @@ def _course_ahead(tracked: TrackedObject, motion: Pose, sample_numbers: Sequence
 def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: Sequence[int]) -> Trace:
     """Return a trace that repeats a sample, with some objects moved along courses.
 
-    The trace is as long as the longest course. A shorter course, one place for each of `sample_numbers`, is
-    repeated.
+    The trace is as long as the longest course. A shorter course has one place for each of `sample_numbers`,
+    and is repeated.
     """
     start_trace = Trace.from_samples([sample])
     sample_count = max(len(course.places) for course in courses.values())
@@ -567,7 +574,11 @@ def _trace_ahead(sample: Sample, courses: Mapping[str, Course], sample_numbers: 
 
 
 def _ways_aside(start: tuple[float, float], pace: float) -> list[tuple[tuple[float, float], ...]]:
-    """Return straight paths from a place in all directions, short paths first; `pace` is a sample's step."""
+    """Return straight paths from a place in all directions, short paths first.
+
+    Args:
+        pace: length of a path per sample, footprint units.
+    """
     angles = [math.tau * number / _DIRECTIONS for number in range(_DIRECTIONS)]
     return [
         (

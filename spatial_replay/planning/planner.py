@@ -270,7 +270,10 @@ class Planner:
         )
 
     def _test(self, sample: Sample) -> None:
-        """Update `_tested_states`: empty groups' propositions count as open if acceptance stays possible."""
+        """Update `_tested_states`.
+
+        A proposition about an empty group may have any value that allows acceptance.
+        """
         empty_groups = [groups_without_members(formula, sample) for formula in self._formulas]
         closed_states = self.automaton.step_set(self._tested_states, self._symbol)
         symbol = [None if empty else value for empty, value in zip(empty_groups, self._symbol, strict=True)]

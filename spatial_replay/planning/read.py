@@ -377,7 +377,10 @@ class PlannerMessage(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """A sample with the planner's messages until the next sample; `sample` is None before the first one."""
+    """A sample with the planner's messages until the next sample.
+
+    `sample` is None for messages before the first sample.
+    """
 
     sample: Sample | None
     messages: list[PlannerMessage]
@@ -674,10 +677,10 @@ class Replanned(Printed):
         name: name of the log.
         changes: sentences on the changes; empty if nothing was changed.
         decisions: number of decisions in the log.
-        same: number of first decisions that are equal byte for byte, with all their maps.
-        alike: number of first decisions with an equal motion, including equal decisions.
+        same: number of decisions at the beginning that are equal byte for byte, with all their maps.
+        alike: number of decisions at the beginning with an equal motion, including equal decisions.
         recorded, redone: first decision with another motion; None without such a decision. `recorded` is also
-            None if the log has no decision at this sample.
+            None if the log has no decision at the sample of `redone`.
         messages: messages of the redone decisions, including the first different decision.
         faults: sentences on parts of the log that could not be read.
     """
@@ -947,7 +950,7 @@ def _on_redone_topics(messages: Messages) -> Messages:
 
 @dataclass(frozen=True)
 class ReplannedSource(SourceOf):
-    """A planned log with redone decisions next to the recorded ones."""
+    """A planned log with redone decisions next to the recorded decisions."""
 
     beside: Messages
 

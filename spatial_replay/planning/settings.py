@@ -307,9 +307,9 @@ class Settings:
         constraint_margin: margin by which constraints must be false, in the relations' unit, at least 0.
         room: preferred clearance of a placed object, footprint units, at least 0. Room allows later grasps of
             the object and its neighbours. Without targets of this room, targets with less room are used.
-        room_from: "later" keeps room from objects that may need a later motion. A placed object that may need
-            a later motion itself keeps room from all objects. Otherwise only robustness counts. "all" always
-            keeps room from all objects, even at the cost of robustness.
+        room_from: "later" keeps room from objects that may need a later motion; without such objects, only
+            robustness decides. A placed object that may need a later motion itself keeps room from all
+            objects. "all" always keeps room from all objects, even at the cost of robustness.
         attempts: number of failed motions of one object that prune an edge, at least 1. Refused motions count
             as failed.
         motions: maximum number of objects that are moved for one edge, at least 1. With 1, the planner takes
@@ -416,7 +416,7 @@ def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Se
 
     Args:
         path: path or address of the file.
-        base: settings to change. Without these, the file must have `area` and `cell_size`.
+        base: settings to change. Without `base`, the file must have `area` and `cell_size`.
 
     Raises:
         MissingFileError: there is no such file.
