@@ -42,8 +42,9 @@ if TYPE_CHECKING:
 
 
 LABEL: Final = "label"
+"""Column with the labels of judged episodes: "success" or "failure"."""
 AGREEMENT: Final = "agreement"
-"""Columns of judged episodes: the label, "success" or "failure", and its agreement with the verdict."""
+"""Column with the agreement of each label with the verdict."""
 _MOST_LOGS: Final = 2_000
 """Maximum number of rows of the matrix. Larger pages open slowly."""
 _MOST_SPECS: Final = 60

@@ -33,8 +33,8 @@ def write_pages(
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and a page about each log with a failing verdict.
 
-    A page of an earlier run about the same log and specifications stays; only its links are new. The worst
-    log comes first.
+    A page of an earlier run about the same log and specifications is reused, with new links. The
+    links follow the order of the logs, the worst first.
 
     Args:
         folder: folder of the pages, created if needed. The page over all logs is its `index.html`.

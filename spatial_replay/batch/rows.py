@@ -46,7 +46,7 @@ from spatial_replay.trace.trace import time_point_from_text
 ErrorKind: TypeAlias = Literal["usage", "log", "unfit", "machine"]
 """Source of an error: the user's options and files, the log, or the machine and this program.
 
-An "unfit" log can be read, but lacks a requirement of the suite.
+An "unfit" log can be read, but does not meet a requirement of the suite.
 """
 
 ResultName: TypeAlias = tuple[int, str, str | None]
@@ -55,7 +55,7 @@ ResultName: TypeAlias = tuple[int, str, str | None]
 _LONGEST: Final = 2_000
 """Length limit of a text in a row, characters."""
 _MOST: Final = 20
-"""Maximum number of entries in a list of a row. The last entry of a cut list counts the others."""
+"""Maximum number of entries in a list of a row. A further entry gives the number of omitted entries."""
 _KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
     ((UsageError, SpecificationError), "usage"),
     ((LogError, TraceError, GeometryError), "log"),
@@ -70,8 +70,8 @@ class Task:
     Attributes:
         log: path or address of the log.
         specs: texts of the specification files.
-        conditions: options of reading and evaluation. Objects of a parameter without a spec are ignored,
-            because the rows of the parameter's spec may be stored already.
+        conditions: options of reading and evaluation. Objects for a parameter are ignored if no spec in
+            `specs` has the parameter, because the rows of its specs may be stored already.
     """
 
     log: str
@@ -258,7 +258,7 @@ def rows_with_explanations(task: Task) -> TaskRows:
 
 
 def _refuse_unfit(task: Task, source: Source) -> None:
-    """Raise UnfitLogError if a log lacks a requirement of its suite."""
+    """Raise UnfitLogError if a log does not meet a requirement of its suite."""
     if not task.conditions.requires:
         return
     shortfalls = list(fitness_of(task.log, source).lacks(json.loads(task.conditions.requires)))
@@ -457,7 +457,7 @@ def spec_lines(file: Specification) -> dict[str, int]:
 
 
 def _some(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return texts of bounded length and number. The last text counts the texts that are left out."""
+    """Return texts of bounded length and number. The last text gives the number of omitted texts."""
     return tuple(map(_cut, first_lines(texts, _MOST)))
 
 

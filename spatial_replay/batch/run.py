@@ -180,14 +180,14 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
     """Return the logs of patterns, each log once, in the order of the patterns.
 
     The logs of one pattern are sorted. A folder has the logs in all its subfolders. A ROS 2 bag is one log,
-    and each episode of a data set is a log. A bucket lists the logs of `s3://bucket/folder/` and of patterns
-    of addresses.
+    and each episode of a data set is a log. An address names one log, but `s3://bucket/folder/` and addresses
+    with a pattern name all matching logs that the bucket lists.
 
     Args:
         folder: base of relative paths.
 
     Raises:
-        UsageError: patterns have no log; the message lists all of them, with their places.
+        UsageError: patterns have no log; the message lists all these patterns, with their places.
         RemoteError: a bucket cannot be listed.
     """
     logs_by_path: dict[str, FoundLog] = {}
@@ -332,7 +332,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
     """Find the logs of each case, and check the specifications and mappings of a suite.
 
     Raises:
-        SpecificationError: only specifications have faults; the error holds all of them.
+        SpecificationError: only specifications have faults; the error has all these faults.
         UsageError: the suite has other faults, such as patterns without a log, unusable files, or templates
             without objects. The message lists all faults with their lines.
         RemoteError: a bucket cannot be listed.
@@ -556,7 +556,10 @@ def run_batch(
 _GROUP_S: Final = 0.5
 """Target time for a group of logs, seconds."""
 _GROWTH: Final = 8
-"""Largest factor between the sizes of two groups. The time of the first group includes loading code."""
+"""Largest factor from the size of a finished group to the size of the next group.
+
+The time of the first group includes loading code.
+"""
 _MOST_IN_GROUP: Final = 64
 """Maximum number of logs in a group. A scheduler takes 4 to 6 ms per task, the time of a short log."""
 
@@ -628,7 +631,7 @@ def _key(identity: str | None, conditions: list[Any], meaning: str) -> str:
 
 
 def _key_of(conditions: Conditions) -> list[Any]:
-    """Return the conditions in the key of a row. Constants are not among them: `SpecFile.hash` has them."""
+    """Return the conditions in the key of a row, without constants: `SpecFile.hash` depends on constants."""
     mapping = conditions.mapping
     return [
         None if mapping is None else load_mapping(mapping).identity,

@@ -425,8 +425,9 @@ Key: TypeAlias = tuple[str, str, str, str, str | None]
 Change: TypeAlias = Literal["worse", "verdict", "gone", "better", "more", "new"]
 
 WORSE_THAN: Final = "worse than the baseline"
+"""Beginning of the failure of a worse result, if its spec was not edited."""
 EDITED_SINCE: Final = "edited since the baseline"
-"""Beginnings of the failures of worse results: of an unedited and of an edited spec."""
+"""Beginning of the failure of a worse result, if its spec was edited."""
 BASELINE_VERDICT: Final = "baseline_verdict"
 BASELINE_ROBUSTNESS: Final = "baseline_robustness"
 _NUMBER: Final = r"((?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?)"
@@ -471,7 +472,7 @@ class Tolerance:
         """Check that some result has the unit of the amount.
 
         Raises:
-            UsageError: the amount has no unit although results have one, or its unit is no result's unit.
+            UsageError: the amount has no unit although results have units, or no result has its unit.
         """
         units_of_results = sorted({unit for unit in units if unit and unit != "1"})
         if not self.amount or self.unit in units_of_results or not (units_of_results or self.unit):
@@ -723,12 +724,16 @@ def _describe_verdict(verdict: str | None, number: float | None) -> str:
 
 
 MOST_WORST: Final = 10
+"""Maximum number of worst rows in a report."""
 MOST_FLAKY: Final = 20
-"""Maximum numbers of worst rows and of flaky results in a report."""
+"""Maximum number of flaky results in a report."""
 
 
 def total_cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
-    """Return the headings of the number columns, and a row for each total: three names and its numbers."""
+    """Return the headings of the number columns, and a row for each total.
+
+    A row has the case, the spec, the requirement and the numbers.
+    """
     counts_by_heading = counts_of(rows)
     cell_rows = []
     for index, total in enumerate(rows):

@@ -91,12 +91,12 @@ class Conditions:
 DEFAULT_CONDITIONS: Final = Conditions()
 
 
+# beginnings of failures that are no violations
 UNTESTED: Final = "tested by nothing"
 VACUOUS: Final = "vacuous"
 DOUBTFUL: Final = "doubtful"
 DROPPED: Final = "the recorder dropped"
 DAMAGED: Final = "the log is damaged"
-"""Beginnings of failures that are no violations."""
 
 
 class Outcome(Protocol):

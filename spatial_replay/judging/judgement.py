@@ -169,7 +169,10 @@ class Judgement:
 
     @cached_property
     def failures(self) -> dict[str | None, tuple[JudgedEpisode, ...]]:
-        """Failed episodes by first failure, the most frequent first. The key None is any other failure."""
+        """Failed episodes by the name of their first failure, the most frequent first.
+
+        The key None has the failed episodes without a first failure.
+        """
         failed_rows = [row for row in self.rows if row.is_success is False]
         failure_counts = Counter(row.failure for row in failed_rows)
         failure_names = sorted(failure_counts, key=lambda name: (name is None, -failure_counts[name]))

@@ -101,7 +101,10 @@ def failure_lines(judgement: Judgement) -> Iterator[str]:
 
 
 def stage_lines(judgement: Judgement) -> Iterator[str]:
-    """Yield a line for each stage: the number of episodes with this final stage, and of labelled failures."""
+    """Yield a line for each stage: the number of episodes that end in the stage.
+
+    A line also has the number of labelled failures that end in the stage.
+    """
     failed_rows = [row for row in judgement.rows if row.label is False]
     heading, end_heading = f"stages of `{judgement.result}`", "at the end"
     width = max(map(len, (*judgement.stages, heading)))

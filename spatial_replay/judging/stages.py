@@ -24,10 +24,10 @@ from spatial_replay.spec.formula import Specification
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# columns with the stages of frames
 SUBTASK: Final = "subtask_index"
 PROGRESS: Final = "judge.progress"
 LANGUAGE: Final = "language_persistent"
-"""Columns with the stages of frames."""
 
 
 def episode_stages(

@@ -51,7 +51,11 @@ class Rate(NamedTuple):
 
 
 def mcnemar_p(won: int, lost: int) -> float:
-    """Return the p-value of McNemar's exact test. The arguments count pairs in which one side succeeds."""
+    """Return the p-value of McNemar's exact test.
+
+    Args:
+        won, lost: numbers of pairs in which only the one side, or only the other side, succeeds.
+    """
     return float(_scipy().binomtest(won, won + lost).pvalue) if won + lost else 1.0
 
 
