@@ -152,8 +152,8 @@ def diff_specifications(
 ) -> SpecificationDiff:
     """Compare two versions of a specification over a log: changes, their times and their causes.
 
-    Edits are found by evaluation. The old specification with the edit alone has the new verdict. The new
-    specification without the edit has the old verdict.
+    The cause of a changed verdict is a set of edits. The old specification with only these edits has the new
+    verdict, and the new specification without these edits has the old verdict.
 
     Args:
         log: a file in any format, or a trace.
@@ -320,7 +320,7 @@ def learn(
     profile: str = DEFAULT_PROFILE,
     **reading: Unpack[Reading],
 ) -> Learned:
-    """Find a short specification that all good runs satisfy. Some bad run violates each line.
+    """Find a short specification that all good runs satisfy. Each line is violated by at least one bad run.
 
     Without bad runs, the lines are common properties of the good runs: ends, invariants and orders of events.
     Limits have a margin to the good runs (see `docs/learning.md`).
@@ -438,7 +438,7 @@ def judge(
         same_start: largest distance between an object's two first places in a pair; by default 0.001.
         failures: specification file whose specs describe failures. Each failed episode then has its first
             failure.
-        stages: whether each episode has its final stage of the task.
+        stages: whether each row has the stage of the task in which its episode ends.
         output: folder of results; None stores no results.
 
     The other arguments and errors are the same as for `evaluate_logs`.

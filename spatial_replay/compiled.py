@@ -158,7 +158,7 @@ class Compiler:
             sys.setswitchinterval(previous_interval)
 
     def await_code(self) -> bool:
-        """Start a thread that loads the code of all trials, unless it runs. Return whether it was started."""
+        """Start a thread that loads the code of all trials. Return False if a thread or no folder exists."""
         with self.lock:
             if self.loader is not None or self.folder is None:
                 return False
@@ -167,7 +167,10 @@ class Compiler:
             return True
 
     def finish(self, count: int) -> bool:
-        """Clear the trials if there are at most `count`, and return whether the loading thread may end."""
+        """Clear the trials if there are at most `count`; the loading thread may then end.
+
+        Return whether the trials were cleared.
+        """
         with self.lock:
             if len(self.trials) > count:
                 return False
@@ -210,10 +213,11 @@ _Result = TypeVar("_Result")
 _PATIENCE_S: Final = 0.8
 """Time for which a process always interprets kernels, seconds: the time for loading numba and code."""
 _FIRST_S: Final = 1.5
-"""Replaces `_PATIENCE_S` while a kernel's time is a guess, seconds. Most take a tenth of the guess."""
+"""Value of `_PATIENCE_S` for a kernel whose time is a guess, seconds. Most take a tenth of the guess."""
 _COLD_S: Final = 2.0
+"""Limit of a kernel's interpreted time, seconds, if its machine code is not cached."""
 _WARM_S: Final = 0.03
-"""Limits of a kernel's interpreted time, seconds: `_COLD_S` without, `_WARM_S` with cached machine code."""
+"""Limit of a kernel's interpreted time, seconds, if its machine code is cached."""
 _GUESS_S: Final = 2e-6
 """Guessed time of a new kernel, seconds per array element."""
 _LONG: Final = 3.0
@@ -231,13 +235,13 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a kernel whose calls may take milliseconds. Other threads run during a call.
 
-    Short calls must not use such a kernel: a busy thread would get the interpreter for milliseconds.
+    Use it only for long calls: after a call, another busy thread may keep the interpreter for milliseconds.
     """
     return _Kernel(function, {"nogil": True, "no_cfunc_wrapper": True}, times=_LONG)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a kernel that the interpreter runs two to five times as fast.
+    """Return an equal kernel that is interpreted two to five times as fast.
 
     The interpreted kernel gets memoryviews of plain numbers instead of arrays. Named tuples have memoryviews
     only for arrays of one dimension. Such a kernel may read and set single elements, and slice one dimension.
@@ -255,7 +259,7 @@ def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
 def inlined(function: Callable[_Arguments, _Result], **options: bool) -> Callable[_Arguments, _Result]:
     """Return a piece that is inlined into its calling kernels.
 
-    A call counts references to its arrays. Inlining removes these counts.
+    A call updates the reference counts of its arrays. Inlining avoids these updates.
 
     Args:
         options: further options of numba. Versions without these options ignore them.

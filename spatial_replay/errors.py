@@ -9,7 +9,7 @@
     ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
     │   ├── RemoteError         an address that does not answer, or whose file changes
-    │   └── UnfitLogError       a log that lacks a requirement of a suite
+    │   └── UnfitLogError       a log that does not meet a requirement of a suite
     ├── OutputError             an output could not be written
     └── ClusterError            a cluster of computers is lost
 
@@ -131,7 +131,7 @@ class RemoteError(LogError):
 
 
 class UnfitLogError(LogError):
-    """A log that lacks a requirement of a suite: topics, rates, objects."""
+    """A log that does not meet a requirement of a suite: topics, rates, objects."""
 
 
 class OutputError(SpatialReplayError):

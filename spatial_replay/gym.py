@@ -90,9 +90,9 @@ class Judge(gymnasium.Wrapper[Any, Any, Any, Any]):
             rate_hz: steps per second. The reset of an episode has the time 0.
             result: name of the spec that judges; by default the last spec that no other spec uses.
             until: settled verdict that terminates an episode.
-            reward: "margin" or "progress": the reward is its gain since the previous sample, instead of the
-                environment's reward. A margin that is not finite gains 0, and the next gain counts from the
-                last finite margin.
+            reward: "margin" or "progress": the gain of this value since the previous sample replaces the
+                environment's reward. A margin that is not finite gains 0, and the next gain is relative to
+                the last finite margin.
             log: function that is called at the end of each episode, and returns the path of its log.
 
         Raises:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Final
 
+# red, green and blue from 0 to 1
 POSITIVE: Final = (0.0, 0.447, 0.698)
 NEGATIVE: Final = (0.835, 0.369, 0.0)
 NEUTRAL: Final = (0.55, 0.55, 0.55)
@@ -18,7 +19,7 @@ HOLDING: Final = (0.337, 0.706, 0.914)
 PENDING: Final = (0.941, 0.894, 0.259)
 """Colour of pending results: yellow. Unknown results are grey."""
 LABEL: Final = (0.95, 0.95, 0.95)
-"""Red, green and blue from 0 to 1."""
+"""Colour of labels: nearly white."""
 
 CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
 """Colours of curves in one plot, distinguishable with every common colour blindness (Okabe and Ito)."""

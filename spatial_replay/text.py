@@ -22,14 +22,14 @@ _Called = TypeVar("_Called", bound=Callable[..., Any])
 _LONGEST: Final = 300
 """Length limit of a printable text, characters."""
 _LONGEST_FORMULA: Final = 60
+# comparisons of names take quadratic time, and names in logs may be hostile
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
 _MOST_ALIKE: Final = 5
-"""Limits for comparisons of names. They take quadratic time, and names in logs may be hostile."""
 
 
 def is_encodable(text: str) -> bool:
-    """Return whether UTF-8 can encode a text. It cannot encode half of a surrogate pair."""
+    """Return whether UTF-8 can encode a text. UTF-8 cannot encode half of a surrogate pair."""
     return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
 
 
@@ -123,8 +123,9 @@ def plural(count: int, noun: str) -> str:
 
 
 DIGITS: Final = 4
+"""Number of significant digits in texts."""
 LARGEST_PLAIN: Final = 1e12
-"""Digits of numbers in texts, and the least number with an exponent."""
+"""Limit from which numbers in texts have an exponent."""
 
 
 def number_text(number: float) -> str:
@@ -136,7 +137,7 @@ def number_text(number: float) -> str:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Return a number with its unit: "0.05 m". Infinity and numbers of unit "1" have none."""
+    """Return a number with its unit: "0.05 m". Infinity and numbers of unit "1" are without a unit."""
     if names := names_from_unit(unit):
         name_texts = [f" ({json.dumps(name, ensure_ascii=False)})" for name in names if names[name] == number]
         return number_text(number) + "".join(name_texts[:1])

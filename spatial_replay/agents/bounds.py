@@ -208,7 +208,7 @@ class Files:
         self._temporary.cleanup()
 
     def path(self, name: str) -> str:
-        """Return the path of a file with the text of an argument, or the path in the text.
+        """Return the path that an argument gives, or the path of a new file with the argument's text.
 
         Raises:
             UsageError: the text is empty, too long, or the path of a file outside the roots.
@@ -227,7 +227,7 @@ class Files:
         return f"{name}{ending}"
 
     def option(self, option: str, name: str) -> list[str]:
-        """Return an option and the file of a text; an empty list for an empty text."""
+        """Return an option with the `path` of an argument; an empty list for an empty argument."""
         return [option, self.path(name)] if self._texts.get(name) else []
 
     def json(self, command: Sequence[str]) -> Any:

@@ -99,7 +99,7 @@ _OPTIONS: Final = {
     "--const": "constants",
     **{f"--{name}": name for name in ("mapping", "labels", "result", "hz", "good", "bad")},
 }
-"""Arguments of tools, by the pattern of the options that they replace in errors of commands."""
+"""Arguments of tools that replace options in errors of commands, by the pattern of the option."""
 
 
 class Tools:

@@ -336,7 +336,7 @@ class _CutResults:
             blocks.append(replace(block, series=block.series[..., :0].copy()))
 
     def warnings(self, source: Source, ends: RunEnds, zero_ns: int) -> Iterator[Diagnostic]:
-        """Yield a warning for each such result, at its window. Printed times count from `zero_ns`."""
+        """Yield a warning for each result with a cut window. The zero of printed times is `zero_ns`."""
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence
@@ -455,7 +455,7 @@ def _write_automata(
         quiet: whether the message about the file goes to standard error.
 
     Raises:
-        NoAutomatonError: a spec has no automaton; raised after the others are printed.
+        NoAutomatonError: a spec has no automaton; raised after all other automata are printed.
         UsageError: Graphviz is not installed.
         OutputError: the file cannot be written.
     """

@@ -115,7 +115,7 @@ def _end_with_parent() -> None:
 
 
 def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
-    """Append the logs and data sets in the folders to `documents`; a data set has a number of episodes."""
+    """Append a list of logs, and of data sets with numbers of episodes, in the folders to `documents`."""
     from spatial_replay.batch.run import find_logs
     from spatial_replay.batch.suite import LogPattern
     from spatial_replay.errors import UsageError
@@ -137,7 +137,7 @@ def _list_logs(folders: Sequence[str], documents: list[Any]) -> int:
 
 
 def _guard(readable: Sequence[str], *, is_online: bool) -> Callable[[str, tuple[Any, ...]], None]:
-    """Return an audit hook (PEP 578) that refuses files outside some folders, and connections.
+    """Return an audit hook (PEP 578) that refuses connections, and files outside some folders.
 
     The hook also refuses further files that mappings, bags and data sets name. Libraries in C that open files
     themselves bypass the hook.

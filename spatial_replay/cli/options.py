@@ -183,7 +183,7 @@ constants_option = click.option(
 
 
 def keep_option(text: str, default: str = "all") -> Callable[[_Command], _Command]:
-    """Return the repeatable option `--topics`, with the beginning and the end of its help."""
+    """Return the repeatable option `--topics`; its help begins with `text` and names `default`."""
     return click.option(
         "--topics",
         "keep",

@@ -23,7 +23,7 @@ WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
 """Number of results above which results are also counted by verdict."""
 _MOST_SHOWN: Final = 20
-"""Largest number of results that are all printed. Otherwise the worst `_SHOWN` results are printed."""
+"""Number of results up to which all results are printed; above, the worst `_SHOWN` results are printed."""
 _SHOWN: Final = 12
 VERDICT_COLOURS: Final = MappingProxyType({"satisfied": "blue", "violated": "red", "unknown": "yellow"})
 _CHANGE_COLOURS: Final = MappingProxyType({**VERDICT_COLOURS, "holds": "blue", "pending": "yellow"})

@@ -223,7 +223,10 @@ def _open_cameras(
 
 
 def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the shift of each camera's stamps, ns. All are moved together until none is negative."""
+    """Return the offset of each camera's stamps, ns.
+
+    All offsets are raised by the same time, so that none is negative.
+    """
     offsets_ns = [0] * len(names)
     for text in texts:
         name, _, duration_text = text.rpartition("=")

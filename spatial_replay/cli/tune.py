@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _PICTURES = (".png", ".svg", ".html")
 _MANY = frozenset({"--good", "--bad"})
 _MOST_LISTED = 20
-"""Maximum number of listed runs; JSON lists all."""
+"""Maximum number of listed runs; JSON lists all runs."""
 
 
 class ManyLogs(JsonCommand):

@@ -38,8 +38,8 @@ QUANTITY_CODES: Final[Mapping[str, int]] = MappingProxyType(
         "centroid_max_y": CENTROID_MAX_Y,
     }
 )
-"""Codes of quantities in kernels. Codes of quantities of two operands are below 100. Codes of least
-coordinates are even."""
+"""Codes of quantities in kernels. Quantities of two operands have codes below 100. Least coordinates have
+even codes."""
 
 _FLAT: Final = 1e-12
 """Least ratio of twice the area to the squared perimeter of polygons with an area centroid."""
@@ -311,7 +311,10 @@ def _part_protrusion(rows: Rows, a: int, part: int, b: int, enlargement: float) 
 
 @reference_free
 def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> float:
-    """Return a row's greatest coordinate for MAX_ quantities, minus its least for MIN_ quantities."""
+    """Return a row's greatest coordinate for MAX_ quantities.
+
+    For MIN_ quantities, return the row's negated least coordinate.
+    """
     if quantity == MIN_Z:
         return float(-rows.bottom[row])
     if quantity == MAX_Z:

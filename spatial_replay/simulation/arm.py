@@ -471,7 +471,7 @@ def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, Non
 
 
 def put_back(scene: Scene, name: str) -> Motion:
-    """Put down the held body at its current position, if there is one, and open the fingers."""
+    """Put a body down where it is if the fingers hold it, and open the fingers."""
     if scene.engine.fingers_touching(name):
         yield from set_down(scene, name, scene.place_of(name))
     yield from let_go(scene, WIDEST)
