@@ -7,8 +7,8 @@
 
 A key in quotes may have dots, spaces and letters beyond ASCII: `'pose.x'`. A number below 0 counts from the
 end. `[*]` selects the elements of a list, or the values of a JSON object or a protobuf map. `[best]` selects
-the element with the highest score. In names, `[index]` selects an element of another list, at
-the object's index or key in the list of objects.
+the element with the highest score. In names, `[index]` selects an element of another list, at the object's
+index or key in the list of objects.
 
 `tracks[id=7]` is the last element of `tracks` whose field `id` is 7. `position[name=elbow]` is the element of
 `position` at the index of `elbow` in the neighbouring list `name`. Without a matching element the value is

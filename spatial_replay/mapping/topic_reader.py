@@ -118,7 +118,7 @@ class Extractor:
     ) -> None:
         self.noted_frames: set[str] = set()
         self.unseen: tuple[str, ...] = ()
-        """Position paths that no object has had so far, if the mapping has `missing: 0`; otherwise ()."""
+        """Position paths if the mapping has `missing: 0`; () once an object has any of these fields."""
         if mapping.has_zeros_left_out and mapping.position is not None:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
