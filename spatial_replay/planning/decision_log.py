@@ -95,7 +95,7 @@ class TurnedMap(NamedTuple):
 
 
 def maps_of(step: Step) -> list[TurnedMap]:
-    """Return all maps of a step, by edge, in the order of the log.
+    """Return all maps of a step, edge by edge, in the order of the log.
 
     The last map is the chosen object's map in its target orientation, because a viewer shows the last message
     of a topic.

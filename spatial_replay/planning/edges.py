@@ -1,7 +1,7 @@
 """Edges of an automaton for a planner: progress and constraint sets, idle transitions, and attempts.
 
-The automaton takes idle transitions while all propositions keep their values. `X` and bounds in samples count
-samples, so time alone moves the automaton.
+The automaton takes idle transitions while all propositions keep their values. Formulas with `X`, or
+with bounds in samples, depend on the number of samples, so time alone moves their automata.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ Symbol: TypeAlias = tuple[bool | None, ...]
 """The value of each proposition; None if it is unknown."""
 
 MOST_MOTIONS: Final = 100
-"""Maximum number of motions for an edge, including successful and refused ones.
+"""Maximum number of motions for an edge, including successful and refused motions.
 
 Six objects are sorted in at most 14 motions, if three motions in ten fail.
 """
@@ -374,7 +374,9 @@ def equivalent_edges(
     pruned: Collection[Edge],
     symbol: Symbol,
 ) -> Iterator[Edge]:
-    """Iterate over edges from idle states with an equal progress set and at least the same constraints.
+    """Iterate over edges from idle states that are at least as hard to take as a considered edge.
+
+    Such an edge has the progress set of the considered edge, and at least its constraints.
 
     A deadline unrolls one edge into a copy for each remaining sample. If a copy is impossible now, the later
     copies are also impossible, and the planner skips them.
@@ -522,7 +524,7 @@ class Attempts:
 
     Attributes:
         motions: number of concluded motions, without refused motions.
-        planned: motions that were planned after the last motion; empty if the last motion failed.
+        planned: remaining motions of the plan after the last motion; empty if the last motion failed.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """Lookahead: a search for motions from a sample to acceptance, over predicted samples.
 
 A predicted motion brings its object to the target at once. Objects are moved one at a time if possible.
-Otherwise, or if an object would have to be moved twice, they are arranged together.
+Otherwise, or if an object would have to be moved twice, several objects are arranged together.
 
 An arrangement assigns cells to several objects: a constraint satisfaction problem over the cells of a grid.
 The demands on one object are a map. The demands on two objects depend only on the vector between the
@@ -375,7 +375,7 @@ class Arranger:
         return _Field(maps.turns, clearance, obstacle_distances, gaps, surpluses)
 
     def _meeting_cells(self, field: _Field, name: str, group: tuple[str, ...]) -> Booleans:
-        """Return the cells that meet every demand that concerns no other chosen object."""
+        """Return the cells that meet all demands on an object, except demands on several chosen objects."""
         is_met = np.ones(field.clearance.shape, np.bool_)
         for demand, surpluses in field.surplus.items():
             if all(movable == name or movable not in group for movable in self._names_by_demand[demand]):

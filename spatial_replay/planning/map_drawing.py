@@ -116,7 +116,7 @@ def map_drawing(
 ) -> SceneUpdate:
     """Return the message that draws the newest map, or an empty message without a map.
 
-    White lines below the path and below the outline at the target keep these visible on blue cells.
+    The path, and the object's outline at the target, have a white edge to be visible on blue cells.
     """
     message = SceneUpdate()
     if frame is not None:

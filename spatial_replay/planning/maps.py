@@ -434,8 +434,9 @@ MOST_CAUSES: Final = 1000
 """Maximum number of listed causes; cells with a further cause refer to the last listed cause."""
 
 CauseKind: TypeAlias = Literal["constraint", "object", "obstacle", "reach", "unknown", "failed"]
-"""Reason why a cell is blocked: a constraint would hold, an object or obstacle occupies the cell, the robot
-cannot reach it, the progress set is unknown, or a motion to a nearby place failed."""
+"""Reason why a cell is blocked: a constraint would hold, an object or an obstacle occupies the cell, or the
+robot cannot reach the cell. "unknown": the progress set is unknown. "failed": a motion to a nearby place
+failed."""
 
 _KINDS: Final[tuple[CauseKind, ...]] = ("constraint", "object", "reach", "unknown", "failed")
 _KIND_OF: Final = {CONSTRAINED: 0, OCCUPIED: 1, OUT_OF_REACH: 2, UNKNOWN: 3}
@@ -490,7 +491,7 @@ def map_layers(
     Args:
         settings: settings of the planner.
         failed: places (x, y) where motions of the object failed, which the object avoids.
-        tried: (A, rows, columns), further cells near failed targets.
+        tried: (A, rows, columns), further cells to avoid, near failed targets.
     """
     map_parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = map_parts.then.about.propositions

@@ -235,8 +235,8 @@ class Movables:
         """Return the target with a path that keeps the constraints, or the reason why there is no such path.
 
         If no constraint concerns the carried object, the robot may choose the path. On the path, constraints
-        are false by the margin plus half a cell's diagonal. If there is no such path, they are false by the
-        margin. The last resort is a path on which constraints are just false.
+        are false by the margin plus half a cell's diagonal. Without such a path, constraints are false by the
+        margin. As a last resort, constraints are just false.
         """
         settings, name = self.settings, target.name
         proposition_numbers = sorted({number for cube in constraints for number, _ in cube})

@@ -372,7 +372,7 @@ class Lookout:
         return replace(target, waypoints=(*direct_target.waypoints[:-1], (target.x, target.y)))
 
     def _others(self, motions: Mapping[str, Pose], target: Target) -> dict[str, Pose]:
-        """Return the motions of all other moving objects."""
+        """Return the motions of moving objects, without the object of the target."""
         least = least_motion(self._settings)
         return {
             name: motion

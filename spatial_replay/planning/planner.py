@@ -84,8 +84,8 @@ class Planner:
                 planner.conclude(outcome)
 
     The planner must observe every sample, also during an execution, because each sample moves the automaton.
-    Every run ends: an edge is pruned after `Settings.attempts` failed motions of one object, and after a
-    total of `MOST_MOTIONS`. Equal samples and outcomes give equal steps.
+    Every run ends: an edge is pruned after `Settings.attempts` failed motions of one object, and after
+    `MOST_MOTIONS` motions in total. Equal samples and outcomes give equal steps.
 
     Attributes:
         specification: specification to plan for.
@@ -204,7 +204,7 @@ class Planner:
 
     @property
     def is_accepting(self) -> bool:
-        """Whether the observed samples satisfy the specification, by its propositions."""
+        """Whether the observed samples satisfy the specification, for any values of unknown propositions."""
         return self._sample is not None and self._states <= self.automaton.accepting
 
     @property
@@ -221,7 +221,7 @@ class Planner:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the samples satisfy the specification, unless unknown propositions hid a violation.
+        """Whether unknown propositions may hide a violation of an otherwise satisfied specification.
 
         No later sample can resolve this doubt.
         """
