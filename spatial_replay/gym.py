@@ -135,7 +135,7 @@ class VectorJudge(_VectorWrapper):
     """A vector environment whose episodes are judged. `Judge` returns it for a vector environment.
 
     Values of `info["judge"]` are arrays with masks (`_verdict`, …). A step that ends and resets an episode
-    has the episode's last sample in `info["final_info"]["judge"]`.
+    has the values of the episode's last sample in `info["final_info"]["judge"]`.
     """
 
     def __init__(

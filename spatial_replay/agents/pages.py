@@ -72,7 +72,7 @@ def _document(path: str) -> str:
 
 
 def _sections(text: str, headings: Sequence[str]) -> str:
-    """Return the sections with these headings, without their subsections. No headings: the whole page."""
+    """Return the sections with these headings, without subsections; without headings, the whole page."""
     if not headings:
         return text
     lines: list[str] = []

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _ANNOTATIONS: Final = 10
 """Maximum number of annotations of one severity that GitHub shows per step."""
 _MOST_COMPARED: Final = 10_000
-"""Maximum number of worst rows among which failures of different kinds are searched."""
+"""Maximum number of worst rows that are searched for failures of different kinds."""
 
 
 def is_github() -> bool:

@@ -96,7 +96,7 @@ class ResultRow:
             for a violation.
         reason: sentence on the deciding atom, and on the atom of the robustness if it is another atom; ""
             under the paper's semantics.
-        explanation: sentences of `explain`, without the time since which a satisfied spec holds.
+        explanation: sentences of `explain`. A satisfied spec lacks the time since which it holds.
             `explanation`, `reason` and `atom…` are None for an unexplained result.
         tested: see `SpecResult.tested`; None for an error.
         untested: sentences on the parts whose `tested` is not "full".

@@ -159,7 +159,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
 
 
 _DATA_SET_FOLDERS: Final = frozenset({"meta", "data"})
-"""Folder names. The folder of a data set contains at least one of them."""
+"""Names of subfolders. The folder of a data set has at least one of these subfolders."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 

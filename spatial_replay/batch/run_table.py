@@ -207,7 +207,7 @@ class FlakyResult:
 
     @property
     def text(self) -> str:
-        """The result with both counts, in one line."""
+        """The result with the numbers of failed runs and of all runs, in one line."""
         name = result_name(self.spec or self.file, self.object)
         return f"{self.log}: {name} is flaky: {self.failed:,} of {self.runs:,} runs failed"
 
@@ -536,12 +536,12 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """The change with both numbers, in one line."""
+        """The verdict and robustness of the run and of the baseline, in one line."""
         return f"{self.log}: {result_name(self.spec, self.object)} is {self.failure} in the baseline"
 
     @property
     def failure(self) -> str:
-        """The change with both numbers, in a few words."""
+        """The verdict and robustness of the run and of the baseline, without the name of the result."""
         now = "gone" if self.change == "gone" else _describe_verdict(self.now, self.robustness)
         return f"{now}; it was {_describe_verdict(self.before, self.before_robustness)}"
 

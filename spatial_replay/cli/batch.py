@@ -510,7 +510,7 @@ def warn_of_damage(table: pa.Table) -> None:
 
 
 def _join_names(names: Sequence[str]) -> str:
-    """Return the first few names, and the number of others."""
+    """Return the first few names, and the number of further names."""
     other_text = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
     listed_names = [*names[:_MOST_NAMED], *other_text]
     return " and ".join(filter(None, [", ".join(listed_names[:-1]), listed_names[-1]]))

@@ -72,7 +72,7 @@ finding_format_option = click.option(
 
 @contextmanager
 def findings_of(specification: str, form: Form) -> Iterator[None]:
-    """Print the errors of an unparsable specification in the requested form, too."""
+    """Also print the errors of an unparsable specification in the requested form."""
     try:
         yield
     except SpecificationError as error:

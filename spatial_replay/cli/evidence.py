@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _AXES: Final = ("x", "y", "z")
 _LONG_PAUSE: Final = 2.0
-"""Least length of a pause that is shown with its time, in median periods."""
+"""Length above which a pause is shown with its time, in median periods."""
 
 
 def evidence_lines(overview: Overview) -> Iterator[str]:

@@ -112,7 +112,7 @@ _MOST: Final = 2**62
 
 
 def combined_code(columns: Iterable[NDArray[Any]], length: int) -> Integers:
-    """Return a code per row (length,). Codes are equal exactly if all columns of integers are equal."""
+    """Return a code per row (length,). Rows have equal codes exactly if they are equal in all columns."""
     code, code_count = np.zeros(length, np.int64), 1
     for column in columns:
         if not length or (column == column[0]).all():

@@ -181,11 +181,11 @@ def _separate(
 def _distance_by_edges(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
 ) -> float:
-    """Return the signed distance of two parts (without their radii) from all edges and vertices.
+    """Return the signed distance of two parts (without their radii), by a test of all edges and vertices.
 
     The penetration depth is along the normal of an edge. The distance of disjoint polygons is between two
-    vertices, or between a vertex and a point of an edge. In the second case it equals the separation along
-    the edge's normal.
+    vertices, or between a vertex and a point of an edge. In the second case, the distance equals the
+    separation along the edge's normal.
     """
     a_separation, a_nearest = _separate(vertices, edges, a_start, a_stop, b_start, b_stop)
     b_separation, b_nearest = _separate(vertices, edges, b_start, b_stop, a_start, a_stop)

@@ -287,7 +287,7 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """New episodes against old ones.
+    """Comparison of new episodes with old episodes.
 
     Attributes:
         new: name of the new episodes.

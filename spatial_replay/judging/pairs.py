@@ -21,7 +21,7 @@ from spatial_replay.judging.statistics import (
 from spatial_replay.text import plural
 
 SAME_START: Final = 0.001
-"""Largest distance between two equal first places, in units of length."""
+"""Largest distance at which two first places count as equal, in units of length."""
 _Place: TypeAlias = tuple[float, float, float]
 
 

@@ -173,7 +173,7 @@ class Arm:
 def _shares(*durations_s: float) -> list[float]:
     """Return the completed share of a motion after each tick: a cubic, slow at both ends.
 
-    The motion takes 1.5 times the longest duration, because it is slower than its maximum speed.
+    Durations are for maximum speed. The motion takes 1.5 times the longest duration: its mean speed is lower.
     """
     # the maximum speed of the cubic, in the middle, is 1.5 times its mean speed
     tick_count = max(1, math.ceil(1.5 * max(durations_s) * TICKS_PER_S))
@@ -237,7 +237,7 @@ class Scene:
 
 
 def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
-    """Return the distance, metres, from a footprint to the nearest of the others; below 0 for an overlap."""
+    """Return the distance, metres, from a footprint to the nearest of `others`; below 0 for an overlap."""
     batch = FootprintBatch.from_footprints([covered, *others])
     operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
     return float(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0, 0])
@@ -396,7 +396,7 @@ _SETTING_DOWN = 0.002
 _LOST_TICKS = 6
 """Number of ticks without contact after which a body counts as lost."""
 _STRAIGHT = 0.08
-"""Maximum length of a segment of a carried body's way, on which `travel` is nearly straight, metres."""
+"""Maximum length of a segment of a carried body's way, metres; `travel` is nearly straight on a segment."""
 _NEAR = 0.02
 """Tolerance of a placed body's position, metres."""
 
