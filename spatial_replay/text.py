@@ -70,7 +70,7 @@ class Sentence(str):
 
 
 CALENDAR_NS: Final = 500_000_000 * 10**9
-"""Least time since 1970, ns. Smaller times are read from clocks that start at power-on."""
+"""Least time that is measured from 1970, ns. Smaller times come from clocks that start at power-on."""
 
 
 def clock_text(time_ns: int, *, with_date: bool = False) -> str:

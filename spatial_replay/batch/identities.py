@@ -107,7 +107,7 @@ class _LogFiles:
 def states_of(paths: Sequence[str]) -> dict[str, str | None]:
     """Return a hash of the file states of each log: path, device, inode, size and times.
 
-    The hash of unchanged files is equal. Addresses and unreadable files have None.
+    Unchanged files have an unchanged hash. Addresses and unreadable files have None.
     """
     files = _LogFiles()
     return {path: None if is_address(path) else _state(path, files) for path in paths}

@@ -169,7 +169,7 @@ class FoundLog(NamedTuple):
 
     Attributes:
         name: path relative to the suite's folder, or address.
-        path: path or address that opens it.
+        path: path or address that opens the log.
     """
 
     name: str

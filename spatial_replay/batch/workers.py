@@ -139,7 +139,7 @@ def _results(
 
 @contextmanager
 def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
-    """Start processes, and end them at once if the block raises or adds suspects."""
+    """Start processes, and end them at once if the block raises an error or adds suspects."""
     context = forking_context([_PRELOADED])
     other_processes = set(multiprocessing.active_children())
     receiver, sender = multiprocessing.Pipe(duplex=False)

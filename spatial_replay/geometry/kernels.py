@@ -65,7 +65,8 @@ def reference_free(function: Callable[_Arguments, _Result]) -> Callable[_Argumen
 class Rows(NamedTuple):
     """The arrays of a `FootprintBatch`, and `edges` (V, 4) of its parts: outward normal (x, y) and length.
 
-    The fourth number of a part's first edge is the greatest distance from its first vertex to another vertex.
+    For a part's first edge, the fourth number is the greatest distance of the part's first vertex from a
+    vertex of the part.
     """
 
     part_start: Integers

@@ -63,7 +63,7 @@ class Agreement:
     """Numbers of episodes by label and verdict.
 
     Attributes:
-        both, neither: episodes whose label and verdict are both a success, or both a failure.
+        both, neither: episodes with a success by label and verdict, or with a failure by label and verdict.
         only_theirs, only_ours: episodes with a success only by the label, or only by the verdict.
         unstored: episodes whose label is a success in a state that is not stored, and whose verdict on the
             stored states is a failure.

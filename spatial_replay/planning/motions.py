@@ -1,7 +1,7 @@
 """Motions: candidates that can take an edge, predicted samples, and orders of several motions.
 
-An object in the way of another object is parked: it goes aside first, and to its own place, if any, later. So
-two objects can change places, and a pushed object can pass other objects.
+An object in the way of another object is parked: it is moved aside first. Later, a parked object with a
+target is moved to its target. So two objects can change places, and a pushed object can pass other objects.
 """
 
 from __future__ import annotations
