@@ -132,7 +132,8 @@ def number_text(number: float) -> str:
     """Return a number with four digits, for readers. JSON and logs have all digits."""
     # adding 0.0 removes the sign of -0.0
     number += 0.0
-    is_long = 10.0**DIGITS <= abs(number) < LARGEST_PLAIN
+    # from half below on, numbers round to five digits, which `g` would write as 1e+04
+    is_long = 10.0**DIGITS - 0.5 <= abs(number) < LARGEST_PLAIN
     return f"{number:.0f}" if is_long else f"{number:.{DIGITS}g}"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from xml.etree import ElementTree
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
@@ -13,7 +13,7 @@ from laws.strategies_spec import specification_texts
 from pages import shown
 from spatial_replay.html import element
 from spatial_replay.spec.format import iter_branches, label_of
-from spatial_replay.text import printable
+from spatial_replay.text import LARGEST_PLAIN, number_text, printable
 
 
 @given(st.text())
@@ -21,6 +21,15 @@ def test_any_text_is_shown_as_text(text):
     page = ElementTree.fromstring(element("p", text))
     assert page.text in (None, printable(text))
     assert len(page) == 0
+
+
+@example(9999.6)
+@given(st.floats(1e-4, LARGEST_PLAIN, exclude_max=True))
+def test_numbers_of_usual_size_have_no_exponent(number):
+    for signed in (number, -number):
+        text = number_text(signed)
+        assert "e" not in text
+        assert abs(float(text) - signed) <= 5e-4 * number
 
 
 @examples(50)
