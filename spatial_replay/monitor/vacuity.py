@@ -392,7 +392,7 @@ def _scopes(
 
 
 def _below(formula: Temporal, operand_index: int, scope: _Samples, windows: _Windows) -> _Samples:
-    """Return the samples (T,) of an operand, from the samples `scope` of its operator (see `_scopes`)."""
+    """Return the samples (T,) at which an operand counts, if its operator counts at the samples `scope`."""
     begins, ends = windows(formula)
     counting_samples = np.flatnonzero(scope & (begins < ends))
     begins, ends = begins[counting_samples], ends[counting_samples]

@@ -335,7 +335,8 @@ class Arranger:
             is_open = field.clearance > -self._slack
             cells = is_open & self._meeting_cells(field, name, group)
             if not cells.any():
-                # no cell is good even without all other objects, but a partner's motion may meet a demand
+                # no cell meets all demands on the object, but a partner may move to meet one,
+                # so all open cells count
                 cells = is_open
             for neighbour, gap in field.gaps.items():
                 if neighbour in blocked_counts:

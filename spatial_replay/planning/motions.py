@@ -593,7 +593,7 @@ class MotionOrder:
             ) is not None:
                 return sequence
         if len(parked_names) < self._max_parked:
-            # parking does not help an object whose motion takes another edge
+            # a motion that takes another edge is wrong even without a blocker, so nothing is parked for it
             scene_by_name = {
                 mover: scene.after(mover, self._place_of(scene, mover)) for mover in sorted(remaining_names)
             }

@@ -839,7 +839,11 @@ def _copy_metadata(sink: Sink, source: Source) -> None:
 
 
 def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) -> dict[str, object]:
-    """Return the options that differ from the defaults, in the format that `verification` reads."""
+    """Return the options that differ from the defaults, in the format that `verification` reads.
+
+    Args:
+        layer: whether the source's own messages are left out of the output.
+    """
     default_window = Window()
     recorded_options = dict(source.options)
     recorded_options |= {

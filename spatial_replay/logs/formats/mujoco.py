@@ -433,7 +433,7 @@ def _compile(source: _ModelSource) -> SceneModel:
 
 
 class _Folder:
-    """Files of a folder, found by the ends of paths on another machine."""
+    """Files of a folder, read by paths of another machine; the longest end of a path that exists is read."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = None if folder is None else folder.resolve()

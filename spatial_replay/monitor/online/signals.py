@@ -315,8 +315,9 @@ def run_table(
         part: row of the part.
         table: begin of the part's table in the `memory` of the channel.
         top: first free row of `work`.
-        position: index in the run of the first of the `count` samples.
-        begin: place of this first sample in the history.
+        position: index of the first sample in the run.
+        begin: place of the same sample in the history.
+        count: number of samples.
 
     Returns:
         the row of `work` with the part's value. The rows of its lower and its upper bound follow.
