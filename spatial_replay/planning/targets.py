@@ -312,13 +312,13 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
     At several orientations during the turn, no obstacle may touch the object and no constraint may hold.
     """
     step_count = math.ceil(abs(turn) / _SWEPT)
-    subject = gradient.made_of.now.about
-    yaw = subject.sample.objects[gradient.name].yaw or 0.0
+    map_subject = gradient.made_of.now.about
+    yaw = map_subject.sample.objects[gradient.name].yaw or 0.0
     yaws = tuple(yaw + turn * number / step_count for number in range(1, step_count))
     if not yaws:
         return np.ones(grid.shape, np.bool_)
     workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
-    maps = proposition_maps(*subject, gradient.name, workspace, grid)
+    maps = proposition_maps(*map_subject, gradient.name, workspace, grid)
     is_kept = danger_of(maps, gradient.made_of.constraints) < -settings.constraint_margin
     return np.asarray(((maps.clearance > workspace.clearance) & is_kept).all(axis=0))
 
@@ -336,10 +336,10 @@ def is_clear_leg(gradient: GradientMap, leg: Sequence[tuple[float, float]], sett
     if all(gradient.clearance[0][grid.cell(*point)] > least_clearance for point in points):
         return True
     # maps of one cell without propositions measure only the clearance
-    subject = gradient.made_of.now.about
+    map_subject = gradient.made_of.now.about
     return all(
         proposition_maps(
-            (), subject.regions, subject.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
+            (), map_subject.regions, map_subject.sample, gradient.name, workspace, _spot(x, y, grid.cell_size)
         ).clearance[0, 0, 0]
         > workspace.clearance
         # the first point is the object's current place
@@ -426,10 +426,12 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
         best_robustness = float(gradient.robustness.max())
         if size_text := _why_too_large(gradient):
             return size_text
-        subject = gradient.made_of.then.about
-        formulas = [subject.propositions[number] for cube in gradient.made_of.progress for number, _ in cube]
+        map_subject = gradient.made_of.then.about
+        formulas = [
+            map_subject.propositions[number] for cube in gradient.made_of.progress for number, _ in cube
+        ]
         sentence = f"{NOWHERE}: {best_robustness:.4g} at best, {settings.margin:.4g} needed"
-        return "; ".join([sentence, *seam_texts(formulas, subject.regions)])
+        return "; ".join([sentence, *seam_texts(formulas, map_subject.regions)])
     counts_by_reason = np.bincount(gradient.blocked[is_enough], minlength=len(REASONS))
     if counts_by_reason[FREE] and has_failed:
         return "it was tried wherever it would hold"
@@ -440,15 +442,18 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
 
 def _why_too_large(gradient: GradientMap) -> str:
     """Return a sentence on a region or object that is too small to enclose a map's object, or ""."""
-    subject = gradient.made_of.then.about
+    map_subject = gradient.made_of.then.about
     formulas = [
-        subject.propositions[number] for cube in gradient.made_of.progress for number, value in cube if value
+        map_subject.propositions[number]
+        for cube in gradient.made_of.progress
+        for number, value in cube
+        if value
     ]
     for formula in formulas:
         for atom in iter_formulas(formula):
             if not isinstance(atom, Atom) or atom.relation != "enclosedin":
                 continue
-            inner, outer = (_outlines_of(term, subject) for term in atom.terms)
+            inner, outer = (_outlines_of(term, map_subject) for term in atom.terms)
             if getattr(atom.terms[0], "name", "") != gradient.name or not inner or not outer:
                 continue
             outer_size = _extent(outer, 0.0)
@@ -462,12 +467,12 @@ _Rounded: TypeAlias = tuple[Floats, float]
 """Corners (N, 2) and rounding radius of an outline."""
 
 
-def _outlines_of(term: Term, subject: MapSubject) -> list[_Rounded]:
+def _outlines_of(term: Term, map_subject: MapSubject) -> list[_Rounded]:
     """Return the outlines of an object or region; no outlines for other terms."""
     name = getattr(term, "name", "")
-    if isinstance(term, TrackedName) and name in subject.sample.objects:
-        return [(part.vertices, part.radius) for part in subject.sample.objects[name].footprint.parts]
-    if base_of(term) is term and (outline := subject.regions.get(name)) is not None:
+    if isinstance(term, TrackedName) and name in map_subject.sample.objects:
+        return [(part.vertices, part.radius) for part in map_subject.sample.objects[name].footprint.parts]
+    if base_of(term) is term and (outline := map_subject.regions.get(name)) is not None:
         return [(np.array(outline.vertices), outline.radius)]
     return []
 

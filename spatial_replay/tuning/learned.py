@@ -686,11 +686,11 @@ class _Writer:
         ]
         return _Written(tuple(kept_lines), self._parse(kept_lines)) if kept_lines else None
 
-    def order(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
+    def order(self, draft: _Written, bad: Sequence[LabelledRun]) -> _Written:
         """Sort the lines: among lines that the same bad runs violate, shorter lines come first."""
         lines_by_verdicts: dict[tuple[bool, ...], list[Line]] = {}
         verdict_keys = []
-        for line, spec in written.pairs:
+        for line, spec in draft.pairs:
             verdict_keys.append(tuple(robustness_of(spec.formula, run.trace)[1] < 0.0 for run in bad))
             lines_by_verdicts.setdefault(verdict_keys[-1], []).append(line)
         for lines in lines_by_verdicts.values():
@@ -713,7 +713,7 @@ class _Writer:
 
     def text(
         self,
-        written: _Written,
+        draft: _Written,
         head_lines: Sequence[str],
         evidence: Sequence[LearnedLine],
         good_count: int,
@@ -721,7 +721,7 @@ class _Writer:
     ) -> str:
         """Return the text of the file: each spec in canonical form, under a comment with its evidence."""
         lines = [*map(_comment, head_lines), f"use {self.profile}"]
-        for spec, line in zip(written.specification.specs, evidence, strict=True):
+        for spec, line in zip(draft.specification.specs, evidence, strict=True):
             lowest_text = f"lowest robustness {number_text(line.lowest)} in {line.lowest_run}"
             lines += [
                 "",

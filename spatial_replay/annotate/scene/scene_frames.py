@@ -199,9 +199,9 @@ def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
 def _shades() -> NDArray[np.uint8]:
     codes = np.arange(256.0)
     # 1e-9 keeps code 127 negative, so that its colour is vermillion
-    shares = np.where(codes < 128.0, (codes - 127.0) / 126.0 - 1e-9, (codes - 128.0) / 127.0)
-    shares[0] = np.nan
-    return np.asarray(np.round(255.0 * colours(shares, 1.0)), np.uint8)
+    robustness = np.where(codes < 128.0, (codes - 127.0) / 126.0 - 1e-9, (codes - 128.0) / 127.0)
+    robustness[0] = np.nan
+    return np.asarray(np.round(255.0 * colours(robustness, 1.0)), np.uint8)
 
 
 SHADES: Final = _shades()
