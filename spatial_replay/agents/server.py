@@ -203,7 +203,7 @@ class Tools:
     ) -> CallToolResult:
         """Find the shortest run that one of two specifications accepts and the other one rejects, in words.
 
-        The answer also says whether the meanings are equal. It shows which spelling a sentence means. The
+        The answer also says whether the meanings are equal. The run shows which text says what is meant. The
         operators `Y`, `O`, `H` and `S` are not decided: write `(not b) W (a and not b)` for "b only after a".
         """
         with self._texts(first=first, second=second) as files:

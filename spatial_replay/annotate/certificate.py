@@ -169,7 +169,7 @@ class EvaluationHashes:
         """Start before the first sample.
 
         Args:
-            names: name of each result, with the object of a template's instance or None.
+            names: name of each result, and the object of the result's instance; None without a template.
         """
         self._samples, self._messages = SampleHash(), MessageHash()
         self._results = [(_text(name) + _text(object), hashlib.sha256()) for name, object in names]

@@ -126,8 +126,8 @@ def _compression(topic_metadata: dict[str, object]) -> Compression:
         return ""
     if compression_mode not in ("file", "message") or compression_format != "zstd":
         raise LogError(
-            f"the bag is compressed by {compression_mode!r:.40} with {compression_format!r:.40}; zstd by"
-            " file or message is read"
+            f"the bag is compressed by {compression_mode!r:.40} with {compression_format!r:.40}; "
+            "only zstd is read, by file or by message"
         )
     return "file" if compression_mode == "file" else "message"
 

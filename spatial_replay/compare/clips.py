@@ -185,7 +185,7 @@ class _Part:
         return self._decide(result, leaves)
 
     def _within(self, begin_index: int, end_index: int, start_ns: int) -> Floats:
-        """Return the leaves of a log that has only the window's samples, and nothing before `start_ns`."""
+        """Return the leaves that the window's samples have in a log that begins at `start_ns`."""
         leaves = np.ascontiguousarray(self._leaves[:, :, begin_index:end_index])
         delay_samples, delay_ns, has_report_delay = self._look_back
         if self._trace is None or not self._look_back:

@@ -417,7 +417,7 @@ class Edit:
 
 
 class Origin(NamedTuple):
-    """Nodes of two trees that depend on one edit of their texts.
+    """Nodes that one edit of a specification's text affects, in the old tree and in the new tree.
 
     Attributes:
         change: edited declaration; None for the text of the specs.

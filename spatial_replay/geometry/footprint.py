@@ -142,7 +142,7 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
 _SHAPES: Final[Mapping[str, str]] = MappingProxyType(
     {"circle": "disc(x, y, radius)", **dict.fromkeys(("rectangle", "rect"), "box(xmin, ymin, xmax, ymax)")}
 )
-"""Constructors of footprints, by names of shapes in other libraries and in the specification language."""
+"""Constructors of footprints, by the shape's name in other libraries or in the specification language."""
 
 
 class _FootprintType(type):

@@ -254,7 +254,7 @@ _TAIL_BYTES: Final = 2**19
 _HEAD_BYTES: Final = 2**16
 """First read at the beginning of a file, bytes: its format and first records."""
 _LEAST_BYTES: Final = 2**16
-"""Smallest read, bytes, except at the end of the file."""
+"""Least number of bytes in a read, except at the end of the file."""
 _PIECE_BYTES: Final = 2**23
 """Largest request, bytes."""
 _AT_ONCE: Final = 32

@@ -76,7 +76,7 @@ _MOST_SIGNALS = 12
 _MOST_LISTS = 6
 _TEXTS = frozenset({"name", "label"})
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
-"""Last words of topic names that concern programs instead of objects."""
+"""Last words of the topics of programs, which have no objects."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of sensor frames, which are mounted on objects."""
 # PX4 publishes in the frame north, east, down (https://docs.px4.io/main/en/ros2/user_guide.html)

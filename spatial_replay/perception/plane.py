@@ -371,7 +371,7 @@ def _off_alone(
 
 
 def _solve(known_corners: Floats, seen_corners: Floats, camera: Camera | None) -> Floats | None:
-    """Fit the homography (3, 3), or a camera's pose (6,), from places to pixels; None without a solution."""
+    """Fit the homography (3, 3) from places to pixels, or a camera's pose (6,); None without a solution."""
     if camera is not None:
         return fit_pose(_flat(known_corners), seen_corners, camera)
     homography = fit_homography(known_corners, seen_corners)

@@ -88,7 +88,7 @@ class MessageQueue:
                 self.channels[channel.topic] = message_channel
             elif message_channel.declaration != channel:
                 raise UsageError(
-                    f"{channel.topic} is open already with another encoding or schema; give one topic to each"
+                    f"{channel.topic} is open already with another encoding or schema; use another topic"
                 )
             return message_channel
 

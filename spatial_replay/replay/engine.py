@@ -167,8 +167,8 @@ class ReplayPlan:
     Attributes:
         files: the specifications, as an annotated log stores them.
         instances: instances of the specs in each file.
-        departures: collector of departures for each file, before the first sample.
-        heights: counter of height comparisons for all files, before the first sample.
+        departures: empty collector of departures for each file.
+        heights: empty counter of height comparisons for all files.
     """
 
     files: Sequence[Specification]

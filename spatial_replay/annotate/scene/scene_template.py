@@ -404,7 +404,7 @@ class SceneLayout(NamedTuple):
             last outlines (see `Dashes`).
         witness: label of the arrow at the violation; "deleted" to delete the previous arrow; None without
             an arrow.
-        names: names at the arrow; the message then has no other names.
+        names: names at the arrow; with any, the message has no other names.
     """
 
     deleted: tuple[str, ...]
