@@ -213,7 +213,7 @@ _Result = TypeVar("_Result")
 _PATIENCE_S: Final = 0.8
 """Time for which a process always interprets kernels, seconds: the time for loading numba and code."""
 _FIRST_S: Final = 1.5
-"""Value of `_PATIENCE_S` for a kernel whose time is a guess, seconds. Most take a tenth of the guess."""
+"""`_PATIENCE_S` for a kernel whose time is a guess, seconds. Most such kernels take a tenth of it."""
 _COLD_S: Final = 2.0
 """Limit of a kernel's interpreted time, seconds, if its machine code is not cached."""
 _WARM_S: Final = 0.03

@@ -195,7 +195,7 @@ class _Part:
             delay_samples, has_report_delay, int(np.searchsorted(times_ns, start_ns + delay_ns))
         )
         if has_report_delay and (self._trace.reported_ns is not None or self._trace.signals_reported_ns):
-            # a rate needs two reports; before the window's second report, one of them precedes the window
+            # a rate needs two reports; up to the window's second report, the earlier one is before the window
             head_length = len(times_ns)
         trace_begin, trace_end = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
         head_trace = self._trace.slice(trace_begin, min(trace_begin + head_length, trace_end))

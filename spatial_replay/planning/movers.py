@@ -347,7 +347,7 @@ class Lookout:
         aim: Consideration,
         timing: Timing,
     ) -> Target:
-        """Return the target of a push with a path of fewer corners, if other objects will leave such a path.
+        """Return a push's target; its path has fewer corners if moving objects clear a straighter way.
 
         Args:
             motions: motions of all objects between two samples.

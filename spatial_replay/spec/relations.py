@@ -102,7 +102,7 @@ def partovlp(a: Term, b: Term) -> Expression:
 
 
 def moved(a: Term, b: Term, e: float) -> Expression:
-    """`a moved[e] b`: -(a enclosedin enlarge(b, e)), some point of a more than `e` outside of b (Eq. 5)."""
+    """`a moved[e] b`: -(a enclosedin enlarge(b, e)), a point of a is more than `e` outside of b (Eq. 5)."""
     return -enclosedin(a, Enlarged(b, e))
 
 
