@@ -44,6 +44,7 @@ from spatial_replay.planning.decision_log import (
     decision_from_payload,
     decision_lines,
     decision_rows,
+    demand_words,
     effort_text,
     explained_decision,
     latest_decisions,
@@ -53,7 +54,7 @@ from spatial_replay.planning.decision_log import (
     plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
-from spatial_replay.planning.demands import Ban, ban_of, demand_of
+from spatial_replay.planning.demands import Ban, ban_of
 from spatial_replay.planning.maps import BlockedBy, GradientMap, danger_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, changed_settings, changes_text, settings_from_text
@@ -301,23 +302,22 @@ def why_not_there(
         f"({effort_text(steps[number].message)})"
     )
     layers = layers_of(candidate, settings)
-    bans = planner.bans(edge, step.pruned)
+    edge_message = steps[number].message.considered[step.considered.index(edge)]
+    (logged,) = (message for message in edge_message.candidates if message.object == name)
     for layer in np.argsort(layers.robustness[(slice(None), *cell)], kind="stable").tolist():
         robustness = float(layers.robustness[(layer, *cell)])
         judgement = "not met" if robustness < 0.0 else "met"
         margin_note = f", but {settings.margin:.4g} needed" if 0.0 <= robustness < settings.margin else ""
-        demand = demand_of(layers.conjuncts[layer], bans, is_required=layers.required[layer])
-        yield f"  {robustness:>9.4g}  {plain(demand)}: {judgement}{margin_note}"
+        demand = plain(demand_words(logged.conjuncts[layer]))
+        yield f"  {robustness:>9.4g}  {demand}: {judgement}{margin_note}"
     cause = layers.causes[layers.blocked_by[cell]] if layers.blocked_by[cell] >= 0 else None
+    bans = planner.bans(edge, step.pruned)
     yield from (f"  {text}" for text in _blocking_texts(gradient, cell, cause, bans, settings))
     if target is not None:
         judgement = "chosen" if candidate.is_chosen else "possible"
         yield f"  {judgement} instead: ({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"
-        edge_message = steps[number].message.considered[step.considered.index(edge)]
-        rules = [
-            message.rule for message in edge_message.candidates if message.object == name and message.rule
-        ]
-        yield from (f"  rule: {rule}" for rule in rules)
+        if logged.rule:
+            yield f"  rule: {logged.rule}"
 
 
 def _blocking_texts(
