@@ -102,7 +102,7 @@ function labelsOf(moves, places) {
     });
     const isCrossed = ([left, top, right, bottom]) => curves.some((points, other) => other !== number
       && points.some(([x, y]) => left < x && x < right && top < y && y < bottom));
-    const box = boxes.find((place) => taken.every((other) => overlapOf(place, other) === 0) && !isCrossed(place));
+    const box = boxes.find((place) => !taken.some((other) => meets(place, other)) && !isCrossed(place));
     if (!box) return [];
     taken.push(box);
     return svg("text", {class: "guard", x: (box[0] + box[2]) / 2, y: box[3], "text-anchor": "middle", dy: "-0.3em"},

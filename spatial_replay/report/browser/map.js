@@ -376,10 +376,6 @@ function isWithin(box, frame) {
   return box[0] >= frame[0] && box[1] >= frame[1] && box[2] <= frame[2] && box[3] <= frame[3];
 }
 
-function overlapOf([left, top, right, bottom], [l, t, r, b]) {
-  return Math.max(0, Math.min(right, r) - Math.max(left, l)) * Math.max(0, Math.min(bottom, b) - Math.max(top, t));
-}
-
 // Draws a frame around a cell, at least 8 pixels wide, so that it is visible around a small cell.
 function drawCell(context, map, cell, at) {
   const [x, y] = centreOf(map, cell);
